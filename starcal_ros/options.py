@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 import dataclasses
 import difflib
+import os
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,12 +40,14 @@ def option(
     choices: tuple[str, ...] = (),
     length: int | None = None,
     basic: bool = False,
+    is_path: bool = False,
 ) -> Any:
     """
     Dataclass field with the content of a ROS parameter descriptor.
 
     ``low`` and ``high`` are inclusive; like ``choices`` they apply to each element of a list.
-    ``basic`` marks the few options that most cameras need; the others are advanced.
+    ``basic`` marks the few options that most cameras need; the others are advanced.  ``is_path``
+    marks a path, in which ``~`` stands for a home folder.
     """
     return dataclasses.field(
         default=default,
@@ -55,6 +58,7 @@ def option(
             'choices': choices,
             'length': length,
             'basic': basic,
+            'is_path': is_path,
         },
     )
 
@@ -81,9 +85,18 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
         )
     try:
         found: OptionValue = read_value(kind, value, field.name, {})
-        return found
     except ValueError as error:
         raise OptionError(str(error)) from error
+    return with_home(field.name, str(found)) if meta['is_path'] else found
+
+
+def with_home(name: str, path: str) -> str:
+    """The path of an option with ``~`` expanded; OptionError for a user without a home folder."""
+    expanded = os.path.expanduser(path)
+    if expanded.startswith('~'):
+        user = path.partition('/')[0]
+        raise OptionError(f'{name}: {shown(path)}: no home folder of {user}; give the whole path')
+    return expanded
 
 
 def is_of_ros(name: str) -> bool:

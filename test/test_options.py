@@ -14,6 +14,7 @@ import pytest
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.options import (
+    check_value,
     from_mapping,
     names_of,
     option,
@@ -22,8 +23,8 @@ from starcal_ros.options import (
     read_parameter_file,
     section_applies,
 )
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import OPTION_CLASSES
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
+from starcal_ros.pipeline.setup import OPTION_CLASSES, read_values
 
 
 @dataclass(frozen=True)
@@ -260,3 +261,37 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / 'latin.yaml').write_bytes(b'foo: \xff\xfe\n')
     with pytest.raises(OptionError, match='latin.yaml: not a text file'):
         read_parameter_file(tmp_path / 'latin.yaml', ('foo',))
+
+
+PATHS = (
+    'camera_info_url', 'catalog', 'dark_frame', 'flat_field', 'bad_pixel_map', 'state_dir',
+    'state_key_file', 'bag',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize('name', PATHS)
+def test_a_tilde_is_the_home_folder(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`state_dir: ~/x` made a folder of the name `~` in the working folder."""
+    monkeypatch.setenv('HOME', '/home/of_tests')
+    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
+    assert {field.name for field in fields if field.metadata['is_path']} == set(PATHS)
+    (field,) = (field for field in fields if field.name == name)
+    for given, expected in (
+        ('~/x', '/home/of_tests/x'),
+        ('~', '/home/of_tests'),
+        ('/a/~', '/a/~'),
+        ('', ''),
+        ('package://a/~', 'package://a/~'),
+    ):
+        assert check_value(field, given) == expected
+    with pytest.raises(OptionError, match=f'{name}: .~nobody_here/x.: no home folder of ~nobody'):
+        check_value(field, '~nobody_here/x')
+
+
+def test_a_camera_file_at_home_is_not_looked_for_beside_the_parameter_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv('HOME', '/home/of_tests')
+    params = tmp_path / 'params.yaml'
+    params.write_text("/**: {ros__parameters: {camera_info_url: '~/camera.yaml'}}")
+    assert read_values(params)['camera_info_url'] == '/home/of_tests/camera.yaml'

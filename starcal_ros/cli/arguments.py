@@ -302,7 +302,7 @@ def _plan(command: argparse.ArgumentParser) -> None:
 
 
 def _report(command: argparse.ArgumentParser) -> None:
-    what = 'folder with the products of starcal calibrate'
+    what = 'folder with the products of starcal calibrate, or the state_dir of a calibrator'
     command.add_argument('folder', type=_path, metavar='DIR', help=what)
     command.add_argument(
         '--pdf', action='store_true', help='write report.pdf too, to print and sign'
@@ -349,20 +349,6 @@ def _monitor(command: argparse.ArgumentParser) -> None:
     what = 'print one view after S seconds and end; needed where the output is not a terminal'
     command.add_argument('--once', type=_number(float, 0, 3600), metavar='S', help=what)
     _remaps(command, 'read topic A of the nodes from B; may be repeated')
-
-
-def _request(command: argparse.ArgumentParser) -> None:
-    services = ('calibrate', 'solve', 'rollback', 'reset', 'lookup')
-    command.add_argument('service', choices=services, help='service of the calibrator')
-    command.add_argument('--dry-run', action='store_true', help='solve: activate nothing')
-    what = 'solve: activate the result despite the gate'
-    command.add_argument('--force', action='store_true', help=what)
-    what = 'file for the table of lookup (.csv, .npz, .fits)'
-    _output(command, 'FILE', what, required=False)
-    what = 'longest wait for the answer, s (default: 600)'
-    seconds = _number(float, 0.1, 86400)
-    command.add_argument('--timeout', type=seconds, default=600.0, metavar='S', help=what)
-    _remaps(command, 'rename A of the calibrator to B, e.g. __ns:=/cam1; may be repeated')
 
 
 def _seed(command: argparse.ArgumentParser, what: str) -> None:
@@ -567,7 +553,6 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'lookup': _lookup,
     'play': _play,
     'monitor': _monitor,
-    'request': _request,
     'simulate': _simulate,
     'campaign': _campaign,
     'export': _export,

@@ -104,7 +104,9 @@ refused images and stars. The page needs no network. --pdf writes it as numbered
 for signatures (extra pdf).
 
   # from the files of an earlier calibration, with pages to sign
-  starcal report out --pdf""",
+  starcal report out --pdf
+  # of the last calibration of a calibrator, from its state_dir
+  starcal report state""",
     'lookup': """\
 write a table of lines of sight and their sigma by pixel
 
@@ -140,19 +142,6 @@ run, a roll-back or a reset.
   starcal monitor --remap __ns:=/cam1
   # one view after five seconds, for a log
   starcal monitor --once 5""",
-    'request': """\
-call a service of the running calibrator
-
-Requests a calibration (calibrate, or solve with other options), the previous calibration
-(rollback), an empty ensemble (reset) or a table of lines of sight (lookup), and prints the
-response. Exit status 3: the calibrator declined.
-
-  # calibrate from the images collected so far
-  starcal request calibrate
-  # the same without activating the result
-  starcal request solve --dry-run
-  # lines of sight of the active calibration, from a calibrator in a namespace
-  starcal request lookup -o sights.csv --remap __ns:=/cam1""",
     'simulate': """\
 render a bag with known truth
 

@@ -257,20 +257,6 @@ def _monitor(args: argparse.Namespace) -> int:
     return demo.become(demo.node_command('monitor_client', once, args.remap))
 
 
-def _request(args: argparse.Namespace) -> int:
-    """Replace this process by a client of one service of the calibrator."""
-    from starcal_ros.cli.commands import demo
-
-    if (args.dry_run or args.force) and args.service != 'solve':
-        raise OptionError(f'--dry-run, --force: only solve has them, not {args.service}')
-    if (args.service == 'lookup') != (args.output is not None):
-        raise OptionError('-o: the file for the table of lookup (.csv, .npz, .fits), of it alone')
-    options = [f'--{name}' for name in ('dry-run', 'force') if vars(args)[name.replace('-', '_')]]
-    options += [] if args.output is None else ['--output', str(args.output)]
-    asked = [args.service, *options, '--timeout', repr(args.timeout)]
-    return demo.become(demo.node_command('request_client', asked, args.remap))
-
-
 def _simulate(args: argparse.Namespace) -> int:
     """Render a named scenario."""
     from starcal_ros.studies.simulation import scenario as synthetic
@@ -469,7 +455,6 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'lookup': _lookup,
     'play': _play,
     'monitor': _monitor,
-    'request': _request,
     'simulate': _simulate,
     'campaign': _campaign,
     **mission.COMMANDS,

@@ -46,15 +46,14 @@ class CalibratorOptions:
         '',
         'folder that keeps images and calibrations across restarts; empty: memory only',
         basic=True,
+        is_path=True,
     )
     state_key_file: str = option(
         '',
         'file with a secret key of at least 16 bytes; state files then carry an HMAC, and files'
         ' without a valid one are set aside; empty: checksums only, which detect damage but not'
         ' forgery',
-    )
-    state_report: bool = option(
-        True, 'write reports of the active and the last refused calibration to state_dir'
+        is_path=True,
     )
     set_camera_info_service: str = option(
         '', 'sensor_msgs/SetCameraInfo service that receives each new calibration; empty: none'
@@ -65,7 +64,7 @@ class CalibratorOptions:
 class PlayerOptions:
     """Playback of a bag."""
 
-    bag: str = option('', 'an .mcap file or a bag folder')
+    bag: str = option('', 'an .mcap file or a bag folder', is_path=True)
     rate: float = option(
         1.0,
         'playback speed; 1: real time, 0: as fast as the stars are observed',

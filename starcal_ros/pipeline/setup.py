@@ -41,6 +41,7 @@ from starcal_ros.options import (
     OptionValue,
     read_parameter_file,
     unknown_option,
+    with_home,
 )
 from starcal_ros.pipeline import detector_frames
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
@@ -131,6 +132,7 @@ class SetupOptions:
         'prior camera, a ROS camera YAML or a .cameramodel of mrcal: a path, or a file:// or'
         ' package:// URL',
         basic=True,
+        is_path=True,
     )
     lens_model: str = option(
         'prior',
@@ -156,20 +158,23 @@ class SetupOptions:
         ' empty: colour images are refused',
         choices=('', *CHANNELS),
     )
-    catalog: str = option('', 'star catalog file; empty: the bundled catalog')
+    catalog: str = option('', 'star catalog file; empty: the bundled catalog', is_path=True)
     dark_frame: str = option(
         '',
         'dark frame to subtract, a FITS, TIFF or PNG of the image size and depth; empty: none',
+        is_path=True,
     )
     flat_field: str = option(
         '',
         'flat field to divide by, a FITS, TIFF or PNG of the image size, normalised to its'
         ' median; empty: none',
+        is_path=True,
     )
     bad_pixel_map: str = option(
         '',
         'map of bad pixels, a FITS, TIFF or PNG of the image size; nonzero pixels are'
         ' treated as hot pixels; empty: none',
+        is_path=True,
     )
 
 
@@ -240,7 +245,11 @@ def read_values(params: Path) -> dict[str, object]:
 
     Raises OptionError when it is not a parameter file.
     """
-    return dict(camera_yaml.with_camera_url_from(read_parameter_file(params, NODES), params))
+    values = dict(read_parameter_file(params, NODES))
+    url = values.get('camera_info_url')
+    if isinstance(url, str):
+        values['camera_info_url'] = with_home('camera_info_url', url)
+    return camera_yaml.with_camera_url_from(values, params)
 
 
 def files_of(frames: SetupOptions) -> dict[str, Path]:

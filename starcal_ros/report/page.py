@@ -8,7 +8,7 @@ The page needs no network: styles, script and pictures are embedded.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import functools
 import json
@@ -69,8 +69,9 @@ def write_report(folder: Path) -> Path:
     """
     Write ``report.html`` from the product files of a folder and return its path.
 
-    Where the last calibration into the folder failed, it is the page of that failure.  Raises
-    ProductError, BagError when a file cannot be read or the report cannot be written.
+    In the state folder of a calibrator it is the page of the last calibration.  Where the last
+    calibration into the folder failed, it is the page of that failure.  Raises ProductError,
+    BagError when a file cannot be read or the report cannot be written.
     """
     failure = product_folder.read_not_calibrated(folder)
     if failure is not None:
@@ -82,18 +83,25 @@ def write_report(folder: Path) -> Path:
 
 def _read_folder(folder: Path) -> Found:
     residuals = folder / product_folder.RESIDUALS_FILE
-    observations = folder / OBSERVATIONS_FILE
+    observations, ensemble = folder / OBSERVATIONS_FILE, folder / product_folder.STATE_ENSEMBLE
+    calibration = calibration_json.read_calibration(product_folder.calibration_file(folder))
     recorded = None
     if observations.is_file():
-        topic = reader.choose_topic([observations], OBSERVATIONS_TYPE)
-        recorded = tuple(reader.read_observations([observations], topic))
+        recorded = tuple(_observations(observations))
+    elif any(ensemble.glob('*.mcap')):  # it may have grown since
+        span_ns = range(calibration.first_image_ns, calibration.time_ns + 1)
+        recorded = tuple(image for image in _observations(ensemble) if image.time_ns in span_ns)
     return Found(
-        calibration_json.read_calibration(folder / calibration_json.CALIBRATION_FILE),
+        calibration,
         product_folder.read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER),
         tuple(name for name in _PRODUCTS if (folder / name).is_file()),
     )
+
+
+def _observations(bag: Path) -> Iterator[StarObservations]:
+    return reader.read_observations([bag], reader.choose_topic([bag], OBSERVATIONS_TYPE))
 
 
 def with_digests(text: str, folder: Path) -> str:

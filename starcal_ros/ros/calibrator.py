@@ -6,7 +6,6 @@ from __future__ import annotations
 import array
 from collections.abc import Sequence
 import contextlib
-from pathlib import Path
 import sys
 import threading
 from typing import Any
@@ -21,12 +20,9 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate, LineOfSightTable
-from starcal.srv import Plan as PlanService
 from starcal_ros.assessment.lookup import line_of_sight_table
-from starcal_ros.assessment.plan import LINE_OF_SIGHT
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.calibration_messages import (
     alignment_to_message,
     calibration_to_message,
@@ -39,11 +35,8 @@ from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.plan import Cone, plan_pointings, Pointing
-from starcal_ros.pipeline.plan import Request as PlanRequest
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import IMAGE_REFUSALS
-from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
 from starcal_ros.ros.kept.state import Answer, CalibratorState
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
 from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, StarcalNode, WARN
@@ -76,7 +69,6 @@ class Calibrator(StarcalNode):
         self._listeners: list[tuple[Any, Any]] = []
         self._publishing = threading.Lock()
         self._state = CalibratorState(self._now_ns)
-        self._reports = CalibratorReports(self.guarded(self._on_report))
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
@@ -90,7 +82,6 @@ class Calibrator(StarcalNode):
             (Trigger, '~/reset', self._on_reset, deciding),
             (Trigger, '~/rollback', self._on_rollback, deciding),
             (LineOfSightTable, '~/lookup', self._on_lookup, sending),
-            (PlanService, '~/plan', self._on_plan, solving),
             (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
         ):
             self.create_service(kind, name, self._answered(answer), callback_group=group)
@@ -101,9 +92,6 @@ class Calibrator(StarcalNode):
         self._own = from_mapping(CalibratorOptions, values)
         self._setup = load_setup(values, self.options.classes)
         self._state.open(self._setup, self._own)
-        self._reports.open(
-            self._own.state_dir if self._own.state_report else '', self._setup.frames.camera_frame
-        )
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)
         if self._state.withheld:
@@ -171,7 +159,6 @@ class Calibrator(StarcalNode):
             while self._made:
                 destroy, entity = self._made.pop()
                 destroy(entity)
-        self._reports.close()
         self._state.close()
 
     def health(self) -> Health:
@@ -218,8 +205,6 @@ class Calibrator(StarcalNode):
             return WARN, f'camera driver not updated: {driver.outcome}', numbers
         if not last.success:
             return WARN, last.message, numbers
-        if self._reports.trouble:
-            return WARN, f'no report: {self._reports.trouble}', numbers
         return OK, 'collecting' if active is None else 'calibration active', numbers
 
     def _foreign_transforms(self) -> str:
@@ -310,32 +295,6 @@ class Calibrator(StarcalNode):
             response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
         return response
 
-    def _on_plan(self, request: Any, response: Any) -> Any:
-        response.success = False
-        try:
-            allowed = _rows('pointings', request.ra_deg, request.dec_deg, request.roll_deg)
-            avoid = (request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg)
-            wanted = PlanRequest(
-                images=request.images or 10,
-                minimise=request.minimise or LINE_OF_SIGHT,
-                pointings=tuple(Pointing(*row) for row in allowed),
-                avoid=tuple(Cone(*row) for row in _rows('avoid', *avoid)),
-                largest_slew_deg=request.largest_slew_deg or 180.0,
-            )
-            found = plan_pointings(self._state.ensemble, self._setup, wanted)
-        except StarcalError as error:
-            response.message = str(error)
-            return response
-        places = [step.pointing for step in found.steps]
-        for name in ('ra_deg', 'dec_deg', 'roll_deg'):
-            setattr(response, name, array.array('d', [getattr(one, name) for one in places]))
-        response.stars = [step.stars for step in found.steps]
-        response.sigma = [step.sigma for step in found.steps]
-        response.sigma_name, response.sigma_now = found.name, found.sigma
-        response.enough = -1 if found.enough is None else found.enough
-        response.success, response.message = True, found.in_a_sentence()
-        return response
-
     def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
         driver = self._driver
         if driver is None:
@@ -360,23 +319,15 @@ class Calibrator(StarcalNode):
         if not self.is_active:
             pass  # deactivated meanwhile: activation publishes the active calibration
         elif answer.calibration is not None and answer.active:
-            self._publish_active(answer)
+            self._publish_active()
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
-            self._reports.show(CANDIDATE, answer)
         self._last_answer = Answer(answer.success, answer.message)
         response.success, response.message = answer.success, answer.message
         return response
 
-    def _on_report(self, page: Path, trouble: str) -> None:
-        if trouble:
-            self.get_logger().warning(f'{page}: not made: {trouble}')
-        else:
-            self.get_logger().info(f'report: {page}')
-        self.publish_health_change()
-
-    def _publish_active(self, answer: Answer | None = None) -> None:
-        """Publish the active calibration, and its report where it is that of an answer."""
+    def _publish_active(self) -> None:
+        """Publish the active calibration."""
         # Two requests may activate one each: of all publishers the last is of the later one.
         with self._publishing:
             calibration = self._state.active_on_disk
@@ -393,8 +344,6 @@ class Calibrator(StarcalNode):
                 self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
             if self._driver is not None:
                 self._driver.hand_over(camera_info)
-            if answer is not None and answer.calibration is calibration:
-                self._reports.show(ACTIVE, answer)
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""
@@ -418,12 +367,6 @@ class Calibrator(StarcalNode):
             return response
 
         return run_and_tell
-
-
-def _rows(name: str, *columns: Sequence[float]) -> list[tuple[float, ...]]:
-    if len(set(map(len, columns))) > 1:
-        raise OptionError(f'{name}: the columns are not of one length')
-    return list(zip(*columns, strict=True))
 
 
 def main(args: Sequence[str] | None = None) -> int:

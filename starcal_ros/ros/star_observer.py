@@ -66,7 +66,6 @@ _ATTITUDE_MESSAGES = {
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
 _STAMP_NS = operator.itemgetter(0)
-_MAX_VELOCITY_M_S = 1e6
 _DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
 _HISTORY_S = 3600.0  # of attitudes: 2 MB at 10 Hz; images come later only from a recorder
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
@@ -88,7 +87,8 @@ class StarObserver(StarcalNode):
         self._publishers_made: list[Any] = []
         self._worker: threading.Thread | None = None
         self._counts: Counter[str] = Counter()
-        self._last_refusal = ''
+        self._last_refusal = self._bad_velocity = ''
+        self._velocities_left_out = 0
         self._retried = self._retried_used = 0
         self._camera_info: Any = None  # of the active calibration, header of the last image
 
@@ -127,7 +127,8 @@ class StarObserver(StarcalNode):
         self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
         self._counts.clear()
         self._restarts = self._retried = self._retried_used = 0
-        self._last_refusal = ''
+        self._last_refusal = self._bad_velocity = ''
+        self._velocities_left_out = 0
         self._unmatched = Unmatched(
             self._setup, functools.partial(self._in_worker, self._on_diagnosis)
         )
@@ -194,6 +195,7 @@ class StarObserver(StarcalNode):
             'attitude_rate_hz': _short(self._attitude_step_s.rate_hz()),
             'attitude_gap_s': _short(self._attitude_step_s.largest()),
             'attitudes_not_used': ', '.join(not_used) or 'none',
+            'velocities_left_out': self._velocities_left_out,
             'restarts': self._restarts,
             'retried': self._retried,
             'retried_used': self._retried_used,
@@ -208,6 +210,8 @@ class StarObserver(StarcalNode):
             return WARN, f'last image refused: {self._last_refusal}', numbers
         if why_not := [one.why for one in unfit.values() if one.why]:
             return WARN, '; '.join(why_not), numbers
+        if self._bad_velocity:
+            return WARN, self._bad_velocity, numbers
         if not counts:
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers
@@ -259,13 +263,14 @@ class StarObserver(StarcalNode):
         self._queue.wake()
 
     def _on_velocity(self, message: Any) -> None:
-        time_ns, velocity_m_s = telemetry.velocity_from_message(message)
-        # The Earth moves at 3e4 m/s; a value beyond this limit would displace all stars.
-        if not float(abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
-            raise ValueError(
-                f'velocity: {velocity_m_s.tolist()} m/s is not plausible for a spacecraft'
-            )
-        self._velocities.append((time_ns, velocity_m_s))
+        try:
+            self._velocities.append(telemetry.velocity_from_message(message))
+            self._bad_velocity = ''
+        except ValueError as error:
+            self._bad_velocity = str(error)
+            self._velocities_left_out += 1
+            if self._velocities_left_out == 1:  # the diagnostics count the others
+                self.get_logger().warning(self._bad_velocity)
 
     def _on_temperature(self, message: Any) -> None:
         self._temperatures.append(telemetry.temperature_from_message(message))

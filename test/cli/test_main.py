@@ -143,7 +143,6 @@ def test_help_is_there_at_once() -> None:
         (['play', str(TINY), '--remap', 'image'], ['--remap', "'image'"]),
         (['monitor'], ['--once', 'not a terminal']),
         (['monitor', '--once', 'nan'], ['--once', 'nan']),
-        (['request', 'reset', '--timeout', 'nan'], ['--timeout', 'nan']),
     ],
 )
 def test_bad_arguments(
@@ -569,18 +568,6 @@ def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
     # The entry point imports that module of ros/; it was once renamed without its command.
     assert importlib.util.find_spec('starcal_ros.ros.monitor_client')
-
-
-def test_request_becomes_its_client(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[list[str]] = []
-    monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
-    run('request', 'solve', '--dry-run', '--timeout', '5', '--remap', '__ns:=/cam1')
-    module = [*module_command('starcal_ros.entry_points'), 'request_client']
-    asked = ['solve', '--dry-run', '--timeout', '5.0', '--ros-args', '-r', '__ns:=/cam1']
-    assert called == [[*module, *asked]]
-    for words in (['reset', '--force'], ['lookup'], ['calibrate', '-o', 'a.csv']):
-        status, _, err = run('request', *words)
-        assert status == 2 and err.count('\n') == 1
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 
 from starcal_ros.cli import main
 from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
+from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products import product_folder
 from starcal_ros.formats.products.calibration_json import (
     CALIBRATION_FILE,
@@ -26,7 +28,10 @@ from starcal_ros.formats.products.calibration_json import (
     write_calibration,
 )
 from starcal_ros.formats.products.product_files import REPORT_FILE
+from starcal_ros.records import Ensemble
 from starcal_ros.report import page as report
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.state import Activation
 from starcal_ros.text import significant
 
 FIGURES = (
@@ -69,6 +74,23 @@ def page(folder: Path) -> str:
 
 def page_of(folder: Path) -> str:
     return report.write_report(folder).read_text()
+
+
+def test_of_a_state_folder_the_last_calibration_and_its_images(
+    tiny_products: Path, tmp_path: Path
+) -> None:
+    calibration = read_calibration(tiny_products / CALIBRATION_FILE)
+    images = tuple(read_observations([tiny_products / 'observations.mcap'], '/observations'))
+    later = dataclasses.replace(images[-1], time_ns=images[-1].time_ns + 10**9)
+    older, last = (dataclasses.replace(calibration, number=number) for number in (1, 2))
+    with contextlib.closing(Archive(tmp_path, 'camera')) as archive:
+        events = (Activation(8, 0, older), Activation(9, 8, last))
+        archive.keep(Ensemble((*images, later)), events)
+        assert main.main(['report', str(tmp_path)]) == EXIT_ACCEPTED  # while it is in use
+    page = (tmp_path / REPORT_FILE).read_text()
+    assert 'by the gate: calibration 2' in page
+    assert len(report._read_folder(tmp_path).observations or ()) == len(images)
+    assert '<svg' in page and 'no residuals (residuals.npz)' in page
 
 
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:

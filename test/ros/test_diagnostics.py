@@ -219,6 +219,39 @@ def test_sensor_data_publishers_are_received(
     client.until(lambda: newest(diagnostics, 'star_observer')[2].get('messages') == '1')
 
 
+IMPLAUSIBLE = 'm/s is not plausible for a spacecraft: left out'
+
+
+def test_velocities_of_no_spacecraft_are_counted_and_logged_once(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """NaN, inf and light speed were an error a message in the log, and OK in the diagnostics."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    observer = start_node('star_observer', ros=ros)
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    velocity = client.publisher(TwistStamped, '/spacecraft/velocity')
+    client.collect(StarObservations, 'observations')
+    client.until_listened()
+
+    def send(*speeds_m_s: float) -> None:
+        for speed_m_s in speeds_m_s:
+            message = TwistStamped()
+            message.twist.linear.y = speed_m_s
+            velocity.publish(message)
+
+    send(math.nan, math.inf, 3e8)
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('velocities_left_out') == '3')
+    level, text, _ = newest(diagnostics, 'star_observer')
+    assert level == b'\x01' and text == 'velocity [0.0, 300000000.0, 0.0] ' + IMPLAUSIBLE
+    send(7000.0)
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('messages') == '4')
+    level, text, values = newest(diagnostics, 'star_observer')
+    assert (level, text) == (b'\x00', 'waiting for images')
+    assert (values['velocities_left_out'], values['callback_errors']) == ('3', '0')
+    client.until(lambda: observer.said().count(IMPLAUSIBLE) > 0)
+    assert observer.said().count(IMPLAUSIBLE) == 1
+
+
 def test_a_publisher_that_is_not_received_is_named(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:

@@ -186,7 +186,7 @@ def test_two_cameras_with_one_frame_are_named(
 ) -> None:
     """In namespaces of their own, but with one transform; another name of the frame mends it."""
     ros2 = make(FAST)
-    params = ('--params-file', tiny_bag / 'params.yaml', '-p', 'state_report:=false')
+    params = ('--params-file', tiny_bag / 'params.yaml')
     stored = read_calibration(tiny_products / CALIBRATION_FILE)
     for k, name in enumerate(('left', 'right', 'third')):
         frame = 'third' if name == 'third' else stored.child_frame

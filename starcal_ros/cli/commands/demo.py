@@ -23,7 +23,6 @@ import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.child_process import module_command
-from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
 from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError, StarcalError
@@ -41,7 +40,6 @@ Process = subprocess.Popen[bytes]
 RATE = 5.0  # ten images in eight seconds
 _START_S = 30.0  # longest start of the nodes
 _QUIET_S = 10.0  # after the bag was played: no more images come
-_ANSWER_S = 60.0  # longest calibration
 _NODES = ('star_observer', 'calibrator')
 
 
@@ -139,14 +137,14 @@ def run(
                 stack.callback(_stop, nodes[name])
         _wait_for_images(bag.image_count, state / 'ensemble', nodes, folder, on_image)
         asked = subprocess.run(
-            node_command('request_client', ['calibrate', '--timeout', str(_ANSWER_S)]),
+            node_command('calibrate_client', []),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env=environment,
             text=True,
             check=False,
         )
-        if asked.returncode not in (EXIT_ACCEPTED, EXIT_REFUSED):
+        if asked.returncode:
             raise NodeError(f'{asked.stderr.strip()} (see the log files in {folder})')
         activated = next((state / 'calibrations').glob('*.json'), None)
         return (read_calibration(activated) if activated else None), asked.stdout.strip()
@@ -200,7 +198,7 @@ def _node_command(name: str, params: Path, state: Path) -> list[str]:
         'velocity': simulated_bag.VELOCITY_TOPIC,
     }
     remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
-    kept = ['-p', f'state_dir:={state}', '-p', 'state_report:=false']
+    kept = ['-p', f'state_dir:={state}']
     return node_command(name, ['--ros-args', '--params-file', str(params), *kept, *remaps])
 
 

@@ -71,6 +71,7 @@ class Telemetry:
         self._options = options
         self._on_damage = on_damage
         self._newest_ns: dict[str, int] = {}
+        self.velocities_left_out = 0  # not plausible; the first is reported
 
     def add(self, raw: RawMessage) -> bool:
         """Add a message, or report damage; False if its topic had a later stamp before."""
@@ -88,7 +89,13 @@ class Telemetry:
             sample = attitude_sample(time_ns, quaternion, self._options.attitude_direction)
             by_topic[raw.topic].add(time_ns, sample)
         elif raw.topic == self._topics.velocity:
-            time_ns, velocity_m_s = velocity_from_message(message)
+            try:
+                time_ns, velocity_m_s = velocity_from_message(message)
+            except ValueError as error:
+                self.velocities_left_out += 1
+                if self.velocities_left_out == 1:
+                    self._on_damage(f'{raw.topic}: {error}, as others like it')
+                return True
             bisect.insort(self.velocities, (time_ns, velocity_m_s), key=_stamp_ns)
         else:
             time_ns, temperature_degc = temperature_from_message(message)

@@ -39,6 +39,9 @@ from starcal_ros.records import (
     EnsembleStatus,
 )
 
+# No software on board reads them: they are in calibration.json alone.
+_NOT_SENT = ('model_checks', 'removals')
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -50,8 +53,10 @@ class Alignment:
 
 
 def calibration_to_message(calibration: Calibration, make: Make) -> Message:
-    """Return a starcal/Calibration with every number of the record."""
+    """Return a starcal/Calibration: the record without ``model_checks`` and ``removals``."""
     values = plain_record(calibration)
+    for name in _NOT_SENT:
+        del values[name]
     geometry = values.pop('geometry')
     frames = values.pop('parent_frame'), values.pop('child_frame')
     camera = calibration.geometry.camera

@@ -27,6 +27,8 @@ from starcal_ros.formats.messages.message_fields import (
 
 T = TypeVar('T')
 _STAMP_NS = operator.itemgetter(0)
+# The Earth moves at 3e4 m/s; a value beyond this limit would displace all stars.
+_MAX_VELOCITY_M_S = 1e6
 
 
 def attitude_from_message(message: Message) -> tuple[int, Floats]:
@@ -61,9 +63,18 @@ def attitude_to_message(
 
 
 def velocity_from_message(message: Message) -> tuple[int, Floats]:
-    """Stamp and (3,) m/s of a geometry_msgs/TwistStamped."""
+    """
+    Stamp and (3,) m/s of a geometry_msgs/TwistStamped.
+
+    Raises ValueError for a velocity that no spacecraft has; it is to be left out and counted.
+    """
     linear = message.twist.linear
-    return stamp_ns(message.header.stamp), np.array([linear.x, linear.y, linear.z], np.float64)
+    velocity_m_s = np.array([linear.x, linear.y, linear.z], np.float64)
+    if not float(np.abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
+        raise ValueError(
+            f'velocity {velocity_m_s.tolist()} m/s is not plausible for a spacecraft: left out'
+        )
+    return stamp_ns(message.header.stamp), velocity_m_s
 
 
 def velocity_to_message(time_ns: int, velocity_m_s: Floats, frame_id: str, make: Make) -> Message:

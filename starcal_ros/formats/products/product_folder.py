@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The folder of products of a calibration, as the tool and the calibrator write it.
+The folder of products of a calibration, as the tool writes it, and that of a calibrator's state.
 
 It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_calibrated.json``.
 """
@@ -34,6 +34,7 @@ from starcal_ros.record_codec import json_object, plain_record, read_record
 from starcal_ros.records import Calibration, StarObservations
 
 OBSERVATIONS_TOPIC = '/observations'
+STATE_CALIBRATIONS, STATE_ENSEMBLE = 'calibrations', 'ensemble'  # in a state folder
 RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
     CALIBRATION_FILE,
@@ -70,12 +71,20 @@ def write_observations(
 
 
 def calibration_file(path: Path) -> Path:
-    """Path of the calibration in a folder, or the file itself; raises ProductError if none."""
+    """
+    Path of the calibration in a folder, the last in a state folder, or the file itself.
+
+    Raises ProductError if there is none.
+    """
     if not path.is_dir():
         return path
-    if not (path / CALIBRATION_FILE).exists():
+    if (path / CALIBRATION_FILE).exists():
+        return path / CALIBRATION_FILE
+    activated = (path / STATE_CALIBRATIONS).glob(f'{8 * "[0-9]"}*_calibration_*.json')
+    last = max(activated, key=lambda file: int(file.name.partition('_')[0]), default=None)
+    if last is None:
         raise ProductError(f'{path}: the folder holds no {CALIBRATION_FILE}')
-    return path / CALIBRATION_FILE
+    return last
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:

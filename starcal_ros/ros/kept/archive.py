@@ -12,9 +12,9 @@ A file is written beside its place, synced, renamed, and the folder synced; it i
 afterwards.  So at any instant each file is complete or absent.
 
 The folder is untrusted input.  Only regular files of limited size are opened.  A file with a wrong
-seal (`kept.seal`), or with content that is no image or no calibration, is renamed to
-``….damaged`` and skipped.  With a key, the name of an image carries its HMAC:
-``00000012_<64 digits>.mcap``.
+seal (`Seal`), or with content that is no image or no calibration, is renamed to ``….damaged``
+and skipped.  A file that cannot be read is an error, since it may be sound.  With a key, the name
+of an image carries its HMAC: ``00000012_<64 digits>.mcap``.
 """
 
 from __future__ import annotations
@@ -47,6 +47,8 @@ from starcal_ros.formats.messages.message_fields import (
 )
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.products.product_folder import STATE_CALIBRATIONS as _CALIBRATIONS
+from starcal_ros.formats.products.product_folder import STATE_ENSEMBLE as _ENSEMBLE
 from starcal_ros.record_codec import json_object, read_record
 from starcal_ros.record_fields import Count
 from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
@@ -57,7 +59,7 @@ from starcal_ros.untrusted import read_bytes
 ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
-_ENSEMBLE, _CALIBRATIONS, _EMPTIED = 'ensemble', 'calibrations', 'ensemble.emptied'
+_EMPTIED = 'ensemble.emptied'
 _REFUSED, _METADATA = 'refused.json', 'metadata.yaml'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
@@ -99,7 +101,8 @@ class Archive:
     A state folder, locked by this process until `close`.
 
     The records in memory are authoritative; `keep` writes them.  Not safe for several threads.
-    Raises ArchiveError when the folder cannot be made or read, or another process has locked it.
+    Raises ArchiveError when the folder or a file in it cannot be made or read, or another process
+    has locked the folder.
 
     Attributes
     ----------
@@ -160,16 +163,16 @@ class Archive:
 
     def read_ensemble(self) -> Ensemble:
         """The ensemble on disk, in order of arrival; damaged images are set aside."""
-        images = []
+        images: dict[int, _Kept] = {}
         for path, name in self._files(_ENSEMBLE, _IMAGE_NAME):
             image = self._read_image(path, name)
-            if image is not None and image.time_ns not in self._images:
-                images.append(image)
-                self._images[image.time_ns] = _Kept(image, path)
+            if image is not None and image.time_ns not in images:
+                images[image.time_ns] = _Kept(image, path)
                 self._next_image = max(self._next_image, int(name[1]) + 1)
         for path, _ in self._files(_ENSEMBLE, re.compile(re.escape(_REFUSED))):
             self._refused = self._read_refused(path)
-        return Ensemble(tuple(images), dict(self._refused))
+        self._images = images  # all or none: `close` describes them
+        return Ensemble(tuple(kept.image for kept in images.values()), dict(self._refused))
 
     def set_aside_image(self, time_ns: int, why: str) -> None:
         """Rename the file of an image that cannot be used, so that it is not read again."""
@@ -307,7 +310,7 @@ class Archive:
         except FileNotFoundError:
             return
         except OSError as error:
-            raise ArchiveError(f'state_dir: {error.filename}: {error.strerror}') from error
+            raise _unreadable(self.folder / folder, error) from error
         highest = max((int(n[1]) for n in map(_NUMBERED.match, names) if n), default=0)
         if folder == _ENSEMBLE:
             self._next_image = max(self._next_image, highest + 1)
@@ -318,7 +321,11 @@ class Archive:
             if found is None:
                 continue
             path = self.folder / folder / name
-            if stat.S_ISREG(path.lstat().st_mode):
+            try:
+                is_file = stat.S_ISREG(path.lstat().st_mode)
+            except OSError as error:
+                raise _unreadable(path, error) from error
+            if is_file:
                 yield path, found
             else:
                 self.damage.append(f'{path}: not a regular file, skipped')
@@ -326,10 +333,10 @@ class Archive:
     def _read_image(self, path: Path, name: re.Match[str]) -> StarObservations | None:
         damage: list[str] = []
         try:
-            data = read_bytes(path, _MOST_BYTES, follow_links=False)
+            data = _content(path)
             self._seal.check_mark(name[2] or '', int(name[1]), data)
             found = list(read_observations([path], TOPIC, damage.append))
-        except (BagError, OSError, ValueError) as error:
+        except (BagError, ValueError) as error:
             self._set_aside(path, str(error))
             return None
         if damage or len(found) != 1:
@@ -380,8 +387,8 @@ class Archive:
     def _unsealed(self, path: Path, schema: int) -> Mapping[str, Any] | None:
         """The JSON object of a file with the right seals and this schema; else None."""
         try:
-            content = self._seal.opened(read_bytes(path, _MOST_BYTES, follow_links=False))
-        except (OSError, ValueError) as error:
+            content = self._seal.opened(_content(path))
+        except ValueError as error:
             self._set_aside(path, str(error))
             return None
         if content.get('schema') != schema:
@@ -394,6 +401,19 @@ class Archive:
         with contextlib.suppress(OSError):  # on a read-only disk it is skipped where it is
             path.rename(aside)
         self.damage.append(f'{aside}: damaged, set aside: {" ".join(why.split())}')
+
+
+def _content(path: Path) -> bytes:
+    """Content of a state file; raises ValueError for damage, ArchiveError if it is not known."""
+    try:
+        return read_bytes(path, _MOST_BYTES, follow_links=False)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> ArchiveError:
+    remedy = 'start the calibrator as the user who owns it, or move it to another place'
+    return ArchiveError(f'state_dir: {path} cannot be read: {error.strerror}; {remedy}')
 
 
 def check_publishable(calibration: Calibration) -> None:
@@ -443,5 +463,7 @@ def _locked(folder: Path) -> int:
             os.close(number)
         if isinstance(error, BlockingIOError):
             raise ArchiveError(f'state_dir: {folder} is in use by another calibrator') from error
+        if isinstance(error, PermissionError):
+            raise _unreadable(folder, error) from error
         raise ArchiveError(f'state_dir: {folder}: {error.strerror}') from error
     return number

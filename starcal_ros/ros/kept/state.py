@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.errors import ArchiveError, missing_package, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.node_options import CalibratorOptions
@@ -46,16 +45,13 @@ class Answer:
     """
     Result of a request: ``calibration`` is the solution, where there is one.
 
-    ``active`` states whether it is now the active one.  ``observations`` are its input, and
-    ``residuals`` belong to them; a calibration activated by a roll-back has neither.
+    ``active`` states whether it is now the active one.
     """
 
     success: bool
     message: str
     calibration: Calibration | None = None
     active: bool = False
-    residuals: Residuals | None = None
-    observations: tuple[StarObservations, ...] = ()
 
 
 class CalibratorState:
@@ -208,14 +204,14 @@ class CalibratorState:
         """Solve, and activate a calibration that the gate accepts, or any with ``force``."""
         ensemble = self.ensemble
         try:
-            calibration, residuals = solving.solve_with_residuals(
+            calibration = solving.solve(
                 ensemble, self._setup, method, estimate, active=self.active
             )
         except StarcalError as error:
             return Answer(False, str(error))
         if not calibration.accepted and not force:
             refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
-            return Answer(False, refused, calibration, False, residuals, ensemble.images)
+            return Answer(False, refused, calibration)
         if not calibration.accepted:
             why = (*calibration.reasons, 'activated by request despite the gate')
             calibration = dataclasses.replace(calibration, reasons=why, forced=True)
@@ -227,7 +223,7 @@ class CalibratorState:
             before = self._active.event if self._active else 0
             calibration = self._activate(self._next_event(), before, calibration)
         message = self._answer(f'activated: {summary(calibration)}').message
-        return Answer(True, message, calibration, True, residuals, ensemble.images)
+        return Answer(True, message, calibration, True)
 
     def rollback(self) -> Answer:
         """Activate the calibration before the active one again."""

@@ -154,6 +154,29 @@ def test_no_order_of_recording_changes_a_frame_unreported(
         assert differ == 0
 
 
+@pytest.mark.parametrize('order', ['last', 'first', 'alone'])
+@pytest.mark.parametrize('speed_m_s', [np.nan, np.inf, 3e8])
+def test_bad_velocities_are_left_out_and_reported_once(
+    tmp_path: Path, order: str, speed_m_s: float
+) -> None:
+    """NaN, inf or light speed in a bag ended in a traceback of the images."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        for second in range(10):
+            bad = order == 'alone' or (second > 4) == (order == 'last')
+            speeds = np.array([0.0, speed_m_s if bad else 7.0, 0.0])
+            writer.write_velocity('/velocity', second * 10**9, speeds, 'icrf')
+    told: list[str] = []
+    read = read_telemetry([tmp_path / 'bag'], TOPICS, on_damage=told.append)
+    assert len(read.velocities) + read.velocities_left_out == 10
+    assert read.velocities_left_out == (10 if order == 'alone' else 5)
+    assert len(told) == 1 and told[0].startswith('/velocity: velocity [0.0, ')
+    velocity_m_s, _ = read.at(7 * 10**9)
+    if order == 'alone':
+        assert velocity_m_s is None
+    else:
+        assert velocity_m_s is not None and velocity_m_s[1] == 7.0
+
+
 def test_late_samples_are_reported(tmp_path: Path) -> None:
     """One of the attitudes about the second image comes two seconds late."""
     messages = recording()

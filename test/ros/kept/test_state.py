@@ -139,7 +139,7 @@ def test_the_time_of_an_activation_is_read_when_it_is_made(
     """A roll-back during a solve is the earlier activation, and its time the earlier one."""
     state = filled(setup, shown)
     assert state.solve().success and state.solve().success
-    solve, times = solving.solve_with_residuals, []
+    solve, times = solving.solve, []
 
     def long_solve(*arguments: Any, **options: Any) -> Any:
         solved = solve(*arguments, **options)
@@ -148,7 +148,7 @@ def test_the_time_of_an_activation_is_read_when_it_is_made(
         times.append(back.calibration.active_since_ns)
         return solved
 
-    monkeypatch.setattr(solving, 'solve_with_residuals', long_solve)
+    monkeypatch.setattr(solving, 'solve', long_solve)
     answer = state.solve()
     assert answer.calibration is not None and answer.calibration is state.active
     assert times[0] < answer.calibration.active_since_ns
