@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_ros.camera import CameraModel
-from starcal_ros.errors import IngestError, NotFromStars
+from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
@@ -28,6 +28,7 @@ from starcal_ros.formats.images.photographs import (
     look_at,
     Photograph,
     pixels_of_photograph,
+    Refusals,
 )
 from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -71,15 +72,14 @@ def photographs_of(
     Raises NotFromStars when no file can be read.
     """
     looked: list[Photograph] = []
-    notes = []
+    refusals = Refusals()
     for path in image_paths(paths):
-        try:
+        with refusals.of(path):
             looked.append(look_at(path, focal_length_mm, pixel_um))
-        except IngestError as error:
-            notes.append(str(error))
     groups = by_camera(looked)
+    notes = refusals.lines()
     if not groups:
-        raise NotFromStars('; '.join(notes[:1]) or f'{paths[0]}: no images')
+        raise NotFromStars('; '.join(notes) or f'{paths[0]}: no images')
     (name, chosen), *others = groups.items()
     if others:
         left = ', '.join(f'{len(group)} of {other}' for other, group in others)
@@ -95,10 +95,10 @@ def from_photographs(
 
     Raises NotFromStars when the stars give no camera.
     """
-    found = camera_of_photographs(photographs, values)
+    found, notes = camera_of_photographs(photographs, values)
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
-        for image in _images(photographs):
+        for image in _images(photographs, Refusals()):
             if found.mirrored:
                 image = Image(image.time_ns, image.pixels[:, ::-1].copy())
             writer.write_image('/camera/image_raw', image, 'camera')
@@ -106,26 +106,33 @@ def from_photographs(
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
-    return _set_up(found, [bag], stated, folder, is_located)
+    return _set_up(found, [bag], stated, folder, is_located, notes)
 
 
 def camera_of_photographs(
     photographs: Sequence[Photograph], values: Mapping[str, object]
-) -> FromStars:
+) -> tuple[FromStars, list[str]]:
     """
-    Camera and rotations of photographs; the search starts at their stated focal length, if any.
+    Camera and rotations of photographs, and notes on files that turned out to be damaged.
 
-    Raises NotFromStars when the stars give no camera.
+    The search starts at their stated focal length, if any.  Raises NotFromStars when the stars
+    give no camera.
     """
     first = photographs[0]
     focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
     hint = pinhole((first.width, first.height), focal_px) if focal_px < 1e9 else None
-    return _found(_images(photographs), values, hint)
+    refusals = Refusals()
+    try:
+        return _found(_images(photographs, refusals), values, hint), refusals.lines()
+    except NotFromStars as error:
+        raise NotFromStars('; '.join([str(error), *refusals.lines()])) from error
 
 
-def _images(photographs: Sequence[Photograph]) -> Iterator[Image]:
+def _images(photographs: Sequence[Photograph], refusals: Refusals) -> Iterator[Image]:
+    """Images of the files that can be decoded."""
     for one in photographs:
-        yield Image(one.time_ns, pixels_of_photograph(one.path))
+        with refusals.of(one.path):
+            yield Image(one.time_ns, pixels_of_photograph(one.path))
 
 
 def from_bags(
@@ -176,6 +183,7 @@ def _set_up(
     values: Mapping[str, object],
     folder: Path,
     is_located: bool,
+    notes: Sequence[str] = (),
 ) -> NightSky:
     attitudes = folder / 'attitudes.mcap'
     with BagWriter(attitudes) as writer:
@@ -186,7 +194,7 @@ def _set_up(
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
-    return NightSky((*bags, attitudes), setup, (found.in_a_sentence(),), is_located)
+    return NightSky((*bags, attitudes), setup, (*notes, found.in_a_sentence()), is_located)
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:

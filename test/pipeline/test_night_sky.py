@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import dataclasses
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -204,3 +205,29 @@ def test_pictures_smaller_than_a_star_are_pictures_without_stars(
     pixels = [rng.integers(0, 255, (side, side + 3), np.uint8) for _ in range(4)]
     with pytest.raises(NotFromStars, match='no stars'):
         starcal_ros.calibrate_images(write_pngs(pixels, tmp_path / 'night'))
+
+
+@pytest.mark.slow
+def test_bad_files_among_photographs_cost_a_line_for_each_reason(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_pngs([one.pixels for one in tiny_images()], tmp_path / 'night')
+    os.mkfifo(folder / 'pipe.png')
+    (folder / 'zero.png').symlink_to('/dev/zero')
+    (folder / 'loop.png').symlink_to('loop.png')
+    (folder / 'folder.png').mkdir()
+    whole = (folder / '00.png').read_bytes()
+    for k in range(50):  # the header is sound, the pixels are not
+        (folder / f'half{k}.png').write_bytes(whole[:9000])
+        (folder / f'a{k}.jpg').write_bytes(b'\xff\xd8\xff' + bytes(200))
+    cut = cv2.imencode('.jpg', (tiny_images()[0].pixels / 256).astype(np.uint8))[1].tobytes()
+    (folder / 'cut.jpg').write_bytes(cut[: len(cut) // 2])
+    assert main(['calibrate', str(folder), '-o', str(tmp_path / 'out')]) in (0, 3)
+    said = capfd.readouterr().err
+    assert 'left out: 50 files (half0.png, half1.png, half10.png, ...): a PNG, not r' in said
+    assert 'left out: 50 files (a0.jpg, a1.jpg, a10.jpg, ...): a JPEG, not readable' in said
+    assert 'left out: 2 files (pipe.png, zero.png): not a regular file' in said
+    assert 'left out: 1 file (cut.jpg): damaged' in said
+    assert len(said.splitlines()) < 12
+    used = read_calibration(tmp_path / 'out' / 'calibration.json').images_used
+    assert used == len(tiny_images())

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
 from dataclasses import dataclass
-import glob
 from pathlib import Path
 import sys
 import tempfile
@@ -72,8 +71,6 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
     from starcal_ros.formats.images.photographs import image_paths
 
     photographs = image_paths(args.bags)
-    if not photographs and any(glob.has_magic(str(path)) for path in args.bags):
-        raise OptionError(f'{args.bags[0]}: no such files')
     if photographs or without_attitudes(args.bags, asked):
         return _calibrate_by_stars(args, asked, photographs)
     if args.params is None:
@@ -103,6 +100,7 @@ def _calibrate_by_stars(args: argparse.Namespace, asked: Topics, photographs: li
     from starcal_ros.pipeline import night_sky  # seldom needed, slow to load
 
     bags = [] if photographs else args.bags
+    read = [] if photographs else reader.mcap_files(bags)
     check_folder(args.output, bags, (*photographs, *filter(None, [args.params])))
     values = read_values(args.params) if args.params else {}
     make_folder(args.output)
@@ -114,6 +112,7 @@ def _calibrate_by_stars(args: argparse.Namespace, asked: Topics, photographs: li
                 )
                 for note in notes:
                     print_text(note, file=sys.stderr)
+                read = [one.path for one in chosen]
                 found = night_sky.from_photographs(chosen, values, Path(folder))
             else:
                 found = night_sky.from_bags(bags, asked, values, Path(folder))
@@ -122,7 +121,7 @@ def _calibrate_by_stars(args: argparse.Namespace, asked: Topics, photographs: li
             raise
         for note in found.notes:
             print_text(note, file=sys.stderr)
-        files = [*(photographs or reader.mcap_files(bags)), *filter(None, [args.params])]
+        files = [*read, *filter(None, [args.params])]
         return _calibrate(args, asked, found.setup, found.bags, files, found.through_air)
 
 
