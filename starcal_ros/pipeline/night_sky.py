@@ -79,7 +79,7 @@ def photographs_of(
     groups = by_camera(looked)
     notes = refusals.lines()
     if not groups:
-        raise NotFromStars('; '.join(notes) or f'{paths[0]}: no images')
+        raise NotFromStars('; '.join(['no image can be read', *notes]))
     (name, chosen), *others = groups.items()
     if others:
         left = ', '.join(f'{len(group)} of {other}' for other, group in others)
