@@ -118,7 +118,7 @@ def calibrated(given: Scenario) -> Calibration:
             for image in images(given):
                 writer.write_image('/camera/image_raw', image, 'camera')
         found = night_sky.from_bags([bag], topics.Topics(), {}, Path(name))
-        chosen = topics.choose_topics(found.bags, topics.Topics(), found.setup)
+        chosen = topics.choose_topics(found.bags, found.topics, found.setup)
         measured = list(topics.read(found.bags, chosen, found.setup))
         ensemble = Ensemble()
         for one in found.through_air(measured)[0]:

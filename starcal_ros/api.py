@@ -253,7 +253,7 @@ def calibrate_images(images: Path | str | Sequence[Path | str], **options: objec
     chosen, _ = night_sky.photographs_of(paths)
     with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
         found = night_sky.from_photographs(chosen, options, Path(folder))
-        in_bags = topics.choose_topics(found.bags, topics.Topics(), found.setup)
+        in_bags = topics.choose_topics(found.bags, found.topics, found.setup)
         measured = topics.read(found.bags, in_bags, found.setup)
         through_air = found.through_air(list(measured))[0]
         ensemble = solve.ensemble_of(through_air, found.setup)

@@ -132,13 +132,17 @@ def _inspect(args: argparse.Namespace) -> int:
         OBSERVATIONS_TYPE,
     )
     from starcal_ros.pipeline import inspect
+    from starcal_ros.pipeline.topics import without_attitudes
 
     setup = None
     if args.params:
         from starcal_ros.pipeline.setup import read_setup
 
         setup = read_setup(args.params)
-    if setup and not setup.is_aligned:
+    alone = args.camera_alone or without_attitudes(
+        args.bags, _asked(args), setup.options() if setup else {}
+    )
+    if setup and not (setup.is_aligned or alone):
         from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
 
         setup, aligned = aligned_by_bags(args.bags, _asked(args), setup)
@@ -146,15 +150,16 @@ def _inspect(args: argparse.Namespace) -> int:
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with terminal.progress_bar(total, 'images') as advance:
-        found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
+        found = inspect.inspect(args.bags, _asked(args), setup, advance, args.camera_alone)
     if found.chosen and found.images and sum(r.count for r in found.refused) == found.images:
         from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
 
         why = of_refusals(found.refused, found.images)
-        if setup and not found.chosen.observations:
+        if setup and not (found.chosen.observations or found.by_stars):
             why = of_a_failure(args.bags, _asked(args), setup, found.refused)
         if why:
-            problems = (*found.problems, why.in_a_sentence())
+            command = '' if found.by_stars else 'starcal diagnose'
+            problems = (*found.problems, why.in_a_sentence(command))
             found = dataclasses.replace(found, problems=problems)
     if args.json:
         _print_json(found)

@@ -341,8 +341,9 @@ def _observations(
 
 def options_of(values: Mapping[str, object]) -> dict[str, object]:
     """Options of a calibration whose attitudes are those of `from_stars`."""
+    others = ('more_star_trackers', 'more_alignments')
     return {
-        **values,
+        **{name: value for name, value in values.items() if name not in others},
         'method': 'per_image',
         'star_tracker_sigma_arcsec': (_SIGMA_ARCSEC,) * 3,
         'star_tracker_frame': '',

@@ -89,6 +89,7 @@ class Inspection:
     samples around an accepted image; NaN if none records it.  Only if the stars were ``measured``
     are there ``stars_per_image`` (accepted images), ``refused_stars`` (by reason) and the
     ``status`` of a calibration; if not, an image may still be refused for its stars.
+    ``by_stars`` is True if the stars alone would give the camera, without attitudes;
     ``problems`` are why the bag cannot be calibrated.
     """
 
@@ -104,6 +105,7 @@ class Inspection:
     status: EnsembleStatus | None
     damage: tuple[str, ...]
     problems: tuple[str, ...]
+    by_stars: bool
 
 
 def inspect(
@@ -111,21 +113,28 @@ def inspect(
     asked: Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
+    camera_alone: bool = False,
 ) -> Inspection:
     """
     Contents of bags and the images that a calibration would refuse.
 
     With a setup, stars are measured as for a calibration; without one, images are only checked
-    against the attitudes, at the default limits. Raises BagError when a bag is missing or not a
-    bag.
+    against the attitudes, at the default limits.  So are images of which the stars give the camera
+    alone, without attitudes. Raises BagError when a bag is missing or not a bag.
     """
     damage: dict[str, None] = {}  # an ordered set
     topics = _contents(paths, lambda text: damage.setdefault(text))
     options = setup.attitude if setup else AttitudeOptions()
     problems = []
-    chosen, seen = None, []
+    chosen, seen, by_stars = None, [], False
     try:
-        chosen = bag_topics.choose_topics(paths, asked, setup)
+        if by_stars := bag_topics.without_attitudes(
+            paths, asked, setup.options() if setup else {}, camera_alone
+        ):
+            setup = None
+            chosen = Topics(image=bag_topics.choose_image_topic(paths, asked))
+        else:
+            chosen = bag_topics.choose_topics(paths, asked, setup)
         if setup:
             found = bag_topics.read(paths, chosen, setup)
         elif chosen.observations:
@@ -161,6 +170,7 @@ def inspect(
         status=status,
         damage=tuple(damage),
         problems=tuple(problems),
+        by_stars=by_stars,
     )
 
 
@@ -233,8 +243,10 @@ def placed(
         height, width = image.pixels.shape
         try:
             check_order(image, latest_ns)
-            before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
-            gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+            gap_s = math.nan
+            if topics.attitude:
+                before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
+                gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
         except ImageRefused as refused:
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
             continue

@@ -9,6 +9,7 @@ calibration of these bags is the same as that of any bag.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
 from dataclasses import dataclass
 import itertools
 import math
@@ -35,10 +36,12 @@ from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.from_stars import from_stars, FromStars, options_of, pinhole
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.pipeline.topics import choose_image_topic, Topics
+from starcal_ros.pipeline.topics import choose_image_topic, stated_tracker, Topics
 from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
+
+_ATTITUDE_TOPIC = '/stars/attitude'
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class NightSky:
     """
     Bags and set-up of a calibration by the stars alone, and notes for the user.
 
+    ``topics`` are those to read: the attitudes of the stars, in place of any in the bags.
     ``is_located`` is False if neither the options nor the files state the site of the camera.
     """
 
@@ -53,14 +57,22 @@ class NightSky:
     setup: Setup
     notes: tuple[str, ...]
     is_located: bool
+    topics: Topics
 
     def through_air(
         self, observations: Sequence[StarObservations]
     ) -> tuple[list[StarObservations], str]:
         """Observations, refracted if the stars show it and no site is given, and a note on it."""
+        # An image has an attitude if its stars were identified.
+        images = [
+            dataclasses.replace(one, refusal='no_match', detail='no part of the sky was found')
+            if one.refusal in ('no_attitude', 'attitude_gap')
+            else one
+            for one in observations
+        ]
         if self.is_located:
-            return list(observations), ''
-        return with_air(observations, self.setup.prior.camera)
+            return images, ''
+        return with_air(images, self.setup.prior.camera)
 
 
 def photographs_of(
@@ -106,7 +118,7 @@ def from_photographs(
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
-    return _set_up(found, [bag], stated, folder, is_located, notes)
+    return _set_up(found, [bag], stated, folder, is_located, Topics(), notes)
 
 
 def camera_of_photographs(
@@ -146,7 +158,7 @@ def from_bags(
     found = camera_of_bags(bags, choose_image_topic(bags, asked), values)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
-    return _set_up(found, bags, values, folder, is_located)
+    return _set_up(found, bags, values, folder, is_located, asked)
 
 
 def camera_of_bags(
@@ -183,18 +195,23 @@ def _set_up(
     values: Mapping[str, object],
     folder: Path,
     is_located: bool,
+    asked: Topics,
     notes: Sequence[str] = (),
 ) -> NightSky:
     attitudes = folder / 'attitudes.mcap'
     with BagWriter(attitudes) as writer:
         for time_ns in sorted(found.icrf_from_camera):
             xyzw = found.icrf_from_camera[time_ns].as_quat()
-            writer.write_attitude('/stars/attitude', time_ns, xyzw, 'icrf')
+            writer.write_attitude(_ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
     prior = CameraGeometry(found.camera, np.array([0.0, 0.0, 0.0, 1.0]))
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
-    return NightSky((*bags, attitudes), setup, (*notes, found.in_a_sentence()), is_located)
+    notes = [*notes, found.in_a_sentence()]
+    if unused := stated_tracker(values):
+        notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
+    topics = dataclasses.replace(asked, attitude=_ATTITUDE_TOPIC)
+    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics)
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:

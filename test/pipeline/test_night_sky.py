@@ -211,7 +211,8 @@ def test_pictures_smaller_than_a_star_are_pictures_without_stars(
 def test_bad_files_among_photographs_cost_a_line_for_each_reason(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_pngs([one.pixels for one in tiny_images()], tmp_path / 'night')
+    frames = [*(one.pixels for one in tiny_images()), lights(0)]
+    folder = write_pngs(frames, tmp_path / 'night')
     os.mkfifo(folder / 'pipe.png')
     (folder / 'zero.png').symlink_to('/dev/zero')
     (folder / 'loop.png').symlink_to('loop.png')
@@ -229,5 +230,7 @@ def test_bad_files_among_photographs_cost_a_line_for_each_reason(
     assert 'left out: 2 files (pipe.png, zero.png): not a regular file' in said
     assert 'left out: 1 file (cut.jpg): damaged' in said
     assert len(said.splitlines()) < 12
-    used = read_calibration(tmp_path / 'out' / 'calibration.json').images_used
-    assert used == len(tiny_images())
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert calibration.images_used == len(tiny_images())
+    # In the words of photographs, which have no attitudes.
+    assert calibration.images_refused == {'no_match': 1}

@@ -71,10 +71,11 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
     from starcal_ros.formats.images.photographs import image_paths
 
     photographs = image_paths(args.bags)
-    if photographs or without_attitudes(args.bags, asked):
+    values = read_values(args.params) if args.params else {}
+    if photographs or without_attitudes(args.bags, asked, values, args.camera_alone):
         return _calibrate_by_stars(args, asked, photographs)
     if args.params is None:
-        raise OptionError('--params: needed for a bag with attitudes')
+        raise OptionError('--params: needed for a bag with attitudes, unless --camera-alone')
     setup = read_setup(args.params)
     check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
     files = (*reader.mcap_files(args.bags), args.params)
@@ -122,7 +123,7 @@ def _calibrate_by_stars(args: argparse.Namespace, asked: Topics, photographs: li
         for note in found.notes:
             print_text(note, file=sys.stderr)
         files = [*read, *filter(None, [args.params])]
-        return _calibrate(args, asked, found.setup, found.bags, files, found.through_air)
+        return _calibrate(args, found.topics, found.setup, found.bags, files, found.through_air)
 
 
 def _calibrate(
@@ -322,7 +323,7 @@ def _failure(
         found = of_a_failure(job.bags, job.asked, job.setup, groups)
     if found is None:
         return NotCalibrated(words, named, refused)
-    words += f'. {found.in_a_sentence()}'
+    words += f'. {found.in_a_sentence("starcal diagnose" if job.through_air is None else "")}'
     return NotCalibrated(words, named, refused, found.cause, found.evidence, found.mend)
 
 
