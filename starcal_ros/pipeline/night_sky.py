@@ -30,17 +30,26 @@ from starcal_ros.formats.images.photographs import (
     Photograph,
     pixels_of_photograph,
     Refusals,
+    without_copies,
 )
 from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.pipeline.from_stars import from_stars, FromStars, options_of, pinhole
+from starcal_ros.pipeline.from_stars import (
+    count_of_stars,
+    FEWEST_SOURCES,
+    from_stars,
+    FromStars,
+    options_of,
+    pinhole,
+)
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.pipeline.topics import choose_image_topic, stated_tracker, Topics
 from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
 
+_FEW = 5  # images that are looked at for stars
 _ATTITUDE_TOPIC = '/stars/attitude'
 
 
@@ -58,21 +67,26 @@ class NightSky:
     notes: tuple[str, ...]
     is_located: bool
     topics: Topics
+    copies_ns: frozenset[int] = frozenset()
 
     def through_air(
         self, observations: Sequence[StarObservations]
     ) -> tuple[list[StarObservations], str]:
         """Observations, refracted if the stars show it and no site is given, and a note on it."""
-        # An image has an attitude if its stars were identified.
-        images = [
-            dataclasses.replace(one, refusal='no_match', detail='no part of the sky was found')
-            if one.refusal in ('no_attitude', 'attitude_gap')
-            else one
-            for one in observations
-        ]
+        images = [self._in_words_of_stars(one) for one in observations]
         if self.is_located:
             return images, ''
         return with_air(images, self.setup.prior.camera)
+
+    def _in_words_of_stars(self, one: StarObservations) -> StarObservations:
+        """Observations of a copy refused, and of an image without stars as such."""
+        if one.time_ns in self.copies_ns:
+            reason, detail = 'frozen', 'a copy of another image'
+        elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
+            reason, detail = 'no_match', 'its stars are no part of the sky'
+        else:
+            return one
+        return refused_image(one.time_ns, one.width, one.height, reason, detail)
 
 
 def photographs_of(
@@ -89,14 +103,28 @@ def photographs_of(
         with refusals.of(path):
             looked.append(look_at(path, focal_length_mm, pixel_um))
     groups = by_camera(looked)
-    notes = refusals.lines()
     if not groups:
-        raise NotFromStars('; '.join(['no image can be read', *notes]))
-    (name, chosen), *others = groups.items()
+        raise NotFromStars('; '.join(['no image can be read', *refusals.lines()]))
+    if len(groups) > 1:
+        with_stars = {name: _shows_stars(group) for name, group in groups.items()}
+        groups = dict(sorted(groups.items(), key=lambda item: not with_stars[item[0]]))
+    (name, group), *others = groups.items()
+    chosen = without_copies(group, refusals)
+    notes = refusals.lines()
     if others:
-        left = ', '.join(f'{len(group)} of {other}' for other, group in others)
+        left = ', '.join(
+            f'{len(group)} of {other}{"" if with_stars[other] else ", which show no stars"}'
+            for other, group in others
+        )
         notes.append(f'{len(chosen)} images of {name} are used; left out: {left}')
     return in_order(chosen), notes
+
+
+def _shows_stars(group: Sequence[Photograph]) -> bool:
+    """True if one of a few images of a group, from its first to its last, shows stars."""
+    few = [group[k * (len(group) - 1) // (_FEW - 1)] for k in range(min(_FEW, len(group)))]
+    images = _images(few, Refusals())
+    return any(count_of_stars(image.pixels) >= FEWEST_SOURCES for image in images)
 
 
 def from_photographs(
@@ -211,7 +239,7 @@ def _set_up(
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
     topics = dataclasses.replace(asked, attitude=_ATTITUDE_TOPIC)
-    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics)
+    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics, found.copies_ns)
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:

@@ -13,6 +13,7 @@ import io
 import math
 import os
 from pathlib import Path
+import re
 from typing import Any
 import warnings
 
@@ -71,6 +72,7 @@ class Photograph:
     focal_px: float = math.nan
     site: tuple[float, float, float] | None = None
     camera: str = ''
+    file_bytes: int = 0
 
 
 def image_paths(paths: Iterable[Path]) -> list[Path]:
@@ -192,6 +194,15 @@ def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
             one = replace(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
         found.append(one)
     return found
+
+
+def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
+    """Photographs of one camera; of those with the same time of exposure, the largest file."""
+    kept: dict[object, Photograph] = {}
+    for one in sorted(photographs, key=lambda one: (-one.file_bytes, one.path.name)):
+        if kept.setdefault(one.time_ns if one.dated else one.path, one) is not one:
+            refusals.add(one.path, 'a copy: another file has its time of exposure')
+    return list(kept.values())
 
 
 def by_camera(photographs: Sequence[Photograph]) -> dict[str, list[Photograph]]:
@@ -347,7 +358,8 @@ def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Ph
     if math.isnan(focal_px) and equivalent_mm > 0:
         focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
     site, camera = _exif_site(gps), ' '.join(words)
-    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera)
+    size = path.stat().st_size
+    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera, size)
 
 
 def _real(value: object) -> float:
@@ -381,7 +393,10 @@ def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
     with contextlib.suppress(ValueError, OverflowError):
         aware = datetime.strptime(f'{text} {zone or "+0000"}', '%Y:%m:%d %H:%M:%S %z')
         if _DATES[0] <= aware < _DATES[1]:
-            return round((aware.timestamp() + half_s) * NANOSECONDS_PER_SECOND), True, bool(zone)
+            digits = str(tags.get(0x9291) or '').strip('\0 ')  # SubSecTimeOriginal
+            part_s = float(f'0.{digits}') if digits.isdecimal() and len(digits) < 10 else 0.0
+            middle_s = aware.timestamp() + part_s + half_s
+            return round(middle_s * NANOSECONDS_PER_SECOND), True, bool(zone)
     return _time_of_file(path), False, False
 
 
@@ -408,6 +423,10 @@ def _exif_site(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 
 
 def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Photograph:
+    for key in ('IMAGETYP', 'OBSTYPE', 'FRAME'):
+        kind = str(header[key].value).strip().lower() if key in header else ''
+        if re.search('dark|flat|bias', kind):
+            raise IngestError(f'{path}: no image of the sky: {key} is {kind[:40]!r}')
     time_ns, dated = _time_of_file(path), False
     with contextlib.suppress(TimeError, ValueError, OverflowError):
         stated_ns = middle_of_exposure(header, '')

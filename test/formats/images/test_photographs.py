@@ -25,6 +25,8 @@ from starcal_ros.formats.images.photographs import (
     in_order,
     look_at,
     pixels_of_photograph,
+    Refusals,
+    without_copies,
 )
 
 TIME_S = calendar.timegm((2024, 3, 9, 22, 10, 4))
@@ -123,6 +125,20 @@ def test_equal_stamps_are_set_apart(tmp_path: Path) -> None:
     paths = image_paths([tmp_path])
     first, second = in_order([look_at(path) for path in paths])
     assert second.time_ns - first.time_ns == 10**9
+
+
+def test_of_files_with_one_time_of_exposure_the_largest_is_kept(tmp_path: Path) -> None:
+    for name, part, quality in (('a', '25', 50), ('b', '25', 95), ('c', '75', 95)):
+        exif = Image.Exif()
+        exif.update({**CANON, EXIF: {**DATE, 0x9291: part}})
+        pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f'{name}.jpg', exif=exif, quality=quality)
+    refusals = Refusals()
+    kept = without_copies([look_at(path) for path in image_paths([tmp_path])], refusals)
+    assert sorted(one.path.name for one in kept) == ['b.jpg', 'c.jpg']
+    assert refusals.lines() == [
+        'left out: 1 file (a.jpg): a copy: another file has its time of exposure'
+    ]
 
 
 def dng(path: Path, mosaic: NDArray[np.uint16]) -> Path:
