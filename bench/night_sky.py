@@ -120,7 +120,7 @@ def calibrated(given: Scenario) -> Calibration:
             for image in images(given):
                 writer.write_image('/camera/image_raw', image, 'camera')
         found = night_sky.from_bags([bag], Topics(), {}, Path(name))
-        campaign = calibrate_bags(found.bags, found.setup, Topics(), None, found.through_air)
+        campaign = calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)
         return campaign.calibration
 
 

@@ -253,7 +253,7 @@ def calibrate_images(images: Path | str | Sequence[Path | str], **options: objec
     with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
         found = night_sky.from_photographs(chosen, options, Path(folder))
         inputs = inputs_of([one.path for one in chosen])
-        campaign = calibrate_bags(found.bags, found.setup, Topics(), inputs, found.through_air)
+        campaign = calibrate_bags(found.bags, found.setup, found.topics, inputs, found.through_air)
     return campaign.calibration
 
 

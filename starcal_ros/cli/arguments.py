@@ -238,9 +238,15 @@ def _lens(command: argparse.ArgumentParser) -> None:
     command.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
 
 
+def _camera_alone(command: argparse.ArgumentParser) -> None:
+    what = 'estimate the camera by its stars, without attitudes and alignment, in the bag or not'
+    command.add_argument('--camera-alone', action='store_true', help=what)
+
+
 def _inspect(command: argparse.ArgumentParser) -> None:
     _bags(command, _BAGS)
     _params(command, 'ROS parameter file; with it the stars are measured too')
+    _camera_alone(command)
     _topics(command)
     _json(command)
 
@@ -262,6 +268,7 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
         '--no-report', action='store_true',
         help='write no report; starcal report DIR writes it later',
     )  # fmt: skip
+    _camera_alone(command)
     _lens(command)
     _topics(command)
     when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'

@@ -141,7 +141,7 @@ def _inspect(args: argparse.Namespace) -> int:
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with terminal.progress_bar(total, 'images') as advance:
-        found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
+        found = inspect.inspect(args.bags, _asked(args), setup, advance, args.camera_alone)
     for note in found.notes:
         terminal.print_text(note, file=sys.stderr)
     if args.json:

@@ -176,6 +176,8 @@ def print_inspection(inspection: Inspection) -> None:
         )
     if inspection.problems:
         print_verdict(False, 'cannot be calibrated: ' + '; '.join(inspection.problems))
+    elif inspection.by_stars:
+        print_verdict(True, 'no problems found so far; the camera alone, without attitudes')
     elif inspection.measured:
         print_verdict(True, 'can be calibrated')
     else:

@@ -17,16 +17,17 @@ import math
 import time
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.lens import ideal_points
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.identification.blind.bright_sources import bright_sources
+from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
 from starcal_ros.identification.blind.search import (
     confirm_sky,
     find_in_any,
@@ -52,7 +53,11 @@ _HALF_FIELDS_DEG = (
 _SEARCHED = 4  # images that are searched over all focal lengths
 _SEARCH_S = 150.0  # of processor time
 _CENTROID_PX = 0.3  # of a bright source
-_FEWEST_SOURCES = 6
+FEWEST_SOURCES = 6
+_HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
+_BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
+# Of noise: exposures have 0, or 0.3 by what their sensor adds to each.
+_NOISE_SIDE_PX, _SAME_NOISE = 256, 0.5
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
@@ -65,8 +70,9 @@ class FromStars:
     Camera and rotations of images that were identified by their stars.
 
     ``camera`` is of the images mirrored left to right where they are ``mirrored``;
-    ``icrf_from_camera`` by stamp; ``images`` is the number of all images; ``other_focal_px`` has
-    the focal lengths of images that match the sky with another camera and are left out.
+    ``icrf_from_camera`` by stamp; ``images`` is the number of different images, ``copies_ns`` has
+    the stamps of copies of them; ``other_focal_px`` has the focal lengths of images that match the
+    sky with another camera and are left out.
     """
 
     camera: CameraModel
@@ -74,6 +80,7 @@ class FromStars:
     icrf_from_camera: Mapping[int, Rotation]
     images: int
     other_focal_px: tuple[float, ...] = ()
+    copies_ns: frozenset[int] = frozenset()
 
     def in_a_sentence(self) -> str:
         """Findings as a sentence for a person."""
@@ -87,19 +94,25 @@ class FromStars:
         flipped = '; the images are mirrored, and were mirrored back' if self.mirrored else ''
         others = ', '.join(f'{focal_px:.0f}' for focal_px in self.other_focal_px)
         left_out = f'; left out, with another focal length: {others} px' if others else ''
+        copies = f'; left out: {len(self.copies_ns)} copies' if self.copies_ns else ''
         return (
             f'{len(self.icrf_from_camera)} of {self.images} images identified by their stars:'
-            f' focal length {fx:.1f} px, field {field} degrees{left_out}{flipped}'
+            f' focal length {fx:.1f} px, field {field} degrees{left_out}{copies}{flipped}'
         )
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """Sources of an image: all by their light, and the compact ones, without glare."""
+    """
+    Sources of an image: all by their light, and the compact ones, without glare.
+
+    ``stars`` counts those that may be stars; 0 in a picture of anything but the night sky.
+    """
 
     time_ns: int
     all: Floats
     compact: Floats
+    stars: int
 
 
 @one_blas_thread()
@@ -116,13 +129,13 @@ def from_stars(
     """
     seen, size, copies = _sources(images)
     if len(seen) < min_images:
-        again = f' ({copies} more are copies)' if copies else ''
+        again = f' ({len(copies)} more are copies)' if copies else ''
         raise NotFromStars(
             f'{len(seen)} different images{again}, {min_images} are needed: {ADVICE}'
         )
-    rich = [one for one in seen if len(one.all) >= _FEWEST_SOURCES]
+    rich = [one for one in seen if one.stars >= FEWEST_SOURCES]
     if not rich:
-        counts = [len(one.all) for one in seen]
+        counts = [one.stars for one in seen]
         raise NotFromStars(
             f'no stars: {int(np.median(counts))} star-like sources in an image; {ADVICE}, and'
             ' focus at infinity'
@@ -144,15 +157,18 @@ def from_stars(
             ' no clouds, no lights, no frames of anything else'
         )
     camera, rotations = _common_camera(found, catalog, first.camera)
-    return FromStars(camera, first.mirrored, rotations, len(seen), other_focal_px)
+    return FromStars(
+        camera, first.mirrored, rotations, len(seen), other_focal_px, frozenset(copies)
+    )
 
 
-def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], int]:
-    """Sources of the images that differ, their size, and the number of copies."""
+def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], list[int]]:
+    """Sources of the images that differ, their size, and the stamps of copies."""
     seen: list[_Seen] = []
     size = (0, 0)
     sums = set()
-    copies = 0
+    noises: list[Floats] = []
+    copies = []
     for image in images:
         height, width = image.pixels.shape
         if size == (0, 0):
@@ -162,17 +178,51 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], int
                 f'images of {size[0]} x {size[1]} and of {width} x {height}: give those of one'
                 ' camera and mode'
             )
-        digest = hash(image.pixels.tobytes())
-        if digest in sums:
-            copies += 1
+        digest, noise = hash(image.pixels.tobytes()), _noise(image.pixels)
+        if digest in sums or any(float(noise @ other) > _SAME_NOISE for other in noises):
+            copies.append(image.time_ns)
             continue
         sums.add(digest)
+        noises.append(noise)
         sources = bright_sources(image.pixels)
         # The structure of a corona is wide along both axes, as few stars are.
         middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
         compact = sources.xy_px[sources.wide_px <= middle_px]
-        seen.append(_Seen(image.time_ns, sources.xy_px, compact))
+        stars = _count_of_stars(image.pixels, sources)
+        seen.append(_Seen(image.time_ns, sources.xy_px, compact, stars))
     return seen, size, copies
+
+
+def count_of_stars(pixels: Pixels) -> int:
+    """Number of sources of an image that may be stars; 0 of anything but the night sky."""
+    return _count_of_stars(pixels, bright_sources(pixels))
+
+
+def _count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
+    low, middle, high = np.percentile(pixels[::4, ::4], [10, 50, 90])
+    brightest = sources.peak_dn[:_BRIGHTEST]
+    # By day and by lamps the peaks are hardly above the rest of the picture.
+    if not len(brightest) or np.median(brightest) - middle < _LEAST_CONTRAST * (high - low):
+        return 0
+    return int(np.count_nonzero(sources.wide_px > _HOT_PIXEL_PX))
+
+
+def _noise(pixels: Pixels) -> Floats:
+    """
+    Noise in the middle of an image without its stars, a unit vector; zeros if there is none.
+
+    It differs between exposures, and is still there in a copy that was compressed again.
+    """
+    v, u = (max(0, (side - _NOISE_SIDE_PX) // 2) // 8 * 8 for side in pixels.shape)
+    part = pixels[v : v + _NOISE_SIDE_PX, u : u + _NOISE_SIDE_PX].astype(np.float64)
+    rows, columns = (side // 2 for side in part.shape)
+    # Compression keeps little of the noise of single pixels.
+    binned = part[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+    noise = binned - uniform_filter(binned, 5)
+    sigma = 1.4826 * float(np.median(np.abs(noise)))
+    noise[np.abs(noise) > 3.0 * sigma] = 0.0
+    length = float(np.linalg.norm(noise))
+    return np.asarray(noise.ravel() / length if length > 0 else np.zeros(noise.size))
 
 
 def pinhole(size: tuple[int, int], focal_px: float) -> CameraModel:
@@ -203,7 +253,7 @@ def _first_match(
 ) -> tuple[SkyMatch, bool] | None:
     """An image identified with one of the cameras, and whether by its compact sources."""
     deadline_s = time.thread_time() + _SEARCH_S
-    ordered = sorted(seen, key=lambda one: -len(one.all))
+    ordered = sorted(seen, key=lambda one: -one.stars)
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
         for camera in cameras:
@@ -341,8 +391,9 @@ def _observations(
 
 def options_of(values: Mapping[str, object]) -> dict[str, object]:
     """Options of a calibration whose attitudes are those of `from_stars`."""
+    others = ('more_star_trackers', 'more_alignments')
     return {
-        **values,
+        **{name: value for name, value in values.items() if name not in others},
         'method': 'per_image',
         'star_tracker_sigma_arcsec': (_SIGMA_ARCSEC,) * 3,
         'star_tracker_frame': '',

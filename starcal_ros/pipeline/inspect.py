@@ -90,7 +90,7 @@ class Inspection:
     are there ``stars_per_image`` (accepted images), ``refused_stars`` (by reason) and the
     ``status`` of a calibration; if not, an image may still be refused for its stars.
     ``problems`` are why the bag cannot be calibrated, ``notes`` state the alignment that was found
-    where none is given.
+    where none is given.  ``by_stars`` is True if the stars alone would give the camera.
     """
 
     bags: tuple[str, ...]
@@ -105,6 +105,7 @@ class Inspection:
     status: EnsembleStatus | None
     damage: tuple[str, ...]
     problems: tuple[str, ...]
+    by_stars: bool
     notes: tuple[str, ...] = ()
 
 
@@ -113,28 +114,35 @@ def inspect(
     asked: Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
+    camera_alone: bool = False,
 ) -> Inspection:
     """
     Contents of bags and the images that a calibration would refuse.
 
     With a setup, stars are measured as for a calibration, which measures images that match no star
     once more in the end; without one, images are only checked against the attitudes, at the
-    default limits. Raises BagError when a bag is missing or not a bag.
+    default limits.  So are images of which the stars give the camera alone, without attitudes.
+    Raises BagError when a bag is missing or not a bag.
     """
     damage: dict[str, None] = {}  # an ordered set
     topics = _contents(paths, lambda text: damage.setdefault(text))
     options = setup.attitude if setup else AttitudeOptions()
     problems = []
     notes: tuple[str, ...] = ()
-    chosen, seen = None, []
+    chosen, seen, by_stars = None, [], False
     try:
+        if by_stars := bag_topics.without_attitudes(
+            paths, asked, setup.options() if setup else {}, camera_alone
+        ):
+            setup = None
+            chosen = Topics(image=bag_topics.choose_image_topic(paths, asked))
         if setup:
             from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
 
             source = source_of(paths, setup, asked)
             chosen, setup, notes = source.topics, source.setup, source.notes
             found = bag_topics.read(paths, chosen, setup)
-        elif (chosen := bag_topics.choose_topics(paths, asked)).observations:
+        elif (chosen := chosen or bag_topics.choose_topics(paths, asked)).observations:
             found = reader.read_observations(paths, chosen.observations)
         else:
             found = placed(paths, chosen, options)
@@ -153,7 +161,8 @@ def inspect(
     if chosen and not problems:
         problems += _shortages(used, status)
     if chosen and seen and not used:
-        problems += _causes(paths, chosen, setup, refusals(seen))
+        command = '' if by_stars else 'starcal diagnose'
+        problems += _causes(paths, chosen, setup, refusals(seen), command)
     return Inspection(
         bags=tuple(map(str, paths)),
         topics=topics,
@@ -169,6 +178,7 @@ def inspect(
         status=status,
         damage=tuple(damage),
         problems=tuple(problems),
+        by_stars=by_stars,
         notes=notes,
     )
 
@@ -242,8 +252,10 @@ def placed(
         height, width = image.pixels.shape
         try:
             check_order(image, latest_ns)
-            before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
-            gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+            gap_s = math.nan
+            if topics.attitude:
+                before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
+                gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
         except ImageRefused as refused:
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
             continue
@@ -266,16 +278,20 @@ def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
 
 
 def _causes(
-    paths: Sequence[Path], chosen: Topics, setup: Setup | None, refused: Sequence[Refused]
+    paths: Sequence[Path],
+    chosen: Topics,
+    setup: Setup | None,
+    refused: Sequence[Refused],
+    command: str,
 ) -> list[str]:
-    """The cause for which all images are refused, in a sentence."""
+    """The cause for which all images are refused, in a sentence; ``command`` gives details."""
     from starcal_ros.pipeline.diagnosis import bags  # seldom needed, slow
 
     if setup and not chosen.observations:
         cause = bags.of_a_failure(paths, chosen, setup, refused)
     else:
         cause = bags.of_refusals(refused, sum(group.count for group in refused))
-    return [cause.in_a_sentence()] if cause else []
+    return [cause.in_a_sentence(command)] if cause else []
 
 
 def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) -> list[str]:

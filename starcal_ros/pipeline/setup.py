@@ -129,7 +129,7 @@ class SetupOptions:
 
     camera_info_url: str = option(
         '',
-        'prior camera, a ROS camera YAML or a .cameramodel of mrcal: a path, or a file:// or'
+        'prior camera, a camera file of ROS, OpenCV, kalibr or mrcal: a path, or a file:// or'
         ' package:// URL',
         basic=True,
         is_path=True,

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+import re
 
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
@@ -22,6 +23,10 @@ from starcal_ros.formats.messages.message_fields import (
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
+
+_OF_A_STAR_TRACKER = ('prior_alignment', 'star_tracker_sigma_arcsec', 'more_star_trackers')
+_LIKE_ATTITUDES = re.compile('Odometry|Pose|TFMessage|Transform|Quaternion|Attitude|Orientation')
+_CAMERA_ALONE = 'starcal calibrate --camera-alone estimates the camera without an alignment'
 
 Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
@@ -102,18 +107,26 @@ def _choose_attitudes(
     except BagError as error:
         if first:
             raise
-        raise BagError(f'{error}{_other_attitudes(there, asked)}') from error
+        raise BagError(f'{error}{_other_attitudes(there, asked)}; {_CAMERA_ALONE}') from error
 
 
 def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
-    """Return which topics may hold the attitudes in messages of another type."""
+    """Return which topics may hold the attitudes in messages of another type, and the remedy."""
     names = {kind: name for name, kind in ATTITUDE_TYPES.items()}
-    return ''.join(
-        f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}: if it holds the attitudes, set'
-        f' attitude_message: {names[topic.type_name]}'
-        for topic in there
-        if topic.type_name in names and topic.name.lstrip('/') == (asked or topic.name).lstrip('/')
-    )
+    text = ''
+    for topic in there:
+        if asked and topic.name.lstrip('/') != asked.lstrip('/'):
+            continue
+        name = topic.type_name.rpartition('/')[2]
+        if topic.type_name in names:
+            option = f'attitude_message: {names[topic.type_name]}'
+            text += f'; {topic.name} is a {name}: if it holds the attitudes, set {option}'
+        elif _LIKE_ATTITUDES.search(name):
+            text += (
+                f'; {topic.name} is a {name}, which is not read: publish its orientation as a'
+                f' QuaternionStamped, or as a PoseStamped with attitude_message: pose'
+            )
+    return text
 
 
 def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:
@@ -202,11 +215,33 @@ def _of_frame(frame: Frame, setup: Setup, track: Track) -> tuple[StarObservation
     )
 
 
-def without_attitudes(bags: Sequence[Path], asked: Topics) -> bool:
-    """Return True if bags hold images, but neither attitudes nor observations."""
+def without_attitudes(
+    bags: Sequence[Path],
+    asked: Topics,
+    options: Mapping[str, object],
+    camera_alone: bool = False,
+) -> bool:
+    """
+    Return True if bags of images are to be calibrated by their stars alone.
+
+    So are bags without attitudes and observations, unless the options state a star tracker, which
+    is then missing; and all bags if the camera alone is requested.
+    """
     kinds = {topic.type_name for topic in reader.topics(bags)}
+    has_images = bool(kinds & _IMAGE_TYPES)
+    if camera_alone:
+        return has_images
     others = {*ATTITUDE_TYPES.values(), OBSERVATIONS_TYPE}
-    return bool(kinds & _IMAGE_TYPES) and not kinds & others and not asked.attitude
+    return has_images and not (kinds & others or asked.attitude or stated_tracker(options))
+
+
+def stated_tracker(options: Mapping[str, object]) -> list[str]:
+    """Names of the options that state a star tracker."""
+    values = {name: options.get(name) or () for name in _OF_A_STAR_TRACKER}
+    # A bad value is refused where the options are read.
+    return [
+        name for name, value in values.items() if not isinstance(value, Iterable) or any(value)
+    ]
 
 
 def count(paths: Sequence[Path], topics: Topics) -> int:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
 import json
+import os
 from pathlib import Path
 
+from astropy.io import fits
 import cv2
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.pipeline.from_stars import from_stars
+from starcal_ros.pipeline.night_sky import photographs_of
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.studies.simulation.rendering import images
@@ -204,3 +207,116 @@ def test_pictures_smaller_than_a_star_are_pictures_without_stars(
     pixels = [rng.integers(0, 255, (side, side + 3), np.uint8) for _ in range(4)]
     with pytest.raises(NotFromStars, match='no stars'):
         starcal_ros.calibrate_images(write_pngs(pixels, tmp_path / 'night'))
+
+
+@pytest.mark.slow
+def test_bad_files_among_photographs_cost_a_line_for_each_reason(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    frames = [*(one.pixels for one in tiny_images()), lights(0)]
+    folder = write_pngs(frames, tmp_path / 'night')
+    os.mkfifo(folder / 'pipe.png')
+    (folder / 'zero.png').symlink_to('/dev/zero')
+    (folder / 'loop.png').symlink_to('loop.png')
+    (folder / 'folder.png').mkdir()
+    whole = (folder / '00.png').read_bytes()
+    for k in range(50):  # the header is sound, the pixels are not
+        (folder / f'half{k}.png').write_bytes(whole[:9000])
+        (folder / f'a{k}.jpg').write_bytes(b'\xff\xd8\xff' + bytes(200))
+    cut = cv2.imencode('.jpg', (tiny_images()[0].pixels / 256).astype(np.uint8))[1].tobytes()
+    (folder / 'cut.jpg').write_bytes(cut[: len(cut) // 2])
+    assert main(['calibrate', str(folder), '-o', str(tmp_path / 'out')]) in (0, 3)
+    said = capfd.readouterr().err
+    assert 'left out: 50 files (half0.png, half1.png, half10.png, ...): a PNG, not r' in said
+    assert 'left out: 50 files (a0.jpg, a1.jpg, a10.jpg, ...): a JPEG, not readable' in said
+    assert 'left out: 2 files (pipe.png, zero.png): not a regular file' in said
+    assert 'left out: 1 file (cut.jpg): damaged' in said
+    assert len(said.splitlines()) < 12
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert calibration.images_used == len(tiny_images())
+    # In the words of photographs, which have no attitudes.
+    assert calibration.images_refused == {'no_match': 1}
+
+
+def daylight(seed: int, size: tuple[int, int] = (512, 640)) -> Pixels:
+    """A picture with detail of all sizes, evenly lit: leaves, clouds, walls."""
+    rng = np.random.default_rng(seed)
+    light = np.full(size, 9000.0)
+    for blur_px in (1.0, 3.0, 9.0, 30.0):
+        noise = cv2.GaussianBlur(rng.normal(size=size), (0, 0), blur_px)
+        light += 2000.0 * noise / noise.std()
+    return light.clip(0, 65535).astype(np.uint16)
+
+
+def dark(seed: int) -> Pixels:
+    """A dark frame with hot pixels."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.normal(200.0, 5.0, (512, 640))
+    pixels[rng.integers(0, 512, 300), rng.integers(0, 640, 300)] += rng.uniform(200, 9000, 300)
+    return pixels.astype(np.uint16)
+
+
+def jpeg(pixels: Pixels, quality: int) -> Pixels:
+    """An image in 8 bit, compressed and read again."""
+    eight = (pixels / 8.0).clip(0, 255).astype(np.uint8)
+    coded = cv2.imencode('.jpg', eight, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED))
+
+
+def test_the_group_with_stars_is_taken_not_the_largest(tmp_path: Path) -> None:
+    folder = write_pngs([daylight(k, (400, 500)) for k in range(8)], tmp_path / 'card')
+    for k, image in enumerate(tiny_images()[:3]):
+        cv2.imwrite(str(folder / f'night{k}.png'), image.pixels)
+    chosen, notes = photographs_of([folder])
+    assert [one.path.name for one in chosen] == ['night0.png', 'night1.png', 'night2.png']
+    assert notes == [
+        '3 images of 640 x 512 are used; left out: 8 of 500 x 400, which show no stars'
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('other', [daylight, dark])
+def test_many_images_of_no_stars_do_not_hide_a_few_of_stars(
+    other: Callable[[int], Pixels],
+) -> None:
+    nights = tiny_images()[:4]
+    others = [Image(nights[0].time_ns - 10**9 * (k + 1), other(k)) for k in range(16)]
+    found = from_stars([*others, *nights], load_catalog())
+    assert found.icrf_from_camera.keys() == {one.time_ns for one in nights}
+
+
+@pytest.mark.parametrize('kind', ['Dark Frame', 'FLAT', 'Bias Frame', 'Master Dark'])
+def test_frames_of_the_detector_are_left_out_by_their_headers(tmp_path: Path, kind: str) -> None:
+    for name, value in (('light', 'Light Frame'), ('other', kind)):
+        hdu = fits.PrimaryHDU(np.ones((30, 40), np.float32))
+        hdu.header['IMAGETYP'] = value
+        hdu.writeto(tmp_path / f'{name}.fits')
+    chosen, notes = photographs_of([tmp_path])
+    assert [one.path.name for one in chosen] == ['light.fits']
+    assert notes == [
+        'left out: 1 file (other.fits): no image of the sky: IMAGETYP is ' + repr(kind.lower())
+    ]
+
+
+def test_copies_that_were_compressed_again_are_one_image(tmp_path: Path) -> None:
+    noise = np.random.default_rng(2).normal(0.0, 40.0, (512, 640))
+    pixels = (tiny_images()[0].pixels + 200.0 + noise).clip(0).astype(np.uint16)
+    copies = [jpeg(pixels, quality) for quality in (95, 90, 80, 70)]
+    folder = write_pngs(copies, tmp_path / 'night')
+    with pytest.raises(NotFromStars, match=r'1 different images \(3 more are copies\)'):
+        starcal_ros.calibrate_images(folder)
+
+
+def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
+    """Also with a pattern that the sensor adds to each."""
+    pixels = tiny_images()[0].pixels.astype(np.float64)
+    sky = cv2.medianBlur(tiny_images()[0].pixels, 5)
+    stars = np.where(pixels > sky + 60.0, pixels, sky)
+    rng = np.random.default_rng(3)
+    pattern = rng.normal(0.0, 3.0, pixels.shape)
+    frames = [
+        jpeg((stars + pattern + rng.normal(0.0, 6.0, pixels.shape)).clip(0).astype(np.uint16), 90)
+        for _ in range(2)
+    ]
+    with pytest.raises(NotFromStars, match='^2 different images, 3 are needed'):
+        starcal_ros.calibrate_images(write_pngs(frames, tmp_path / 'night'))

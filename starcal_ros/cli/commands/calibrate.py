@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
 from dataclasses import dataclass
-import glob
 from pathlib import Path
 import sys
 import tempfile
@@ -110,14 +109,13 @@ def _source(
     from starcal_ros.formats.images.photographs import image_paths
 
     photographs = image_paths(args.bags)
-    if not photographs and any(glob.has_magic(str(path)) for path in args.bags):
-        raise OptionError(f'{args.bags[0]}: no such files')
-    if photographs or without_attitudes(args.bags, asked):
+    values = read_values(args.params) if args.params else {}
+    if photographs or without_attitudes(args.bags, asked, values, args.camera_alone):
         with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
             yield _source_by_stars(args, asked, photographs, Path(folder))
         return
     if args.params is None:
-        raise OptionError('--params: needed for a bag with attitudes')
+        raise OptionError('--params: needed for a bag with attitudes, unless --camera-alone')
     setup = read_setup(args.params)
     check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
     with _failure_recorded(args, OptionError):
@@ -132,6 +130,7 @@ def _source_by_stars(
     from starcal_ros.pipeline import night_sky  # seldom needed, slow to load
 
     bags = [] if photographs else args.bags
+    files = [] if photographs else reader.mcap_files(bags)
     params = list(filter(None, [args.params]))
     check_folder(args.output, bags, (*photographs, *params))
     values = read_values(args.params) if args.params else {}
@@ -142,12 +141,13 @@ def _source_by_stars(
                 photographs, args.focal_length_mm, args.pixel_size_um
             )
             _tell(notes)
+            files = [photograph.path for photograph in chosen]
             sky = night_sky.from_photographs(chosen, values, folder)
         else:
             sky = night_sky.from_bags(bags, asked, values, folder)
     _tell(sky.notes)
-    source = campaign.source_of(sky.bags, sky.setup, asked, sky.through_air)
-    return source, (*(photographs or reader.mcap_files(bags)), *params)
+    source = campaign.source_of(sky.bags, sky.setup, sky.topics, sky.through_air)
+    return source, (*files, *params)
 
 
 @contextlib.contextmanager
@@ -293,7 +293,7 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
         cause = of_a_failure(source.bags, source.topics, source.setup, groups)
     if cause is None:
         return NotCalibrated(words, named, refused)
-    words += f'. {cause.in_a_sentence()}'
+    words += f'. {cause.in_a_sentence("starcal diagnose" if source.through_air is None else "")}'
     return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
 
 

@@ -78,10 +78,10 @@ def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
 
     Raises NotFromStars when the stars give no camera.
     """
-    found = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
+    found, notes = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
     options = night_sky.site_of(photographs)
     to_state = () if options else (_OF_PLACE,)
-    return FirstSetup(found.camera, options, (found.in_a_sentence(),), to_state)
+    return FirstSetup(found.camera, options, (found.in_a_sentence(), *notes), to_state)
 
 
 def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:

@@ -10,31 +10,44 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+import contextlib
 from dataclasses import dataclass
 import functools
 import logging
+import os
 from pathlib import Path
 import re
+import shlex
+
+from mcap.summary import Summary
 
 from starcal_ros.errors import BagError, errors_as, ImageRefused
-from starcal_ros.formats.bag.mcap_reader import (
-    Damage,
-    MAGIC,
-    RawMessage,
-    read_messages,
-    read_summary,
-)
-from starcal_ros.formats.bag.typestore import typestore_of
+from starcal_ros.formats.bag.mcap_reader import Damage, RawMessage, read_messages, read_summary
+from starcal_ros.formats.bag.typestore import typestore, typestore_of
+from starcal_ros.formats.file_kinds import FileKind, kind_of, MCAP, ROS_1_BAG, SQLITE_BAG
 from starcal_ros.formats.messages.image_messages import image_from_message, refused_from_message
-from starcal_ros.formats.messages.message_fields import Message, nearest_stamp_ns
+from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPES,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    Message,
+    nearest_stamp_ns,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
-_SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
-_MAGIC_BYTES = 16
-_HOW_TO_IMPORT = '; starcal import makes a bag of image files'
+_OF_IMAGES = (
+    ': starcal calibrate or init takes images alone; starcal import makes a bag of image files and'
+    ' attitudes'
+)
+# Topics of other types may be unknown to the converter, which then stops.
+_CONVERTED = frozenset(
+    [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES.values(), VELOCITY_TYPE, TEMPERATURE_TYPE]
+)
 _LONGEST_NAME = 4096  # of a path on Linux
 
 
@@ -77,24 +90,32 @@ class Topics:
 
 
 def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
-    """MCAP files of bags in recording order; raises BagError where a path has none."""
+    """
+    MCAP files of bags in the order of their first messages, each once.
+
+    Raises BagError where a path has none.
+    """
     files = []
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
-        elif path.exists():  # opening a pipe would wait for its writer
-            if not path.is_file():
-                raise BagError(f'{path}: not a regular file')
+        elif os.path.lexists(path):
             files.append(path)
         else:
             raise BagError(f'{path}: no such bag')
     for file in files:
-        with errors_as(BagError, file), file.open('rb') as stream:
-            magic = stream.read(_MAGIC_BYTES)
-        if not magic.startswith(MAGIC):
-            other = _how_to_convert(file, magic) or _HOW_TO_IMPORT
-            raise BagError(f'{file}: not an MCAP bag{other}')
-    return files
+        with errors_as(BagError, file):  # opening a pipe would wait for its writer
+            kind = kind_of(file)
+        if kind is not MCAP:
+            raise BagError(f'{file}: not an MCAP bag{_instead(file, kind)}')
+    # A shell sorts rec_10 before rec_2.
+    return sorted(dict.fromkeys(files), key=_first_ns)
+
+
+def _first_ns(file: Path) -> int:
+    """Time of recording of the first message of a file; 0 for an empty one."""
+    status = file.stat()
+    return _listed(file, status.st_size, status.st_mtime_ns)[2]
 
 
 def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
@@ -109,7 +130,7 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
         status = file.stat()
-        listed, damage = _listed(file, status.st_size, status.st_mtime_ns)
+        listed, damage, _ = _listed(file, status.st_size, status.st_mtime_ns)
         for text in damage:
             on_damage(text)
         for topic in listed:
@@ -118,25 +139,27 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
 
 
-@functools.lru_cache(maxsize=64)
-def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str]]:
-    """Topics of a file and its damage; kept, as a file without summary is read for them."""
-    damage: list[str] = []
-    found = _summary(file)
-    if not found:
-        messages = read_messages(file, None, damage.append)
-        counts = Counter((raw.topic, raw.type_name) for raw in messages)
-        found = [Topic(*topic, count) for topic, count in counts.items()]
-    return found, damage
-
-
-def _summary(file: Path) -> list[Topic]:
-    """Topics in the summary of a file; none if it is damaged or has no counts."""
+@functools.lru_cache(maxsize=256)
+def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str], int]:
+    """Topics of a file, its damage, and the time of its first message."""
     summary = read_summary(file)
-    if summary is None or summary.statistics is None:
-        return []
+    damage: list[str] = []
+    if summary is not None and summary.statistics is not None and (found := _summary(summary)):
+        return found, damage, summary.statistics.message_start_time
+    # Kept, as a file without summary is read for them.
+    counts: Counter[tuple[str, str]] = Counter()
+    first_ns = 0
+    for raw in read_messages(file, None, damage.append):
+        first_ns = raw.log_time_ns if not counts else min(first_ns, raw.log_time_ns)
+        counts[raw.topic, raw.type_name] += 1
+    return [Topic(*topic, count) for topic, count in counts.items()], damage, first_ns
+
+
+def _summary(summary: Summary) -> list[Topic]:
+    """Topics in the summary of a file; none if it has no counts."""
     found = []
-    for number, count in summary.statistics.channel_message_counts.items():
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    for number, count in counts.items():
         channel = summary.channels.get(number)
         schema = summary.schemas.get(channel.schema_id) if channel else None
         # Without a schema a message has no type: it is not of ROS 2.
@@ -239,22 +262,37 @@ def decode(raw: RawMessage) -> Message:
 def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
     names, compression = _metadata(folder / 'metadata.yaml')
-    if compression:
+    if compression.lower() == 'message':
         raise BagError(
-            f'{folder}: compressed by {compression.lower()}; decompress it with ros2 bag convert'
+            f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
+            f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
+            f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
         )
+    if compression:  # of files, which zstd leaves without the ending
+        names = [name.removesuffix('.zstd') for name in names]
+    here = sorted(folder.iterdir(), key=_natural)
     listed = [folder / name for name in names if (folder / name).is_file()]
-    here = (path for path in folder.glob('*.mcap') if path.is_file())
-    found = listed or sorted(here, key=_natural)
+    found = listed or [path for path in here if path.suffix == '.mcap' and path.is_file()]
     if not found:
-        other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
         inside = next(folder.glob('*/*.mcap'), None)
-        near = f' (did you mean {inside.parent}?)' if inside and not other else ''
-        raise BagError(f'{folder}: no .mcap files in the folder{other or near or _HOW_TO_IMPORT}')
+        near = f' (did you mean {inside.parent}?)' if inside else ''
+        raise BagError(f'{folder}: no .mcap files in the folder{_instead_of_any(here) or near}')
     missing = [name for name in names if not (folder / name).is_file()]
     if missing and listed:
-        raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
+        packed = (folder / f'{missing[0]}.zstd').is_file()
+        remedy = f': zstd -d {shlex.quote(str(folder))}/*.zstd' if packed else ''
+        raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing{remedy}')
     return found
+
+
+def _instead_of_any(files: Iterable[Path]) -> str:
+    """End of an error message on a folder without MCAP files: the first file that is of use."""
+    for file in files:
+        with contextlib.suppress(OSError, ValueError):
+            kind = SQLITE_BAG if file.suffix == '.db3' else kind_of(file)
+            if kind.is_image or kind.instead or kind in (SQLITE_BAG, ROS_1_BAG):
+                return f', but {file.name}:{_instead(file, kind).removeprefix(" but")}'
+    return ''
 
 
 def _metadata(path: Path) -> tuple[list[str], str]:
@@ -279,20 +317,31 @@ def _is_inside(name: object) -> bool:
     return not Path(name).is_absolute() and '..' not in Path(name).parts
 
 
-def _how_to_convert(path: Path, magic: bytes) -> str:
-    """End of an error message: the command that converts a bag of another kind to MCAP."""
-    if magic.startswith(_SQLITE):
-        # rosbags converts the folder with its metadata.yaml, not the file in it.
-        kind, source = 'an SQLite bag', path.parent if path.suffix == '.db3' else path
-    elif magic.startswith(_ROS_1):
-        kind, source = 'a ROS 1 bag', path
-    else:
+def _instead(file: Path, kind: FileKind) -> str:
+    """End of an error message on a file that is no MCAP bag: what it is, and what helps."""
+    if kind.is_image:
+        return f' but {kind.name}{_OF_IMAGES}'
+    if kind.instead:
+        return f' but {kind.name}: {kind.instead.replace("FILE", shlex.quote(str(file)))}'
+    if kind not in (SQLITE_BAG, ROS_1_BAG):
         return ''
-    destination = source.with_name(f'{source.stem}_mcap')
-    return (
-        f' but {kind}: rosbags-convert --src {source} --dst {destination} --dst-storage mcap'
-        ' makes one'
-    )
+    # rosbags converts the folder with its metadata.yaml, not the file in it.
+    source = file.parent if kind is SQLITE_BAG else file
+    command = ['rosbags-convert', '--src', str(source)]
+    command += ['--dst', str(source.with_name(f'{source.stem}_mcap')), '--dst-storage', 'mcap']
+    if names := _convertible(source):
+        command += ['--include-topic', *names]
+    return f' but {kind.name}: {shlex.join(command)} makes one'
+
+
+def _convertible(source: Path) -> list[str]:
+    """Topics that starcal reads of a bag of another kind; none where it cannot be opened."""
+    from rosbags.highlevel import AnyReader  # seldom needed, slow to load
+
+    # The exceptions of a damaged bag have no common base class.
+    with contextlib.suppress(Exception), AnyReader([source], default_typestore=typestore()) as bag:
+        return sorted(name for name, topic in bag.topics.items() if topic.msgtype in _CONVERTED)
+    return []
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -13,6 +13,7 @@ import contextlib
 from dataclasses import dataclass
 import itertools
 import math
+import os
 from pathlib import Path
 from typing import Any
 import warnings
@@ -23,15 +24,15 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, IngestError, needing
+from starcal_ros.formats.file_kinds import FITS, kind_of
 from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
 from starcal_ros.formats.images.time_systems import Card, middle_of_exposure, TimeError
 from starcal_ros.formats.messages.image_messages import CHANNELS, of_mosaic, plane
-from starcal_ros.untrusted import read_bytes
+from starcal_ros.untrusted import regular_file
 
-FITS_ENDINGS = ('.fits', '.fit', '.fts', '.fits.gz', '.fit.gz', '.fits.fz', '.fz')
 _RGB, _GREY = 3, 2
 MOST_VALUES = 2**27  # per image, all colours; the nodes have the same limit
-MOST_BYTES = 2**31
+MOST_BYTES = 2**29  # of a file that is decoded as a whole
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
 _FULL = 65000  # of 16 bit; the end of the range means saturation
 
@@ -168,10 +169,14 @@ def check_alike(files: Sequence[ImageFile]) -> None:
 
 
 def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str, Card]]:
-    if path.name.lower().endswith(FITS_ENDINGS):
+    if is_fits(path):
         values, header = read_fits(path, options.hdu)
     else:
-        values, header = _read_picture(path), {}
+        content = content_of(path)
+        if not (png_header(content) or tiff_header(content)):
+            raise IngestError(f'{path}: not an image in FITS, TIFF or PNG')
+        values, header = decoded(path, content), {}
+        values = values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
     is_colour = values.ndim == _RGB and values.shape[2] == _RGB
     if (is_colour or options.bayer) and options.channel not in CHANNELS:
         raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
@@ -187,17 +192,21 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
     return values, header
 
 
+def is_fits(path: Path) -> bool:
+    """True if a file is FITS by its content, compressed or not; raises IngestError."""
+    with errors_as(IngestError, path):
+        return kind_of(path) is FITS
+
+
 def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
     """Values and cards of the image ``hdu``, or the first, of a FITS file; raises IngestError."""
     with needing('mission', IngestError, path):
         from astropy.io import fits
-    if path.exists() and not path.is_file():  # opening a pipe would block until it has a writer
-        raise IngestError(f'{path}: not a regular file')
     try:
         # Not mapped to memory: scaled data cannot be, and files are read one at a time.
         with (
             _truncation_is_an_error(),
-            path.open('rb') as file,
+            regular_file(path) as file,
             fits.open(file, memmap=False, uint=True) as units,
         ):
             if hdu:
@@ -252,34 +261,32 @@ def read_values(path: Path) -> NDArray[Any]:
     return _read(path, ImageOptions())[0]
 
 
-def content_of(path: Path) -> bytes:
-    """Content of an image file; raises IngestError when it cannot be read."""
-    with errors_as(IngestError, path):
-        return read_bytes(path, MOST_BYTES)
+def content_of(path: Path, first_bytes: int = MOST_BYTES) -> bytes:
+    """Content of an image file, or its first bytes; raises IngestError if it cannot be read."""
+    with errors_as(IngestError, path), regular_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > MOST_BYTES:
+            raise ValueError(f'larger than {MOST_BYTES // 2**20} MB')
+        return file.read(min(size, first_bytes))
 
 
 def decoded(path: Path, content: bytes) -> NDArray[Any]:
-    """Values of an image file without EXIF rotation, colour as BGR; raises IngestError."""
+    """
+    Values of an image file without EXIF rotation, colour as BGR; raises IngestError.
+
+    The size in the header of a PNG or TIFF is checked before anything is decoded.
+    """
+    header = png_header(content) or tiff_header(content)
+    if header and header.width * header.height * header.channels > MOST_VALUES:
+        raise IngestError(f'{path}: its header claims {header.width} x {header.height} pixels')
+    if header and png_header(content) and has_surplus(content, header):
+        raise IngestError(f'{path}: inflates to far more than its pixels')
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise IngestError(f'{path}: damaged, or in a format that OpenCV cannot read')
     return np.asarray(values)
-
-
-def _read_picture(path: Path) -> NDArray[Any]:
-    content = content_of(path)
-    header = png_header(content) or tiff_header(content)
-    if header is None:
-        raise IngestError(f'{path}: not an image in FITS (by its ending), TIFF or PNG')
-    # The size is checked before anything is decoded.
-    if header.width * header.height * header.channels > MOST_VALUES:
-        raise IngestError(f'{path}: its header claims {header.width} x {header.height} pixels')
-    if png_header(content) and has_surplus(content, header):
-        raise IngestError(f'{path}: inflates to far more than its pixels')
-    values = decoded(path, content)
-    return values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
 
 
 def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:

@@ -6,39 +6,50 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timezone
 import glob
 import importlib
 import io
 import math
 import os
 from pathlib import Path
+import re
 from typing import Any
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import IngestError, needing
+from starcal_ros.errors import errors_as, IngestError, needing
+from starcal_ros.formats.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
 from starcal_ros.formats.images.image_files import (
     content_of,
     decoded,
-    FITS_ENDINGS,
     MOST_VALUES,
     number,
     read_fits,
 )
 from starcal_ros.formats.images.time_systems import Card, middle_of_exposure, TimeError
 
-_RAW = ('.dng', '.cr2', '.cr3', '.nef', '.arw', '.orf', '.rw2', '.raf', '.pef')
-ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', *_RAW, *FITS_ENDINGS)
+# Of files whose content says nothing, as of damaged ones.
+_ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts')
 _DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
 _EXIF, _GPS = 0x8769, 0x8825
 _FOCAL_LENGTH = 0x920A
 _GREEN = 1
 _SAME_STAMP_NS = NANOSECONDS_PER_SECOND  # file times are often equal; stamps must differ
+# Outside of it a clock was not set, or a file is damaged; stamps of ROS end in 2038.
+_DATES = datetime(1990, 1, 1, tzinfo=timezone.utc), datetime(2037, 1, 1, tzinfo=timezone.utc)
+_FIRST_NS, _LAST_NS = (round(date.timestamp()) * NANOSECONDS_PER_SECOND for date in _DATES)
+_NAMES_SHOWN, _MOST_REASONS = 3, 8
+_LONGEST_EXPOSURE_S = 86400.0
+# Focal length over the diagonal: fields of 160 degrees to 0.1 degrees.
+_SHORTEST, _LONGEST = 0.08, 600.0
+# Tags before the pixels: Pillow would look through all of a damaged file for them, byte by byte.
+_JPEG_HEADER_BYTES = 2**22
 
 
 @dataclass(frozen=True)
@@ -61,38 +72,117 @@ class Photograph:
     focal_px: float = math.nan
     site: tuple[float, float, float] | None = None
     camera: str = ''
+    file_bytes: int = 0
 
 
 def image_paths(paths: Iterable[Path]) -> list[Path]:
-    """Image files of paths, folders and patterns; empty where there are none."""
-    found: list[Path] = []
+    """
+    Files of paths, folders and patterns if an image is among them, else none: they are bags.
+
+    Files that are no images are in the list too, so that each is read or refused with a reason.
+    A folder with a bag in it is a bag.  Raises IngestError for a pattern that matches nothing.
+    """
+    files: list[Path] = []
     for path in paths:
         if glob.has_magic(str(path)) and not path.exists():
-            found += [Path(name) for name in sorted(glob.glob(str(path)))]
-        elif path.is_dir():
-            found += sorted(path.iterdir())
-        else:
-            found.append(path)
-    return [path for path in found if path.name.lower().endswith(ENDINGS)]
+            names = sorted(glob.glob(str(path)))
+            if not names:
+                raise IngestError(f'{path}: no such files')
+            files += map(Path, names)
+        elif not path.is_dir():
+            files.append(path)
+        elif not (any(path.glob('*.mcap*')) or (path / 'metadata.yaml').exists()):
+            files += sorted(file for file in path.iterdir() if not file.name.startswith('.'))
+    return files if any(map(_is_image, files)) else []
+
+
+def _is_image(path: Path) -> bool:
+    """True if a file is an image of any kind, or was to be one by its name."""
+    with contextlib.suppress(OSError, ValueError):
+        kind = kind_of(path)
+        if kind is not UNKNOWN:
+            return kind.is_image
+    return path.name.lower().endswith(_ENDINGS)
+
+
+class Refusals:
+    """Files that are left out, counted by their reason."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, list[str]] = {}
+
+    @contextlib.contextmanager
+    def of(self, path: Path) -> Iterator[None]:
+        """Count a file whose reading in the block raises IngestError."""
+        try:
+            yield
+        except IngestError as error:
+            self.add(path, str(error).removeprefix(f'{path}: '))
+
+    def add(self, path: Path, reason: str) -> None:
+        """Count a file."""
+        self._names.setdefault(reason, []).append(path.name)
+
+    def lines(self) -> list[str]:
+        """A line for each reason, with a few names."""
+        by_count = sorted(self._names.items(), key=lambda item: -len(item[1]))
+        lines = [_left_out(names, reason) for reason, names in by_count[:_MOST_REASONS]]
+        if others := [name for _, names in by_count[_MOST_REASONS:] for name in names]:
+            lines.append(_left_out(others, 'for other reasons'))
+        return lines
+
+
+def _left_out(names: Sequence[str], reason: str) -> str:
+    count = '1 file' if len(names) == 1 else f'{len(names)} files'
+    more = ', ...' if len(names) > _NAMES_SHOWN else ''
+    return f'left out: {count} ({", ".join(names[:_NAMES_SHOWN])}{more}): {reason}'
+
+
+def _readable(path: Path) -> FileKind:
+    """Kind of an image that is read; raises IngestError for another file."""
+    if path.is_dir():
+        raise IngestError(f'{path}: a folder: give it too, or leave it out')
+    with errors_as(IngestError, path):
+        kind = kind_of(path)
+    if kind is UNKNOWN:
+        raise IngestError(f'{path}: no image, by its content')
+    if kind.instead:
+        raise IngestError(f'{path}: {kind.name}, which is not read: {kind.instead}')
+    if not kind.is_image:
+        raise IngestError(f'{path}: {kind.name}: calibrate it by itself')
+    return kind
 
 
 def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
     """Facts of a file; a given length or pixel size replaces its own.  Raises IngestError."""
-    if path.name.lower().endswith(FITS_ENDINGS):
+    kind = _readable(path)
+    if kind is FITS:
         values, header = read_fits(path, '')
         stated = _of_fits(path, values, header)
         stated_mm, stated_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
     else:
-        is_raw = path.name.lower().endswith(_RAW)
-        tags, gps, width, height = (_facts_of_raw if is_raw else _facts_of_picture)(path)
-        if width * height > MOST_VALUES:
-            raise IngestError(f'{path}: claims {width} x {height} pixels')
+        tags, gps, width, height = (
+            _facts_of_raw(path) if kind is RAW else _facts_of_picture(path, kind)
+        )
         stated = _of_tags(path, tags, gps, width, height)
         stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+    if not (focal_length_mm or pixel_um):
+        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
     given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
-    if math.isnan(given_px) or not (focal_length_mm or pixel_um):
-        return stated
+    if math.isnan(given_px):
+        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
+    if math.isnan(_plausible(given_px, stated)):
+        raise IngestError(
+            f'{path}: --focal-length-mm and --pixel-size-um give a focal length of {given_px:.3g}'
+            f' px for {stated.width} x {stated.height} pixels'
+        )
     return replace(stated, focal_px=given_px)
+
+
+def _plausible(focal_px: float, of: Photograph) -> float:
+    """A focal length, or NaN for one that no camera has."""
+    ratio = focal_px / math.hypot(of.width, of.height)
+    return focal_px if _SHORTEST < ratio < _LONGEST else math.nan
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
@@ -104,6 +194,15 @@ def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
             one = replace(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
         found.append(one)
     return found
+
+
+def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
+    """Photographs of one camera; of those with the same time of exposure, the largest file."""
+    kept: dict[object, Photograph] = {}
+    for one in sorted(photographs, key=lambda one: (-one.file_bytes, one.path.name)):
+        if kept.setdefault(one.time_ns if one.dated else one.path, one) is not one:
+            refusals.add(one.path, 'a copy: another file has its time of exposure')
+    return list(kept.values())
 
 
 def by_camera(photographs: Sequence[Photograph]) -> dict[str, list[Photograph]]:
@@ -121,12 +220,15 @@ def pixels_of_photograph(path: Path) -> Pixels:
     Green of a colour image, interpolated in one of camera raw.  The sRGB curve of 8-bit colour is
     undone into 16 bit.
     """
-    if path.name.lower().endswith(_RAW):
+    kind = _readable(path)
+    if kind is RAW:
         values = _linear(path)
-    elif path.name.lower().endswith(FITS_ENDINGS):
+    elif kind is FITS:
         values = read_fits(path, '')[0]
     else:
-        values = decoded(path, content_of(path))  # the EXIF orientation is not applied
+        content = content_of(path)
+        with _quiet():
+            values = decoded(path, content)  # the EXIF orientation is not applied
     if values.ndim == 3:
         is_rendered = values.dtype == np.uint8
         values = np.ascontiguousarray(values[:, :, _GREEN])
@@ -153,22 +255,42 @@ _SRGB_TO_LIGHT = _srgb_to_light()
 _Tags = Mapping[int, Any]
 
 
-def _facts_of_picture(path: Path) -> tuple[_Tags, _Tags, int, int]:
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Drop the lines that libpng, libtiff and OpenCV print on a damaged file."""
+    with open(os.devnull, 'wb') as nothing, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # there is no stderr
+            kept = os.dup(2)
+            stack.callback(os.close, kept)
+            os.dup2(nothing.fileno(), 2)
+            stack.callback(os.dup2, kept, 2)
+        yield
+
+
+def _facts_of_picture(path: Path, kind: FileKind) -> tuple[_Tags, _Tags, int, int]:
     """Tags of EXIF and GPS, width and height."""
     with needing('report', IngestError, path):
         from PIL import Image
+    start = content_of(path, _JPEG_HEADER_BYTES) if kind is JPEG else content_of(path)
     try:
         # Opened, not decoded: size and tags only.
-        with Image.open(io.BytesIO(content_of(path))) as image:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(start)) as image:
+            warnings.simplefilter('ignore')
             width, height = image.size
+            _check_size(path, width, height)
             exif = image.getexif()
             tags = {**dict(exif), **dict(exif.get_ifd(_EXIF))}
             gps = dict(exif.get_ifd(_GPS))
     except IngestError:
         raise
     except Exception as error:  # a damaged file makes Pillow raise anything
-        raise IngestError(f'{path}: not readable: {" ".join(str(error).split())[:160]}') from error
+        raise IngestError(f'{path}: {kind.name}, not readable: damaged') from error
     return tags, gps, width, height
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MOST_VALUES:
+        raise IngestError(f'{path}: claims {width} x {height} pixels')
 
 
 def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
@@ -182,6 +304,7 @@ def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
         0x9003: f'{taken:%Y:%m:%d %H:%M:%S}' if taken else '',
         0xA434: f'{lens.make} {lens.model}'.strip(),
     }
+    _check_size(path, sizes.width, sizes.height)
     return tags, {}, sizes.width, sizes.height
 
 
@@ -213,7 +336,7 @@ def _raw(path: Path) -> Iterator[Any]:
             yield raw
     except rawpy.LibRawError as error:
         why = os.fsdecode(*error.args[:1] or [''])
-        raise IngestError(f'{path}: not readable: {why}') from error
+        raise IngestError(f'{path}: camera raw, not readable: {why}') from error
 
 
 def _rawpy(path: Path) -> Any:
@@ -235,14 +358,15 @@ def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Ph
     if math.isnan(focal_px) and equivalent_mm > 0:
         focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
     site, camera = _exif_site(gps), ' '.join(words)
-    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera)
+    size = path.stat().st_size
+    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera, size)
 
 
 def _real(value: object) -> float:
     """A number of EXIF, NaN for none: rationals may have a denominator of zero."""
     try:
         return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return math.nan
 
 
@@ -263,24 +387,34 @@ def _focal_px(focal_mm: float, pixel_um: float) -> float:
 def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
     """Stamp of the middle of the exposure, and whether it has a date and a time zone."""
     exposure_s = _real(tags.get(0x829A))
-    half_s = 0.5 * exposure_s if exposure_s > 0 else 0.0
+    half_s = 0.5 * exposure_s if 0 < exposure_s < _LONGEST_EXPOSURE_S else 0.0
     zone = str(tags.get(0x9011) or tags.get(0x9010) or '').strip('\0 ')  # OffsetTimeOriginal
     text = str(tags.get(0x9003) or tags.get(0x0132) or '').strip('\0 ')  # DateTimeOriginal
     with contextlib.suppress(ValueError, OverflowError):
         aware = datetime.strptime(f'{text} {zone or "+0000"}', '%Y:%m:%d %H:%M:%S %z')
-        if aware.year >= 1990:  # a clock that was never set
-            return round((aware.timestamp() + half_s) * NANOSECONDS_PER_SECOND), True, bool(zone)
-    return path.stat().st_mtime_ns, False, False
+        if _DATES[0] <= aware < _DATES[1]:
+            digits = str(tags.get(0x9291) or '').strip('\0 ')  # SubSecTimeOriginal
+            part_s = float(f'0.{digits}') if digits.isdecimal() and len(digits) < 10 else 0.0
+            middle_s = aware.timestamp() + part_s + half_s
+            return round(middle_s * NANOSECONDS_PER_SECOND), True, bool(zone)
+    return _time_of_file(path), False, False
+
+
+def _time_of_file(path: Path) -> int:
+    """Stamp of the last change of a file."""
+    with errors_as(IngestError, path):
+        return min(max(path.stat().st_mtime_ns, _FIRST_NS), _LAST_NS)
 
 
 def _exif_site(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     try:
         degrees = [
-            sum(float(part) / 60.0**k for k, part in enumerate(gps[tag]))
+            # Degrees, minutes and seconds, or fewer of them.
+            sum(float(part) / 60.0**k for part, k in zip(gps[tag], range(3), strict=False))
             * (-1.0 if str(gps[tag - 1]).upper()[:1] in 'SW' else 1.0)
             for tag in (2, 4)  # GPSLatitude, GPSLongitude, each after its reference
         ]
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     height_m = _real(gps.get(6))
     if not (abs(degrees[0]) <= 90 and abs(degrees[1]) <= 180):
@@ -289,9 +423,15 @@ def _exif_site(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 
 
 def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Photograph:
-    time_ns, dated = path.stat().st_mtime_ns, False
+    for key in ('IMAGETYP', 'OBSTYPE', 'FRAME'):
+        kind = str(header[key].value).strip().lower() if key in header else ''
+        if re.search('dark|flat|bias', kind):
+            raise IngestError(f'{path}: no image of the sky: {key} is {kind[:40]!r}')
+    time_ns, dated = _time_of_file(path), False
     with contextlib.suppress(TimeError, ValueError, OverflowError):
-        time_ns, dated = middle_of_exposure(header, ''), True
+        stated_ns = middle_of_exposure(header, '')
+        if _FIRST_NS <= stated_ns < _LAST_NS:
+            time_ns, dated = stated_ns, True
     focal_mm, pixel_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
     matrix = (number(header, key) for key in ('CD1_1', 'CD2_1'))
     step_deg = math.hypot(*(value for value in matrix if not math.isnan(value)))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -22,7 +22,7 @@ from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_text, write_atomically
 from starcal_ros.record_codec import read_record
 from starcal_ros.record_fields import Finite, Shape
-from starcal_ros.untrusted import PARAMETER_BYTES, yaml_value
+from starcal_ros.untrusted import PARAMETER_BYTES, shown, yaml_value
 
 CAMERA_INFO_FILE = 'camera_info.yaml'
 DEFAULT_CAMERA_NAME = 'camera'
@@ -57,6 +57,8 @@ class _CameraInfo:
         if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):
             raise ValueError(f'camera_matrix.data: {list(K)} is not [fx s cx 0 fy cy 0 0 1]')
         data = list(self.distortion_coefficients.data)
+        if not data:  # none: ROS writes so where a lens has no distortion
+            data = [0.0] * (4 if self.distortion_model in ('equidistant', 'fisheye') else 5)
         try:
             model, distortion = from_ros_distortion(self.distortion_model[:60], data)
         except ValueError as error:
@@ -116,12 +118,63 @@ def _camera_of_mrcal(text: str) -> CameraModel:
     ).camera()
 
 
+def _camera_info_values(text: str) -> Mapping[str, Any]:
+    """
+    Keys of a ROS camera YAML, from one or from another form of the same camera.
+
+    These are a file of ``cv2.FileStorage``, a camchain of kalibr with one camera, and a printed
+    ``CameraInfo`` message.
+    """
+    if text.startswith('%YAML:1.0'):  # of OpenCV: neither this line nor the tag is YAML
+        text = text.partition('\n')[2].replace('!!opencv-matrix', '')
+    content = yaml_value(text)
+    if not isinstance(content, dict):
+        raise ValueError('not a camera YAML (no keys)')
+    if 'cam1' in content:
+        raise ValueError('several cameras of kalibr: keep cam0, of this camera, alone')
+    if isinstance(kalibr := content.get('cam0'), dict):
+        if kalibr.get('camera_model') != 'pinhole':
+            raise ValueError(f'camera_model: {shown(kalibr.get("camera_model"))} is not pinhole')
+        fx, fy, cx, cy = kalibr['intrinsics']
+        width, height = kalibr['resolution']
+        model = kalibr['distortion_model']
+        return _values(
+            width,
+            height,
+            [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+            [] if model == 'none' else kalibr['distortion_coeffs'],
+            {'radtan': 'plumb_bob', 'none': 'plumb_bob'}.get(model, model),
+        )
+    folded = {key.lower(): value for key, value in content.items()}
+    if 'k' in folded and 'camera_matrix' not in folded:
+        model = folded.get('distortion_model') or 'plumb_bob'
+        return _values(folded['width'], folded['height'], folded['k'], folded['d'], model)
+    coefficients = content.get('distortion_coefficients')
+    if 'distortion_model' not in content and isinstance(coefficients, dict):
+        many = len(coefficients.get('data', ())) > 5
+        model = 'rational_polynomial' if many else 'plumb_bob'
+        is_fisheye = content.get('lens_model') == 'fisheye'
+        content['distortion_model'] = 'equidistant' if is_fisheye else model
+    return content
+
+
+def _values(width: Any, height: Any, K: Any, D: Any, model: Any) -> Mapping[str, Any]:
+    return {
+        'image_width': width,
+        'image_height': height,
+        'camera_matrix': {'data': K},
+        'distortion_coefficients': {'data': D},
+        'distortion_model': model,
+    }
+
+
 def read_camera_info(location: str | Path) -> CameraModel:
     """
     The camera in a ROS camera YAML; K[0,1], where a file has one, is its skew.
 
-    The location is a path, or a ``file://`` or ``package://`` URL.  A ``.cameramodel`` of mrcal is
-    read too: its lens, not its pose.
+    The location is a path, or a ``file://`` or ``package://`` URL.  Files of OpenCV, kalibr and
+    mrcal and a printed ``CameraInfo`` are read too: the camera, not its pose.
+
     Raises ProductError naming the file and the key that is missing, wrong or not supported.
     """
     path = resolve_url(location) if isinstance(location, str) else location
@@ -129,10 +182,7 @@ def read_camera_info(location: str | Path) -> CameraModel:
     try:
         if _IS_MRCAL.search(text):
             return _camera_of_mrcal(text)
-        content = yaml_value(text)
-        if not isinstance(content, dict):
-            raise ValueError('not a camera YAML (no keys)')
-        return read_record(_CameraInfo, content).camera()
+        return read_record(_CameraInfo, _camera_info_values(text)).camera()
     except (ValueError, KeyError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         words = ' '.join(f'{error}'.split())
         raise ProductError(f'{path}: {words}') from error
@@ -141,7 +191,8 @@ def read_camera_info(location: str | Path) -> CameraModel:
 def read_camera_name(location: str | Path) -> str:
     """The ``camera_name`` in a ROS camera YAML that `read_camera_info` accepts."""
     path = resolve_url(location) if isinstance(location, str) else location
-    name = yaml_value(read_text(path, PARAMETER_BYTES)).get('camera_name')
+    text = read_text(path, PARAMETER_BYTES)
+    name = None if _IS_MRCAL.search(text) else _camera_info_values(text).get('camera_name')
     return name if isinstance(name, str) and name else DEFAULT_CAMERA_NAME
 
 

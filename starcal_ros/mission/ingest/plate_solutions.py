@@ -21,17 +21,16 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.errors import IngestError, needing
-from starcal_ros.formats.images.image_files import FITS_ENDINGS, ImageFile
-from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE, start_of
+from starcal_ros.formats.images.image_files import ImageFile, is_fits
+from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE
 from starcal_ros.pipeline.from_stars import pinhole
 
-_MAGIC = b'SIMPLE  ='
 _GRID = 5  # points per side; the attitude fits them all, which averages the distortion
 
 
 def is_solution(path: Path) -> bool:
     """True if a file is FITS: an image, or a header alone."""
-    return _is_fits(path) or start_of(path).startswith(_MAGIC)
+    return is_fits(path)
 
 
 def read_wcs(paths: Sequence[Path], images: Sequence[ImageFile]) -> Attitudes:
@@ -49,7 +48,7 @@ def read_wcs(paths: Sequence[Path], images: Sequence[ImageFile]) -> Attitudes:
         )
     solved = [_attitude(by_name[_name(one.path)], one) for one in images]
     # Programs reverse the rows when they write FITS, so only FITS files can be affected.
-    upward = {up for (_, up), one in zip(solved, images, strict=True) if _is_fits(one.path)}
+    upward = {up for (_, up), one in zip(solved, images, strict=True) if is_fits(one.path)}
     if len(upward) > 1:
         raise IngestError(
             'some FITS images mirror the sky and others do not: import them separately'
@@ -68,10 +67,6 @@ def read_wcs(paths: Sequence[Path], images: Sequence[ImageFile]) -> Attitudes:
 
 def _name(path: Path) -> str:
     return Path(path.name.removesuffix('.gz').removesuffix('.fz')).stem
-
-
-def _is_fits(path: Path) -> bool:
-    return path.name.lower().endswith(FITS_ENDINGS)
 
 
 def _attitude(path: Path, image: ImageFile) -> tuple[Rotation, bool]:

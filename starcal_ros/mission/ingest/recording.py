@@ -23,7 +23,6 @@ from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag.writer import BagWriter, check_replaceable
 from starcal_ros.formats.images import image_files
-from starcal_ros.formats.images.image_files import FITS_ENDINGS
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.mission.ingest.guard import Guard
@@ -264,7 +263,7 @@ def _write_messages(
                 )
             wanted = _options_of(content.path, options)
             pixels = guard.call(content.path, image_files.pixels_of, content.path, wanted, scale)
-            if rows_upward and content.path.name.lower().endswith(FITS_ENDINGS):
+            if rows_upward and image_files.is_fits(content.path):
                 pixels = pixels[::-1]
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
             on_image()

@@ -75,8 +75,8 @@ class Diagnosis:
         mend = ['', 'in the parameter file:', *(f'  {line}' for line in self.mend)]
         return lines + mend if self.mend else lines
 
-    def in_a_sentence(self) -> str:
-        """Cause and remedy, as the end of a complaint."""
+    def in_a_sentence(self, command: str = 'starcal diagnose') -> str:
+        """Cause and remedy, as the end of a complaint; ``command`` gives the evidence, if any."""
         said = [self.sentence]
         if options := '; '.join(line for line in self.mend if not line.startswith('#')):
             said.append(f'Set {options}.')
@@ -84,7 +84,7 @@ class Diagnosis:
             if line.startswith('#'):
                 advice = line.removeprefix('# ').removeprefix(_NO_PARAMETER)
                 said.append(f'{advice[0].upper()}{advice[1:]}.')
-        return f'{" ".join(said)} (details: starcal diagnose)'
+        return ' '.join([*said, f'(details: {command})'] if command else said)
 
 
 def found_alignment(found: Diagnosis) -> tuple[list[float] | None, str]:

@@ -228,7 +228,7 @@ def test_a_folder_of_image_files_is_imported(
         assert 'starcal import makes a bag of image files' in capsys.readouterr().err
     # Calibrated without a bag, by the stars alone: a file that is none is named.
     assert main.main(['calibrate', str(tmp_path), '-o', str(tmp_path / 'out')]) == 2
-    assert '001.fits: not readable as FITS' in capsys.readouterr().err
+    assert 'no image can be read; left out: 1 file (001.fits): not' in capsys.readouterr().err
 
 
 def test_a_bag_without_attitudes_is_named(

@@ -25,6 +25,8 @@ from starcal_ros.formats.images.photographs import (
     in_order,
     look_at,
     pixels_of_photograph,
+    Refusals,
+    without_copies,
 )
 
 TIME_S = calendar.timegm((2024, 3, 9, 22, 10, 4))
@@ -117,20 +119,26 @@ def test_fits_header_with_wcs_and_date(tmp_path: Path) -> None:
     assert (one.time_ns, one.dated, one.camera) == (TIME_S * 10**9, True, 'ASI')
 
 
-def test_equal_stamps_are_set_apart_and_other_files_left(tmp_path: Path) -> None:
+def test_equal_stamps_are_set_apart(tmp_path: Path) -> None:
     for name in 'ab':
         jpeg(tmp_path / f'{name}.jpg', CANON, DATE)
-    (tmp_path / 'notes.txt').write_text('clouds')
     paths = image_paths([tmp_path])
-    assert [path.name for path in paths] == ['a.jpg', 'b.jpg']
     first, second = in_order([look_at(path) for path in paths])
     assert second.time_ns - first.time_ns == 10**9
 
 
-def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path) -> None:
-    (tmp_path / 'a.jpg').write_bytes(b'\xff\xd8\xff' + bytes(200))
-    with pytest.raises(IngestError, match=r'a\.jpg: not readable'):
-        look_at(tmp_path / 'a.jpg')
+def test_of_files_with_one_time_of_exposure_the_largest_is_kept(tmp_path: Path) -> None:
+    for name, part, quality in (('a', '25', 50), ('b', '25', 95), ('c', '75', 95)):
+        exif = Image.Exif()
+        exif.update({**CANON, EXIF: {**DATE, 0x9291: part}})
+        pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f'{name}.jpg', exif=exif, quality=quality)
+    refusals = Refusals()
+    kept = without_copies([look_at(path) for path in image_paths([tmp_path])], refusals)
+    assert sorted(one.path.name for one in kept) == ['b.jpg', 'c.jpg']
+    assert refusals.lines() == [
+        'left out: 1 file (a.jpg): a copy: another file has its time of exposure'
+    ]
 
 
 def dng(path: Path, mosaic: NDArray[np.uint16]) -> Path:
@@ -192,10 +200,10 @@ def test_green_of_camera_raw_is_linear_in_light(tmp_path: Path) -> None:
 def test_a_damaged_raw_file_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip('rawpy')
     path = tmp_path / 'a.nef'
-    path.write_bytes(b'x' * 5000)
-    with pytest.raises(IngestError, match='a.nef: not readable: Unsupported file format'):
+    path.write_bytes(b'II*\0' + b'x' * 5000)
+    with pytest.raises(IngestError, match='a.nef: camera raw, not readable: Unsupported file'):
         look_at(path)
     whole = dng(tmp_path / 'b.dng', np.full((80, 120), 600, np.uint16))
     whole.write_bytes(whole.read_bytes()[:-5000])
-    with pytest.raises(IngestError, match='b.dng: not readable: '):
+    with pytest.raises(IngestError, match='b.dng: camera raw, not readable: '):
         pixels_of_photograph(whole)

@@ -146,8 +146,8 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
         (
             '[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]',
-            '[]',
-            '0 coefficients of plumb_bob, .* 4 or 5',
+            '[-0.1]',
+            '1 coefficients of plumb_bob, .* 4 or 5',
         ),
         ('-0.1, 1e-2', 'true, 1e-2', r'coefficients.data\[0\]: True is not a number'),
         ('-0.1, 1e-2', 'big, 1e-2', r"coefficients.data\[0\]: 'big' is not a number"),
@@ -319,3 +319,93 @@ def test_another_cameramodel_is_refused(tmp_path: Path, change, words: str) -> N
     with pytest.raises(ProductError, match=words) as refused:
         read_camera_info(path)
     assert '\n' not in str(refused.value)
+
+
+K = '[500.0, 0.0, 319.5, 0, 501, 239.5, 0, 0, 1]'
+OPENCV_YAML = f"""%YAML:1.0
+---
+calibration_time: "Mon 03 Mar 2025 10:12:00"
+image_width: 640
+image_height: 480
+flags: 0
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {K}
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -1.0e-01, 1.0e-02, 1.0e-05, -2.0e-04, 3.0e-03 ]
+avg_reprojection_error: 2.1e-01
+"""
+KALIBR_YAML = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [-0.1, 0.01, 1.0e-05, -0.0002]
+  distortion_model: radtan
+  intrinsics: [500.0, 501, 319.5, 239.5]
+  resolution: [640, 480]
+  rostopic: /camera/image_raw
+"""
+INFO_YAML = f"""header:
+  frame_id: camera
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: []
+k: {K}
+---
+"""
+FORMS = {
+    'opencv': (OPENCV_YAML, 'plumb_bob', [-0.1, 0.01, 0.003, 1e-5, -2e-4]),
+    'opencv, 8 coefficients': (
+        OPENCV_YAML.replace('3.0e-03 ]', '3.0e-03, 0.1, 0.2, 0.3 ]'),
+        'rational_polynomial',
+        [-0.1, 0.01, 0.003, 1e-5, -2e-4, 0.1, 0.2, 0.3],
+    ),
+    'kalibr': (KALIBR_YAML, 'plumb_bob', [-0.1, 0.01, 0.0, 1e-5, -2e-4]),
+    'kalibr, equidistant': (
+        KALIBR_YAML.replace('radtan', 'equidistant'), 'equidistant', [-0.1, 0.01, 1e-5, -2e-4],
+    ),
+    'CameraInfo of ROS 2': (INFO_YAML.removesuffix('---\n'), 'plumb_bob', [0.0] * 5),
+    'CameraInfo of ROS 1': (
+        f'width: 640\nheight: 480\nD: []\nK: {K}\ndistortion_model: ""\n', 'plumb_bob', [0.0] * 5,
+    ),
+    'no coefficients': (
+        ROS_YAML.replace('[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]', '[]').replace('0.5,', '0.0,', 1),
+        'plumb_bob',
+        [0.0] * 5,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('form', FORMS)
+def test_other_forms_of_a_camera_file_are_read(form: str, tmp_path: Path) -> None:
+    text, model, distortion = FORMS[form]
+    (tmp_path / 'camera.yaml').write_text(text)
+    camera = read_camera_info(tmp_path / 'camera.yaml')
+    assert (camera.width, camera.height, camera.model) == (640, 480, model)
+    assert camera.intrinsics.tolist() == [500.0, 0.0, 501.0, 319.5, 239.5]
+    assert camera.distortion.tolist() == distortion
+    assert read_camera_name(tmp_path / 'camera.yaml') == (
+        'narrow_stereo' if form == 'no coefficients' else 'camera'
+    )
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        (KALIBR_YAML + KALIBR_YAML.replace('cam0', 'cam1'), 'several cameras of kalibr: keep'),
+        (KALIBR_YAML.replace('pinhole', 'omni'), "camera_model: 'omni' is not pinhole"),
+        (KALIBR_YAML.replace('radtan', 'fov'), "distortion_model: 'fov' is not plumb_bob"),
+        (OPENCV_YAML.replace('image_width', 'columns'), 'image_width'),
+    ],
+)
+def test_a_camera_of_another_form_that_cannot_be_read_is_one_line(
+    text: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / 'camera.yaml').write_text(text)
+    with pytest.raises(ProductError, match=words) as error:
+        read_camera_info(tmp_path / 'camera.yaml')
+    assert '\n' not in str(error.value)

@@ -271,3 +271,14 @@ def test_isd_and_isis_keywords_have_the_errors_they_state(
     isis_px = worst_px(project(made.geometry.camera, sights), pixels)
     assert isis_px == pytest.approx(done.losses[-1].cost_px, abs=1e-6)  # digits of a text kernel
     assert isis_px < 1.0
+
+
+@pytest.mark.parametrize('form', ['opencv', 'kalibr', 'ros'])
+@pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
+def test_an_exported_camera_is_read_as_a_prior_camera(
+    tmp_path: Path, form: str, model: str
+) -> None:
+    made = export(calibration(model, 0.0, False), form, tmp_path, None)
+    camera = read_camera_info(made.files[0])
+    pixels, directions = grid_of(calibration(model, 0.0, False))
+    assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6

@@ -242,7 +242,7 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> N
                  t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
     assert main(line) == 2
     first, second = capsys.readouterr().err.splitlines()
-    assert 'cut.fits: not readable as FITS' in first
+    assert 'cut.fits: not an image in FITS, TIFF or PNG' in first
     assert 'huge.fits: needs more than 1 GB of memory to be read' in second
 
 
