@@ -5,6 +5,9 @@ The one way to write a file.
 A temporary file in the same folder is written, synced and renamed, and the folder is synced: a
 reader, a kill and a power loss see the old file or the new one, each whole.  A kill may leave the
 temporary file; it is locked while its writer lives, and the next write to that path removes it.
+
+Each file has the digest of its content as an extended attribute, by which starcal knows later that
+it wrote the file and that nothing has changed it since.
 """
 
 from __future__ import annotations
@@ -12,12 +15,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import contextlib
 import fcntl
+import hashlib
 import os
 from pathlib import Path
 import secrets
 from typing import IO
 
 PART = '.part'  # ends the name of a file that is not whole yet
+_MARK = 'user.starcal.sha256'
 
 
 @contextlib.contextmanager
@@ -32,12 +37,12 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     part = path.with_name(f'.{path.name}.{secrets.token_hex(4)}{PART}')
     try:
         # Exclusive: a link that waits under this name must not be written through.
-        number = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        with os.fdopen(number, 'wb') as file:
+        number = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        with os.fdopen(number, 'w+b') as file:
             with contextlib.suppress(OSError):  # a file system without locks
                 fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield file
-            file.flush()
+            mark(file)
             os.fsync(number)
             part.replace(path)
         sync_folder(path.parent)
@@ -45,6 +50,29 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         with contextlib.suppress(OSError):
             part.unlink()
         raise
+
+
+def mark(file: IO[bytes]) -> None:
+    """Mark an open file as written by starcal with its present content."""
+    file.flush()
+    # A file system without extended attributes, or a Python without them (macOS).
+    with contextlib.suppress(OSError, AttributeError):
+        os.setxattr(file.fileno(), _MARK, _digest(file))
+
+
+def is_marked(file: IO[bytes]) -> bool:
+    """True if starcal wrote an open file, and its content has not changed since."""
+    with contextlib.suppress(OSError, AttributeError):
+        return os.getxattr(file.fileno(), _MARK) == _digest(file)
+    return False
+
+
+def _digest(file: IO[bytes]) -> bytes:
+    file.seek(0)
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest().encode()
 
 
 def _remove_abandoned(path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from astropy.io import fits
 from astropy.time import Time
+import cv2
 import erfa
 import numpy as np
 import spiceypy
@@ -53,6 +54,16 @@ def date(time_ns: int, system: str = 'utc') -> str:
         time = Time(time.tai.jd1, time.tai.jd2 - 19 / 86400, format='jd', scale='tai')
         return str(Time(time, format='isot', precision=9).value)
     return str(Time(getattr(time, system), format='isot', precision=9).value)
+
+
+def write_frame(folder: Path) -> None:
+    """The first image of the small bag as ``0.png``, its time, and attitudes about it, as CSV."""
+    folder.mkdir()
+    image = images()[0]
+    cv2.imwrite(str(folder / '0.png'), image.pixels)
+    (folder / 'times.csv').write_text(f'file,time_ns\n0.png,{image.time_ns}\n')
+    rows = [f'{image.time_ns + after_ns},0,0,0,1' for after_ns in (-(10**8), 10**8)]
+    (folder / 'attitude.csv').write_text('\n'.join(['time_ns,qx,qy,qz,qw', *rows, '']))
 
 
 def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object) -> Path:

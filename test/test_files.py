@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from starcal_ros.files import replacing, same_as_one_of
+from starcal_ros.files import is_marked, mark, replacing, same_as_one_of
 
 
 def names(folder: Path) -> list[str]:
@@ -37,6 +37,23 @@ def test_an_exception_leaves_the_old_file(tmp_path: Path, error: type[BaseExcept
     with pytest.raises(error):
         interrupted()
     assert path.read_text() == 'old' and names(tmp_path) == ['a']
+
+
+def test_a_file_is_known_until_it_is_changed(tmp_path: Path) -> None:
+    path = tmp_path / 'a'
+    with replacing(path) as file:
+        file.write(b'new')
+    with path.open('r+b') as file:
+        assert is_marked(file)
+        file.write(b'N')
+        file.flush()
+        assert not is_marked(file)
+        mark(file)
+        assert is_marked(file)
+    copy = tmp_path / 'b'
+    copy.write_bytes(path.read_bytes())
+    with copy.open('rb') as file:
+        assert not is_marked(file)
 
 
 def test_a_link_is_replaced_and_its_target_is_not_written(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ exit status: 0 the command succeeded, and a calibration passed the gate; 3 the g
 calibration; 2 bad input, named in one line; 130 interrupted."""
 
 TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
+MOST_POINTS = 2000  # pixels a side of a table of lines of sight: 1.8 GB of memory
 STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
 _BAGS = 'an .mcap file or a bag folder'
 _BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
@@ -43,7 +44,8 @@ first steps:
   # the same by the ROS nodes, where ROS 2 is installed
   starcal demo
 
-starcal COMMAND --help shows examples of each command.
+starcal COMMAND --help shows examples of each command. A file that starcal did not write, or that
+was changed since, is never replaced.
 {_EXIT_STATUS}"""
 
 
@@ -222,7 +224,7 @@ def _demo(command: argparse.ArgumentParser) -> None:
 
 def _init(command: argparse.ArgumentParser) -> None:
     _bags(command, _BAGS_OR_IMAGES)
-    what = 'folder for params.yaml and camera.yaml, created if absent; no file is replaced'
+    what = 'folder for params.yaml and camera.yaml, created if absent'
     _output(command, 'DIR', what, required=True)
     _lens(command)
     _topics(command)
@@ -262,7 +264,7 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     _bags(command, _BAGS_OR_IMAGES)
     what = 'ROS parameter file: prior camera, mounting and options; images need none'
     _params(command, what)
-    what = 'folder for the products, created if absent; existing products are replaced'
+    what = 'folder for the products, created if absent'
     _output(command, 'DIR', what, required=True)
     command.add_argument(
         '--no-report', action='store_true',
@@ -332,7 +334,9 @@ def _lookup(command: argparse.ArgumentParser) -> None:
     _output(command, 'FILE', what, required=True)
     grid = command.add_mutually_exclusive_group()
     what = 'N x N pixels from corner to corner of the detector, u fastest (default: 25)'
-    grid.add_argument('--points', type=_number(int, 2, 2000), default=25, metavar='N', help=what)
+    grid.add_argument(
+        '--points', type=_number(int, 2, MOST_POINTS), default=25, metavar='N', help=what
+    )
     what = 'a pixel every PX pixels along both axes, in place of --points'
     grid.add_argument('--step', type=float, metavar='PX', help=what)
 
@@ -364,7 +368,7 @@ def _seed(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
-    what = 'bag folder or .mcap file to write; an existing one is replaced'
+    what = 'bag folder or .mcap file to write'
     _output(command, 'BAG', what, required=True)
     what, names = 'scenario: tiny, small or paper', ('tiny', 'small', 'paper')
     command.add_argument('--scenario', required=True, choices=names, metavar='NAME', help=what)
@@ -480,7 +484,7 @@ def _import(command: argparse.ArgumentParser) -> None:
     command.add_argument('--attitude', nargs='+', required=True, metavar='FILE', help=what)
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
     command.add_argument('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
-    what = 'bag folder or .mcap file to write; replaces an earlier import, no other file'
+    what = 'bag folder or .mcap file to write'
     command.add_argument('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
     what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
     command.add_argument('--star-tracker', default='', metavar='FRAME', help=what)
@@ -523,7 +527,7 @@ def _import(command: argparse.ArgumentParser) -> None:
 def _catalog(command: argparse.ArgumentParser) -> None:
     what = 'table of Gaia DR3 by the Gaia archive or VizieR: VOTable, FITS, CSV or Parquet'
     command.add_argument('table', type=_path, metavar='GAIA_FILE', help=what)
-    what = 'catalog file to write (.npz), for the option catalog; no file is replaced'
+    what = 'catalog file to write (.npz), for the option catalog'
     _output(command, 'FILE', what, required=True)
 
 

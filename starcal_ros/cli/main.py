@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import dataclasses
 import io
 import json
+import math
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING
 from starcal_ros.cli import arguments, terminal
 from starcal_ros.cli.commands import mission
 from starcal_ros.errors import missing_package, OptionError, StarcalError
-from starcal_ros.formats.products.product_files import make_folder
+from starcal_ros.formats.products.product_files import check_outputs, make_folder, REPORT_FILE
 from starcal_ros.text import significant
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
@@ -115,6 +116,8 @@ def _report(args: argparse.Namespace) -> int:
     """Write the report of a folder."""
     from starcal_ros.report import page
 
+    names = (REPORT_FILE, page.PDF_FILE) if args.pdf else (REPORT_FILE,)
+    check_outputs(args.folder / name for name in names)
     written = page.write_report(args.folder)
     terminal.print_text(f'report written to {written}')
     if args.pdf:
@@ -183,10 +186,9 @@ def _compare(args: argparse.Namespace) -> int:
         return _compare_with_truth(args)
     found = comparison.compare(*map(read_calibration, files))
     if args.output:
-        from starcal_ros.cli.output import check_no_product
         from starcal_ros.report.detector_figures import write_comparison
 
-        check_no_product(args.output, files)
+        output.check_file(args.output, files)
         write_comparison(found, args.output)
     if args.json:
         terminal.print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
@@ -217,19 +219,23 @@ def _lookup(args: argparse.Namespace) -> int:
     """Write a table of lines of sight by pixel."""
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
-    from starcal_ros.cli.output import check_no_product
+    from starcal_ros.cli.output import check_file
     from starcal_ros.formats.products.calibration_json import read_calibration
     from starcal_ros.formats.products.lookup_table import write_lookup_table
     from starcal_ros.formats.products.product_folder import calibration_file
 
     file = calibration_file(args.calibration)
-    check_no_product(args.output, [file])
+    check_file(args.output, [file])
     calibration = read_calibration(file)
     camera = calibration.geometry.camera
     pixels = pixel_grid(camera, args.points, args.points)
     if args.step is not None:
-        if not 0 < args.step <= max(camera.width, camera.height):
-            raise OptionError(f'--step: {args.step:g} px is not within the detector')
+        least = math.sqrt(camera.width * camera.height) / arguments.MOST_POINTS
+        if not least <= args.step <= max(camera.width, camera.height):
+            raise OptionError(
+                f'--step: {args.step:g} px: give {significant(least, 3)} px (a table of'
+                f' {arguments.MOST_POINTS}^2 pixels) or more, up to the size of the detector'
+            )
         pixels = pixels_every(camera, args.step)
     table = line_of_sight_table(camera, calibration.map_covariance, pixels)
     write_lookup_table(table, args.output)
@@ -322,6 +328,7 @@ def _demo(args: argparse.Namespace) -> int:
     make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
+    check_outputs(demo.outputs(args.output))
     terminal.print_text(f'bag {bag.bag}; log files and products in {args.output}')
     with terminal.progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
@@ -379,12 +386,13 @@ def _campaign(args: argparse.Namespace) -> int:
     monte_carlo.check(design)
     workers = _workers(args)
     make_folder(args.output)
+    path = args.output / f'{design.study}.json'
+    check_outputs((path, path.with_suffix('.svg')))
     start = time.monotonic()
     with terminal.progress_bar(design.trials, 'trials') as advance:
         rows = run_trials(design, workers, args.scheduler, advance)
     seconds = time.monotonic() - start
     found = summary.conclude(design, rows)
-    path = args.output / f'{design.study}.json'
     write_atomically(path, summary.content(found, _software()))
     write_atomically(path.with_suffix('.svg'), study_figures.svg(found))
     terminal.print_text(
@@ -419,7 +427,9 @@ def _paper(args: argparse.Namespace) -> int:
     if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
         raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
     images = args.images[0] if args.images else night
-    make_folder(args.output / 'images')
+    path, figures = args.output / 'paper.md', args.output / 'images'
+    make_folder(figures)
+    check_outputs((path, path.with_suffix('.json'), *figures.glob('paper_*.svg')))
     with terminal.progress_bar(images, 'frames') as advance:
         frame = functools.partial(paper.observe_frame_of, args.seed, images)
         frames = run_each(frame, images, workers, args.scheduler, advance)
@@ -428,12 +438,11 @@ def _paper(args: argparse.Namespace) -> int:
     observations = [observed for _, observed in sorted(frames, key=lambda item: item[0])]
     found = paper.study(observations, summary.conclude(table1, rows), args.seed)
     for name, svg in paper.svgs(found).items():
-        write_atomically(args.output / 'images' / f'paper_{name}.svg', svg)
-    path = args.output / 'paper.md'
+        write_atomically(figures / f'paper_{name}.svg', svg)
     write_atomically(path, paper.page(found, _software()))
     content = {'software': _software(), **paper.numbers(found)}
     write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
-    terminal.print_text(f'written to {path}, with figures in {args.output / "images"}')
+    terminal.print_text(f'written to {path}, with figures in {figures}')
     return arguments.EXIT_ACCEPTED
 
 

@@ -2,7 +2,7 @@
 """
 Tables and lines that the tool prints for a calibration, a bag and a comparison.
 
-No command replaces an input, or a file of another origin.
+No command replaces an input, or a file that starcal did not write: `check_outputs`.
 """
 
 from __future__ import annotations
@@ -21,38 +21,30 @@ from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
-from starcal_ros.formats.products.product_files import check_not_inputs
+from starcal_ros.formats.products.product_files import check_outputs
 from starcal_ros.formats.products.product_folder import NOT_CALIBRATED_FILE, PRODUCT_FILES
-from starcal_ros.report.pictures.thumbnails import THUMBNAILS_FOLDER
+from starcal_ros.report.pictures.thumbnails import THUMBNAILS_FOLDER, thumbnails_in
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 
 def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
     """
-    Check that the products of a calibration replace no input and do not become part of a bag.
+    `check_outputs` of the products of a calibration, which do not become part of a bag either.
 
     Raises OptionError or ProductError naming the folder or the file.
     """
     bag_files = reader.files_of_bags(bags)
     if same_as_one_of(folder, [file.parent for file in bag_files]):
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
-    check_not_inputs([folder / name for name in PRODUCT_FILES], (*bag_files, *files))
-    pictures = folder / THUMBNAILS_FOLDER
-    records = (CALIBRATION_FILE, NOT_CALIBRATED_FILE)
-    is_old = any((folder / name).exists() for name in records) and not pictures.is_symlink()
-    if pictures.is_dir() and any(pictures.iterdir()) and not is_old:
-        raise OptionError(f'{pictures}: is not of a calibration; choose another folder (-o)')
+    products = [folder / name for name in (*PRODUCT_FILES, NOT_CALIBRATED_FILE)]
+    pictures = thumbnails_in(folder / THUMBNAILS_FOLDER)
+    check_outputs((*products, *pictures), (*bag_files, *files))
 
 
-def check_no_product(output: Path, calibrations: Sequence[Path]) -> None:
-    """
-    Check that an output is neither a calibration that is read nor another product beside it.
-
-    Raises ProductError naming the file.
-    """
-    beside = [file.with_name(name) for file in calibrations for name in PRODUCT_FILES]
-    check_not_inputs([output], [*calibrations, *beside])
+def check_file(output: Path, inputs: Sequence[Path]) -> None:
+    """`check_outputs` of one file, which is no product beside an input either."""
+    beside = [file.with_name(name) for file in inputs for name in PRODUCT_FILES]
+    check_outputs([output], [*inputs, *beside])
 
 
 if TYPE_CHECKING:

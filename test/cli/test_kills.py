@@ -35,6 +35,7 @@ from starcal_ros.cli import entry_point, main
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import Image
 
 SLOWEST_S = 300.0
@@ -160,7 +161,7 @@ def _old_outputs(command: Command, folder: Path) -> Path:
     old.mkdir()
     if command.name == 'report':
         shutil.copytree(folder / 'in/a', old, dirs_exist_ok=True)
-        (old / 'report.html').write_text('an older page')
+        write_atomically(old / 'report.html', 'an older page')
     elif command.name == 'simulate':
         arguments = ['simulate', '--scenario', 'tiny', '--seed', '4', '-o', str(old / 'sim')]
         Child(folder, arguments).wait()
@@ -168,7 +169,7 @@ def _old_outputs(command: Command, folder: Path) -> Path:
         shutil.copytree(folder / 'in/a/thumbnails', old / 'thumbnails')
         names = [p.name for p in (folder / 'in/a').iterdir() if p.is_file()]
         for name in (*names, 'difference.svg', 'table.csv', 'table1.json', 'table1.svg'):
-            (old / name).write_text(f'an older {name}')
+            write_atomically(old / name, f'an older {name}')
     return old
 
 

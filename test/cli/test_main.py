@@ -27,6 +27,7 @@ from starcal_ros.cli import main
 from starcal_ros.cli.arguments import EXIT_INTERRUPTED, parser
 from starcal_ros.cli.commands import demo
 from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.records import Image
 
@@ -302,6 +303,11 @@ def test_lookup_writes_the_columns_of_the_interface_document(
     [
         ('a.csv', ('--points', '1'), ['--points', '1 is not within 2 to 2000']),
         ('a.csv', ('--step', '0'), ['--step', '0 px']),
+        (
+            'a.csv',
+            ('--step', '1e-6'),
+            ['give 0.286 px (a table of 2000^2 pixels)'],
+        ),
         ('a.csv', ('--step', '641'), ['--step', '641 px']),
         ('a.txt', (), ['a.txt', '.csv', '.npz', '.fits']),
         ('a', (), ['.csv', '.npz', '.fits']),
@@ -533,7 +539,7 @@ def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
 def test_no_report_is_written_where_none_is_wanted(
     run: Run, tmp_path: Path, tiny_bag: Path, tiny_products: Path
 ) -> None:
-    (tmp_path / 'report.html').write_text('of earlier products')
+    write_atomically(tmp_path / 'report.html', 'of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
     status, out, _ = run('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
     assert status == 0 and out.endswith(f'products written to {tmp_path}\n')
@@ -552,7 +558,7 @@ def test_no_older_report_stands_beside_products_that_cannot_be_drawn(
         raise ValueError('no such colour')
 
     monkeypatch.setattr('starcal_ros.report.page.charts_of', cannot)
-    (tmp_path / 'report.html').write_text('of earlier products')
+    write_atomically(tmp_path / 'report.html', 'of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
     status, _, err = run('calibrate', bag, '--params', params, '-o', tmp_path)
     assert status == 0 and 'the products cannot be drawn: ValueError: no such colour' in err

@@ -1,9 +1,16 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Outputs that name inputs or files of others, and standard streams that are closed or full."""
+"""
+Outputs that name inputs or files of others, and standard streams that are closed or full.
+
+A command that writes is in the table `WRITING`.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
+import hashlib
+import os
 from pathlib import Path
 import random
 import shutil
@@ -12,9 +19,14 @@ import subprocess
 import sys
 
 from attacks import BAG, digests, in_time, many, write_product_folder  # type: ignore[import-not-found]
+from mission_files import write_frame, write_lsk, write_sclk  # type: ignore[import-not-found]
+import numpy as np
 import pytest
 
-from starcal_ros.cli import main
+from starcal_ros.cli import arguments, main
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.mission.export.export_formats import FORMATS
+from starcal_ros.sky.catalog import load_catalog
 
 pytestmark = pytest.mark.slow
 
@@ -94,6 +106,18 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda here: (here / 'a.mcap').write_text('recorded'),
         'simulate --scenario tiny -o HERE/a.mcap',
     ),
+    'pointings over the bag': (
+        lambda here: shutil.rmtree(here / 'out'),
+        f'plan HERE/bag {_OWN} HERE/bag/tiny_0.mcap',
+    ),
+    'pointings over the allowed ones': (
+        lambda here: write_atomically(here / 'allowed.csv', 'ra_deg,dec_deg\n1,2\n'),
+        f'plan HERE/bag --pointings HERE/allowed.csv {_OWN} HERE/allowed.csv',
+    ),
+    'catalog over its table': (
+        lambda here: write_atomically(here / 'gaia.npz', 'a table'),
+        'catalog HERE/gaia.npz -o HERE/gaia.npz',
+    ),
     'simulation over parameters': (
         lambda here: (here / 'a_params.yaml').write_text('mine'),
         'simulate --scenario tiny -o HERE/a.mcap',
@@ -123,6 +147,135 @@ def test_an_output_that_names_an_input_is_refused(
         assert main.main([word.replace('HERE', str(here)) for word in command.split()]) == 2
     assert ''.join(capsys.readouterr()).count('\n') == 1
     assert digests(here) == before
+
+
+_OF_BAG = 'HERE/bag --params HERE/bag/params.yaml'
+_CK = '--kernels HERE/bag/naif0012.tls HERE/bag/clock.tsc'
+WRITING: dict[str, str] = {
+    f'calibrate {_OF_BAG} -o HERE/o': (
+        'calibration.json camera_info.yaml observations.mcap residuals.npz report.html'
+        ' thumbnails/image_1.jpg not_calibrated.json'
+    ),
+    'report HERE/o': 'report.html',
+    'init HERE/bag -o HERE/o': 'params.yaml camera.yaml',
+    f'plan {_OF_BAG} --images 1 -o HERE/o/plan.csv': 'plan.csv',
+    'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
+    'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
+    'lookup HERE/out -o HERE/o/a.npz --points 2': 'a.npz',
+    'lookup HERE/out -o HERE/o/a.fits --points 2': 'a.fits',
+    'simulate --scenario tiny -o HERE/o': (
+        'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
+    ),
+    'simulate --scenario tiny -o HERE/o/b.mcap': ('b.mcap b.json b_params.yaml b_camera.yaml'),
+    (
+        'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
+        ' HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o'
+    ): 'o_0.mcap metadata.yaml import.json params.yaml camera.yaml',
+    'catalog HERE/gaia.csv -o HERE/o/deep.npz': 'deep.npz',
+    'trend HERE/out -o HERE/o': 'trend.html',
+    'campaign table1 --trials 1 --images 4 --tracker 20 --workers 0 -o HERE/o': (
+        'table1.json table1.svg'
+    ),
+    'export HERE/out --to c -o HERE/o': 'starcal_camera.c starcal_camera.h',
+    'export HERE/out --to c --table -o HERE/o': 'starcal_camera.bin',
+    'export HERE/out --to csv -o HERE/o': 'lines_of_sight.csv',
+    'export HERE/out --to giant -o HERE/o': 'giant_camera.json',
+    'export HERE/out --to isd --spacecraft-id -9 -o HERE/o': 'camera_isd.json camera_isis.ti',
+    'export HERE/out --to kalibr --image-topic /a -o HERE/o': 'camchain.yaml',
+    'export HERE/out --to mrcal -o HERE/o': 'camera.cameramodel',
+    'export HERE/out --to opencv -o HERE/o': 'opencv.yaml',
+    'export HERE/out --to ros -o HERE/o': 'camera_info.yaml alignment.yaml',
+    'export HERE/out --to spice --spacecraft-id -9 -o HERE/o': 'camera.tf camera.ti',
+    f'export HERE/out --to ck --spacecraft-id -999 -o HERE/o {_CK}': 'camera.bc',
+}
+"""Commands that write, and the files that they write in ``o/``."""
+WITH_NODES = {
+    'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json',
+    'request lookup -o HERE/o/a.csv': 'a.csv',
+}
+
+
+def _foreign(path: Path) -> None:
+    path.write_bytes(b'of another program')
+
+
+def _edited(path: Path) -> None:
+    write_atomically(path, 'of an earlier run\n')
+    with path.open('a') as file:
+        file.write('and of the user\n')
+
+
+OF_OTHERS: dict[str, Callable[[Path], object]] = {
+    'foreign': _foreign,
+    'edited': _edited,
+    'folder': Path.mkdir,
+    'dangling link': lambda path: path.symlink_to('nothing'),
+    'pipe': os.mkfifo,
+}
+
+
+@pytest.fixture(scope='module')
+def inputs(campaign: Path) -> Path:
+    """The campaign with a frame, its time and attitudes, a table of Gaia, and kernels."""
+    write_frame(campaign / 'frames')
+    stars = load_catalog(None, 3.0)
+    stars = stars.select(stars.id > 0)
+    places = np.degrees([stars.ra_rad, stars.dec_rad])
+    columns = zip(stars.id, *places, stars.magnitude, strict=True)
+    rows = [','.join(map(str, row)) for row in columns]
+    header = 'source_id,ra,dec,phot_g_mean_mag'
+    (campaign / 'gaia.csv').write_text('\n'.join([header, *rows, '']))
+    write_lsk(campaign / 'bag/naif0012.tls')
+    write_sclk(campaign / 'bag/clock.tsc')
+    return campaign
+
+
+def test_each_command_that_writes_is_in_the_table() -> None:
+    """One without an option -o that writes is `report`."""
+    actions = arguments.parser()._actions
+    commands = next(one for one in actions if isinstance(one, argparse._SubParsersAction))
+    writing = {
+        name
+        for name, command in commands.choices.items()
+        if '--output' in command._option_string_actions
+    }
+    table = (*WRITING, *WITH_NODES)
+    assert {words.partition(' ')[0] for words in table} == {*writing, 'report'}
+    assert {words.split()[3] for words in table if words.startswith('export')} == {*FORMATS}
+
+
+@pytest.mark.parametrize('command', [*WRITING, *WITH_NODES])
+def test_what_starcal_did_not_write_is_not_replaced(
+    command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file of others, or its own that was changed: nothing is written. Its own is replaced."""
+    if command.startswith('demo'):
+        pytest.importorskip('rclpy')
+    here = tmp_path / 'campaign'
+    shutil.copytree(inputs, here)
+    names = (WRITING | WITH_NODES)[command].split()
+    line = [word.replace('HERE', str(here)) for word in command.split()]
+    if command.startswith('report'):
+        shutil.copytree(inputs / 'out', here / 'o')
+        (here / 'o/report.html').unlink()
+    for name in names:
+        (here / 'o' / name).parent.mkdir(parents=True, exist_ok=True)
+        for make in OF_OTHERS.values():
+            make(here / 'o' / name)
+            before = digests(here)
+            assert main.main(line) == 2, name
+            error = ''.join(capsys.readouterr())
+            assert error.count('\n') == 1 and f'/o/{name}: ' in error
+            assert digests(here) == before
+            is_folder = (here / 'o' / name).is_dir()
+            (here / 'o' / name).rmdir() if is_folder else (here / 'o' / name).unlink()
+    if command in WITH_NODES:
+        return
+    for name in names:
+        write_atomically(here / 'o' / name, 'of an earlier run')
+    assert main.main(line) == 0, capsys.readouterr()
+    old = hashlib.sha256(b'of an earlier run').hexdigest()
+    assert old not in digests(here).values()
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from starcal_ros.child_process import module_command
 from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError, StarcalError
+from starcal_ros.files import mark
 from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_text, write_atomically
@@ -103,6 +104,12 @@ def tiny_bag(spare: Path) -> DemoBag:
     return DemoBag(folder, parameters, prior, simulated_bag.true_geometry(truth), truth['images'])
 
 
+def outputs(folder: Path) -> list[Path]:
+    """The parameter file and the log files of a run."""
+    logs = [folder / f'{name}.log' for name in (*_NODES, 'bag_player')]
+    return [folder / 'demo_params.yaml', *logs]  # not params.yaml: a user's may be there
+
+
 def run(
     bag: DemoBag, folder: Path, on_image: Callable[[], None] = lambda: None
 ) -> tuple[Calibration | None, str]:
@@ -114,7 +121,7 @@ def run(
     have ended when this returns.  Raises NodeError when a node does not start, or ends before the
     calibration.
     """
-    params = folder / 'demo_params.yaml'  # not params.yaml: a user's may be there
+    params, *_ = outputs(folder)
     content = {'/**': {'ros__parameters': bag.parameters}}
     write_atomically(params, yaml.safe_dump(content, sort_keys=False))
     environment = {**os.environ, **_own_domain()}
@@ -128,7 +135,8 @@ def run(
             *('-p', 'wait_for_topic:=observations', '-p', f'wait_for_subscribers_s:={_START_S}'),
         ]
         for name, command in commands.items():
-            log = stack.enter_context((folder / f'{name}.log').open('wb'))
+            log = stack.enter_context((folder / f'{name}.log').open('w+b'))
+            stack.callback(mark, log)
             # Interrupted in here, the process would run on with nobody to end it.
             with _interrupts_wait():
                 nodes[name] = subprocess.Popen(

@@ -23,7 +23,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.images.photographs import image_paths, Photograph
 from starcal_ros.formats.messages.message_fields import ATTITUDE_TYPES, VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.formats.products.product_files import make_folder, write_atomically
+from starcal_ros.formats.products.product_files import check_outputs, make_folder, write_atomically
 from starcal_ros.pipeline import night_sky
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
@@ -126,10 +126,8 @@ def _aligned(
 def init(args: argparse.Namespace, asked: Topics) -> int:
     """Write camera and parameters that the stars show, and print them."""
     params, camera = args.output / _PARAMS_FILE, args.output / CAMERA_FILE
-    for path in (params, camera):
-        if path.exists():
-            raise OptionError(f'{path}: exists; choose another folder (-o)')
     photographs = image_paths(args.bags)
+    check_outputs((params, camera), photographs or reader.files_of_bags(args.bags))
     if photographs:
         chosen, notes = night_sky.photographs_of(
             photographs, args.focal_length_mm, args.pixel_size_um

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
 from starcal_ros.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import make_folder
+from starcal_ros.formats.products.product_files import check_outputs, make_folder
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -147,8 +147,7 @@ def _catalog(args: argparse.Namespace) -> int:
     from starcal_ros.mission.ingest.gaia_catalog import write_deep_catalog
 
     output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
-    if output.exists():
-        raise OptionError(f'{output}: exists; choose another file (-o)')
+    check_outputs([output], [args.table])
     made = write_deep_catalog(args.table, output)
     print_text(
         f'{made.added} stars of {args.table} to V = {made.faintest:.1f}, with the bundled ones'
@@ -178,6 +177,7 @@ def _trend(args: argparse.Namespace) -> int:
 
     if not places.is_remote(args.output):
         make_folder(Path(args.output))
+        check_outputs([Path(args.output, trend_page.TREND_FILE)])
     table = Table(args.output)
     # A file that was repaired or removed is no longer among the tasks.
     table.forget_failed(() if args.retry else (task.stamp for task in tasks()))

@@ -11,9 +11,10 @@ from pathlib import Path
 import sys
 
 from starcal_ros.cli.arguments import EXIT_ACCEPTED
-from starcal_ros.cli.output import check_no_product
+from starcal_ros.cli.output import check_file
 from starcal_ros.cli.terminal import print_table, print_text
 from starcal_ros.errors import OptionError
+from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
@@ -29,7 +30,8 @@ def plan(args: argparse.Namespace, asked: Topics) -> int:
     """Print the pointings that lower a sigma most, and write them if asked."""
     setup = read_setup(args.params)
     if args.output:
-        check_no_product(args.output, [*args.bags, args.params, *files_of(setup.frames).values()])
+        given = [args.params, *files_of(setup.frames).values(), *filter(None, [args.pointings])]
+        check_file(args.output, [*reader.files_of_bags(args.bags), *given])
     request = Request(
         args.images,
         args.minimise,

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 import contextlib
 from dataclasses import dataclass
 import io
-import json
-import os
 from pathlib import Path
 from types import TracebackType
 from typing import Any, IO, TYPE_CHECKING
@@ -32,7 +30,6 @@ from starcal_ros.formats.messages.message_fields import (
 )
 from starcal_ros.formats.messages.observation_messages import observations_to_message
 from starcal_ros.records import Image, StarObservations
-from starcal_ros.untrusted import PRODUCT_BYTES, read_text
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -105,6 +102,13 @@ class BagWriter:
                 with replacing(self._metadata_file) as file:
                     file.write(self._metadata().encode())
 
+    def outputs(self) -> list[Path]:
+        """Files of the bag to write, and those of any bag in its folder."""
+        if self._metadata_file is None:
+            return [self.file]
+        there = [path for end in _OF_BAGS for path in self.file.parent.glob(end)]
+        return [self.file, self._metadata_file, *there]
+
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
         message = image_to_message(image, frame_id, make_message)
@@ -174,32 +178,6 @@ class BagWriter:
             for topic, (_, type_name) in self._channels.items()
         ]
         return metadata_text([file], topics)
-
-
-def check_replaceable(
-    bag: Path, record: Path, others: Iterable[Path], mark: str, kind: str
-) -> None:
-    """
-    Check that a bag and the files beside it replace nothing but an earlier bag of their kind.
-
-    ``record`` is a JSON object beside the bag, whose key ``bag`` names the file of the bag and
-    whose key ``mark`` only records of this kind have; ``others`` are further files to write.
-    Raises BagError that names a file that is not of ``kind``, as 'a simulated bag'.
-    """
-    file = BagWriter(bag).file
-    there = [path for path in (file, record, *others) if os.path.lexists(path)]
-    if bag != file:
-        there += [path for end in _OF_BAGS for path in bag.glob(end)]
-    if there and not _is_record_of(file.name, record, mark):
-        raise BagError(f'{there[0]}: is not of {kind} and would be replaced; choose another place')
-
-
-def _is_record_of(bag_name: str, record: Path, mark: str) -> bool:
-    try:
-        content = json.loads(read_text(record, PRODUCT_BYTES))
-        return bool(content['bag'] == bag_name and content[mark])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
 
 
 @dataclass(frozen=True)

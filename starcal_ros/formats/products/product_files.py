@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
 from starcal_ros import untrusted
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import replacing, same_as_one_of
+from starcal_ros.files import is_marked, replacing, same_as_one_of
 
 OBSERVATIONS_FILE = 'observations.mcap'
 REPORT_FILE = 'report.html'
@@ -43,8 +45,13 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
-def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that no output of a command is one of its inputs; raises ProductError."""
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
+    """
+    Check that a command may write its files: none is an input, and each is new or was its own.
+
+    Its own is a file that starcal wrote and nothing changed since.  Raises ProductError naming the
+    first file that would be replaced and the remedy.
+    """
     inputs = tuple(inputs)
     for path in outputs:
         if same_as_one_of(path, inputs):
@@ -52,3 +59,16 @@ def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
                 f'{path}: is an input of this command and would be replaced; choose another '
                 'place (-o)'
             )
+        if os.path.isdir(path):
+            raise ProductError(f'{path}: is a folder, where a file is written; give another name')
+        if os.path.lexists(path) and not _is_own(path):
+            raise ProductError(
+                f'{path}: was not written by starcal, or was changed or copied since: give another'
+                ' name or remove it'
+            )
+
+
+def _is_own(path: Path) -> bool:
+    with contextlib.suppress(OSError, ValueError), untrusted.regular_file(path, False) as file:
+        return is_marked(file)
+    return False

@@ -12,7 +12,7 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.lookup_table import write_lookup_table
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.products.product_files import check_outputs, write_atomically
 from starcal_ros.mission.export import camera_models
 from starcal_ros.mission.export.c_camera import c_files, c_table, TABLE_FILE
 from starcal_ros.mission.export.camera_models import isd_files
@@ -55,7 +55,7 @@ def export(
     Write a calibration to a folder in one of `FORMATS`.
 
     Raises OptionError for an unknown format, or names that SPICE does not allow. Raises
-    ProductError when a file cannot be written.
+    ProductError when a file cannot be written, and as `check_outputs` does.
 
     Parameters
     ----------
@@ -100,6 +100,7 @@ def export(
         ),
     }
     made = makers[kind]()
+    check_outputs((folder / name for name in made.files), kernels)
     for name, content in made.files.items():
         if callable(content):
             content(folder / name)

@@ -21,7 +21,7 @@ import yaml
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of
-from starcal_ros.formats.bag.writer import BagWriter, check_replaceable
+from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.images import image_files
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -100,14 +100,15 @@ def _options_of(path: Path, options: image_files.ImageOptions) -> image_files.Im
 
 def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -> None:
     """
-    Check that a bag and the files beside it replace no input and no file of another origin.
+    `check_outputs` of a bag and the files beside it; a prior camera that lies there stays.
 
-    Raises BagError or ProductError naming the file.
+    Raises ProductError naming the file.
     """
     record, params, copied = _files_beside(bag)
-    product_files.check_not_inputs([BagWriter(bag).file, record, params], inputs)
-    others = [p for p in (params, copied) if camera and not same_as_one_of(p, [camera])]
-    check_replaceable(bag, record, others, 'scale', 'an imported bag')
+    prior = [params] if camera else []
+    if camera and not same_as_one_of(copied, [camera]):
+        prior.append(copied)
+    product_files.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
 
 
 def _files_beside(bag: Path) -> tuple[Path, Path, Path]:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
-from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.formats.products.product_files import make_folder, write_atomically
 from starcal_ros.identification.blind.bright_sources import bright_sources
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
@@ -143,17 +143,21 @@ def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
 
     Raises ProductError when a file cannot be written, or the folder is a link.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if folder.is_symlink():
-            raise ProductError(f'{folder}: is a link; remove it or choose another folder')
-        for path in folder.iterdir():
-            if _NAME.fullmatch(path.name):
-                path.unlink()
-    except OSError as error:
-        raise ProductError(f'{folder}: cannot be written: {error.strerror}') from error
+    make_folder(folder)
+    for path in thumbnails_in(folder):
+        with errors_as(ProductError, path, 'removed'):
+            path.unlink()
     for thumbnail in thumbnails:
         write_atomically(folder / thumbnail.name, thumbnail.encoded)
+
+
+def thumbnails_in(folder: Path) -> list[Path]:
+    """Files with names of thumbnails in a folder; raises ProductError where it is a link."""
+    if folder.is_symlink():
+        raise ProductError(f'{folder}: is a link; remove it or choose another folder')
+    with errors_as(ProductError, folder):
+        there = folder.iterdir() if folder.exists() else ()
+        return [path for path in there if _NAME.fullmatch(path.name)]
 
 
 def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:

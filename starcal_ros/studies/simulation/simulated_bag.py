@@ -22,9 +22,9 @@ import yaml
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
-from starcal_ros.formats.bag.writer import BagWriter, check_replaceable
+from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.products.product_files import check_outputs, write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.studies.simulation import centroids
@@ -191,8 +191,7 @@ def write_bag(
 
     A bag folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; for a single file
     ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and ``NAME_camera.yaml``. Raises
-    BagError when a file cannot be written, or when it would replace a file that is not from a
-    simulated bag.
+    BagError when a file cannot be written, and ProductError as `check_outputs` does.
 
     Parameters
     ----------
@@ -209,7 +208,7 @@ def write_bag(
     else:
         beside = ('truth.json', 'params.yaml', 'camera.yaml')
     truth, params, camera = (writer.file.with_name(name) for name in beside)
-    check_replaceable(path, truth, (params, camera), 'scenario', 'a simulated bag')
+    check_outputs((*writer.outputs(), truth, params, camera))
     scenario = dataclasses.replace(scenario, prior=mistakes.prior(scenario.prior))
     content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)

@@ -73,5 +73,7 @@ def test_photographs_give_the_camera_and_the_next_command_takes_it(
     assert 'left to state: observer: ground' in capsys.readouterr().out
     params = ['--params', str(first / 'params.yaml'), '--no-report']
     assert main(['calibrate', str(night), *params, '-o', str(tmp_path / 'out')]) in (0, 3)
+    with (first / 'params.yaml').open('a') as file:
+        file.write('    shutter: global\n')
     assert main(['init', str(night), '-o', str(first)]) == 2
-    assert 'params.yaml: exists; choose another folder' in capsys.readouterr().err
+    assert 'params.yaml: was not written by starcal, or was changed' in capsys.readouterr().err

@@ -212,7 +212,7 @@ def test_no_file_of_another_origin_is_replaced(
                  a=aem, b=tmp_path / bag, c=TINY / 'camera.yaml')  # fmt: skip
     assert main(line) == 2
     error = capsys.readouterr().err
-    assert 'is not of an imported bag and would be replaced' in error and error.count('\n') == 1
+    assert 'was not written by starcal' in error and error.count('\n') == 1
     assert tree(folder) == before
 
 
