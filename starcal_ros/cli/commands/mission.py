@@ -148,7 +148,7 @@ def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
 
 def _catalog(args: argparse.Namespace) -> int:
     """Make a catalog file from a table of Gaia."""
-    from starcal_ros.mission.ingest.gaia_catalog import write_deep_catalog
+    from starcal_ros.mission.ingest.gaia_catalog import refusals, write_deep_catalog
 
     output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
     if output.exists():
@@ -158,6 +158,8 @@ def _catalog(args: argparse.Namespace) -> int:
         f'{made.added} stars of {args.table} to V = {made.faintest:.1f}, with the bundled ones'
         f' {len(made.columns["id"])}, written to {output}'
     )
+    if made.refused:
+        print_text(refusals(made.refused))
     print_text(
         f'in the parameter file: catalog: {output.absolute()}, magnitude_limit:'
         f' {made.faintest:.1f}'
