@@ -100,7 +100,7 @@ def test_every_field_of_a_record_has_its_field_in_the_message() -> None:
 def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
     message = calibration_to_message(calibration(), plain)
     for name in (
-        'temperature', 'maps', 'correlation', 'removals', 'model_checks', 'field', 'gate',
+        'temperature', 'maps', 'correlation', 'model_checks', 'field', 'gate',
         'star_trackers', 'sigma_budget',
     ):  # fmt: skip
         delattr(message, name)
@@ -114,7 +114,6 @@ def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
         ('maps', 'line_of_sight_sigma_arcsec', 'sigma_arcsec: 1 numbers, not 4 x 3'),
         ('maps', 'shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
         ('correlation', 'matrix', 'matrix: 1 numbers, not 2 x 2'),
-        ('removals', 'residual_std_px', 'residual_std_px: 1 numbers, not 2'),
         ('field', 'coefficients', 'coefficients: 1 numbers, not 2 x 3'),
         ('field', 'joint_covariance', 'joint_covariance: 1 numbers, not 0 x 0'),
         ('field', 'covariance_factor', 'covariance_factor: 1 numbers, not 19 x 2'),
