@@ -28,7 +28,6 @@ from starcal_ros.records import (
     StarObservations,
     StarTrackerAlignment,
     TemperatureTerms,
-    TermRemoval,
 )
 
 TIME_NS = 1_700_000_000_123_456_789
@@ -106,10 +105,6 @@ def calibration() -> Calibration:
             np.sqrt(np.arange(12.0)).reshape(4, 3),
         ),
         correlation=Correlation(('fx', 'fy'), np.array([[1.0, 1 / 3], [1 / 3, 1.0]])),
-        removals=(
-            TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
-            TermRemoval('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
-        ),
         star_trackers=(
             StarTrackerAlignment(
                 'head',
@@ -204,7 +199,6 @@ def plain_calibration() -> Calibration:
         temperature=None,
         maps=None,
         correlation=None,
-        removals=(),
         star_trackers=(),
         model_checks=None,
         gate=(),

@@ -512,16 +512,10 @@ def _import(command: argparse.ArgumentParser) -> None:
     command.add_argument('--camera', type=Path, metavar='FILE', help=what)
     what = (
         'prior orientation x y z w of the camera in the star tracker frame, then in the frame of'
-        ' each further star tracker (default: found from the first images)'
+        ' each further star tracker; of a single star tracker it may be left out: it is then found'
+        ' from the first images'
     )
-    command.add_argument(
-        '--alignment',
-        nargs='+',
-        type=float,
-        default=(0.0, 0.0, 0.0, 0.0),
-        help=what,
-        metavar='Q',
-    )
+    command.add_argument('--alignment', nargs='+', type=float, default=(), metavar='Q', help=what)
 
 
 def _catalog(command: argparse.ArgumentParser) -> None:

@@ -17,7 +17,6 @@ from starcal_ros.assessment.amplitude_checks import model_checks
 from starcal_ros.assessment.budget import sigma_budget
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.residuals import Residuals, residuals_of
-from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.conversion import ros_fit
@@ -220,7 +219,6 @@ def _not_judged(
             camera, result.map_covariance, result.table.measured_px[kept]
         ),
         correlation=observability.correlation(result.shared_covariance, result.shared_names),
-        removals=removal_study(result),
         star_trackers=tuple(
             dataclasses.replace(one, frame=one.frame or setup.frames.star_tracker_frame)
             for one in result.star_trackers

@@ -17,7 +17,6 @@ from starcal_ros.records.calibration import (
     DetectorMaps,
     GateCheck,
     TemperatureTerms,
-    TermRemoval,
 )
 from starcal_ros.records.calibration_parts import (
     Amplitude,

@@ -124,44 +124,6 @@ class Correlation:
 
 
 @dataclass(frozen=True)
-class TermRemoval:
-    """
-    A calibration after one more term was removed; terms removed before stay removed.
-
-    Attributes
-    ----------
-    removed : str
-        The term; empty for the calibration with all of them.
-    significance : float
-        Distance of the term, with all terms estimated, from the value it is held at when removed,
-        in its sigma.
-    wald : float
-        Rise of chi^2 that the covariance before the removal predicts.
-    chi2_rise : float
-        Rise of chi^2 against the calibration with all terms, over its stars, with its weights.
-    negligible : bool
-        Whether this term and all removed before it may be dropped: the p-value of the rise is over
-        1 %.
-    residual_rms_px : float
-        Per axis, over the same stars.
-    residual_std_px : (float, float)
-        Standard deviation along u and along v.
-    map_change_px : float
-        RMS change over the detector against the calibration with all terms, common rotation
-        removed.
-    """
-
-    removed: str
-    significance: float
-    wald: float
-    chi2_rise: float
-    negligible: Annotated[bool, Named(formerly='within_chance')]
-    residual_rms_px: float
-    residual_std_px: Annotated[tuple[float, ...], Shape((2,))]
-    map_change_px: float
-
-
-@dataclass(frozen=True)
 class GateCheck:
     """
     One check of the gate.
@@ -264,8 +226,6 @@ class Calibration:
     maps : DetectorMaps or None
     correlation : Correlation or None
         None where not recorded.
-    removals : tuple of TermRemoval
-        First that of no term, then the terms in the order of their removal; may be empty.
     first_image_ns : int
         Stamp of the first image used.
     number : int
@@ -312,7 +272,6 @@ class Calibration:
     temperature: TemperatureTerms | None = None
     maps: DetectorMaps | None = None
     correlation: Correlation | None = None
-    removals: tuple[TermRemoval, ...] = ()
     first_image_ns: Stamp = 0
     number: Count = 0
     active_since_ns: Annotated[Stamp, Named(formerly='in_force_since_ns')] = 0

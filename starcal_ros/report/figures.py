@@ -14,7 +14,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import whitening
-from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations, TermRemoval
+from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations
 from starcal_ros.report.pictures.annotation import predicted_px
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import (
@@ -298,52 +298,3 @@ def sigma_budget(parts: Sequence[SigmaPart], has_alignment: bool) -> Chart:
         'Share of the variance of a line of sight, over the detector, that would be gone if '
         'the cause were known exactly.',
     )  # fmt: skip
-
-
-def term_worth(removals: Sequence[TermRemoval]) -> Chart:
-    """Residuals and map as terms are removed one after the other (paper, Fig. 8)."""
-    negligible = [removal.negligible for removal in removals]
-    names = ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
-    insignificant = [r.removed for r in removals[1:] if r.negligible]
-    last = max((k for k, one in enumerate(negligible) if one), default=0)
-    drawn = removal_curves(
-        np.array([removal.residual_std_px for removal in removals]),
-        np.array([removal.map_change_px for removal in removals]),
-        names,
-        last,
-    )
-    return Chart(
-        'Significance of each term',
-        drawn,
-        'Terms removed one after another, the least significant first, with all others '
-        f'estimated again. Not significant (shaded): {", ".join(insignificant) or "none"}.',
-    )
-
-
-def removal_curves(
-    std_px: Floats, map_change_px: Floats, names: Sequence[str], insignificant: int = 0
-) -> Drawing:
-    """
-    Residuals and change of the map after each removal of a term.
-
-    ``std_px`` (n, 2) are the standard deviations of the residuals along u and v, first with all
-    terms; ``map_change_px`` (n,) the RMS change of the distortion map, of which the first is not
-    shown; ``names`` (n,) the terms.  Up to the removal ``insignificant`` the background is shaded.
-    """
-    steps = np.arange(len(names), dtype=float)
-    values = np.c_[std_px, np.r_[np.nan, map_change_px[1:]]].T
-    labels = ('residual, std of u', 'residual, std of v', 'change of the map, rms')
-    marks = ('circle', 'square', 'triangle')
-    curves = [
-        Curve(steps, np.where(one > 0, one, np.nan), colour, label, mark)
-        for one, label, colour, mark in zip(values, labels, SERIES, marks, strict=True)
-    ]
-
-    def shade(panel: Panel) -> None:
-        if insignificant:
-            panel.band(-0.5, insignificant + 0.5, is_vertical=True)
-
-    ends = -0.5, len(names) - 0.5
-    ticks = list(zip(steps.tolist(), names, strict=True))
-    return plot(curves, 'removed, one by one', 'px', x=ends, log='y', x_ticks=ticks,
-                is_left=True, under=shade)  # fmt: skip

@@ -225,8 +225,6 @@ def charts_of(
         parts = parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
         charts['causes'] = detector_figures.budget_over_detector(parts, camera)
-    if len(calibration.removals) > 1:
-        charts['terms'] = figures.term_worth(calibration.removals)
     if residuals is not None and residuals.used.any():
         charts |= _residual_charts(calibration, residuals)
         if prior is not None:

@@ -21,7 +21,6 @@ from scipy.stats import norm
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import (
     CameraModel,
@@ -37,17 +36,18 @@ from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.star_equations import squared_sigmas, star_table
 from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import Ensemble, StarObservations, TermRemoval
+from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.report.detector_figures import distortion_contours, distortion_vectors, star_cloud
-from starcal_ros.report.figures import outline, term_worth
+from starcal_ros.report.figures import outline
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import Curve, Drawing, GRID, INK, Panel, SERIES, sheet
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.monte_carlo import Design, Row
 from starcal_ros.studies.simulation.rendering import fixed_pattern, render
 from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenario, scene
-from starcal_ros.studies.study_figures import removed_terms
+from starcal_ros.studies.study_figures import removed_terms, term_worth
 from starcal_ros.studies.summary import StudyResult
+from starcal_ros.studies.term_removal import removal_study, TermRemoval
 from starcal_ros.studies.trials import PAPER_ESTIMATE, rms
 
 NIGHT = 'paper'
@@ -362,4 +362,4 @@ def _terms(found: PaperStudy) -> Drawing:
     order = [*gone, *(name for name in PARAMETER_NAMES if name not in gone)]
     share = [[float(name in gone[:step]) for name in order] for step in range(len(removals))]
     table = removed_terms(np.array(share), order, 'coloured: removed from the calibration')
-    return sheet([[table, term_worth(removals).svg]])
+    return sheet([[table, term_worth(removals)]])

@@ -10,11 +10,12 @@ from scipy.stats import chi2
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES
-from starcal_ros.report.figures import outline, removal_curves
+from starcal_ros.report.figures import outline
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import Curve, Drawing, INK, Panel, Scale, SERIES, sheet, WIDTH, words
 from starcal_ros.studies.monte_carlo import ENOUGH, Row, UNUSED_IMAGES
 from starcal_ros.studies.summary import column, StudyResult
+from starcal_ros.studies.term_removal import TermRemoval
 from starcal_ros.studies.trials import ESTIMATED
 
 # Colour, mark, and width that keeps coinciding lines visible.
@@ -207,3 +208,42 @@ _FIGURES: Mapping[str, Callable[[StudyResult], Rows]] = {
     'terms': _terms,
     'coverage': _coverage,
 }
+
+
+def term_worth(removals: Sequence[TermRemoval]) -> Drawing:
+    """Residuals and map as terms are removed one after the other (paper, Fig. 8)."""
+    return removal_curves(
+        np.array([removal.residual_std_px for removal in removals]),
+        np.array([removal.map_change_px for removal in removals]),
+        ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])],
+        max((k for k, removal in enumerate(removals) if removal.negligible), default=0),
+    )
+
+
+def removal_curves(
+    std_px: Floats, map_change_px: Floats, names: Sequence[str], insignificant: int = 0
+) -> Drawing:
+    """
+    Residuals and change of the map after each removal of a term.
+
+    ``std_px`` (n, 2) are the standard deviations of the residuals along u and v, first with all
+    terms; ``map_change_px`` (n,) the RMS change of the distortion map, of which the first is not
+    shown; ``names`` (n,) the terms.  Up to the removal ``insignificant`` the background is shaded.
+    """
+    steps = np.arange(len(names), dtype=float)
+    values = np.c_[std_px, np.r_[np.nan, map_change_px[1:]]].T
+    labels = ('residual, std of u', 'residual, std of v', 'change of the map, rms')
+    marks = ('circle', 'square', 'triangle')
+    curves = [
+        Curve(steps, np.where(one > 0, one, np.nan), colour, label, mark)
+        for one, label, colour, mark in zip(values, labels, SERIES, marks, strict=True)
+    ]
+
+    def shade(panel: Panel) -> None:
+        if insignificant:
+            panel.band(-0.5, insignificant + 0.5, is_vertical=True)
+
+    ends = -0.5, len(names) - 0.5
+    ticks = list(zip(steps.tolist(), names, strict=True))
+    return plot(curves, 'removed, one by one', 'px', x=ends, log='y', x_ticks=ticks,
+                is_left=True, under=shade)  # fmt: skip

@@ -54,7 +54,6 @@ FIGURES = (
     'causes',
     'line_of_sight',
     'shape',
-    'terms',
     'alignment',
 )
 
@@ -211,7 +210,6 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         variance_factor=np.nan,
         maps=None,
         correlation=None,
-        removals=(),
         time_ns=0,
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)

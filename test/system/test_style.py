@@ -60,3 +60,10 @@ def test_docstrings_state_a_result_and_functions_are_short() -> None:
                 long += [f'{path}: {node.name}'] if lines > LONGEST_FUNCTION_LINES else []
     assert [text for text in texts if re.match(r'(What|Whether|Of)\b', text)] == []
     assert long == []
+
+
+def test_no_folder_of_one_machine_is_named() -> None:
+    """Files from elsewhere are looked for beside this repository, in ``../shared``."""
+    files = [*FILES, *(ROOT / 'test').rglob('*.py')]
+    folders = {name for path in files for name in re.findall(r"Path\('(/\w+)", path.read_text())}
+    assert folders <= {'/dev', '/proc', '/usr'}

@@ -90,8 +90,12 @@ def _import(args: argparse.Namespace) -> int:
         temperature_key=args.temperature_key,
     )
     needed = 4 * (1 + len(args.more_star_trackers))
-    if args.camera and len(args.alignment) != needed:
-        raise OptionError(f'--alignment: {len(args.alignment)} numbers, {needed} are needed')
+    given = len(args.alignment)
+    if args.camera and given != needed and (given or args.more_star_trackers):
+        raise OptionError(
+            f'--alignment: {given} numbers, {needed} are needed: x y z w for each star tracker;'
+            ' only that of a single one is found from the images'
+        )
     paths, solved = _expanded(args.images), _expanded(args.attitude, '--attitude')
     inputs = [args.times, args.camera, *solved, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
@@ -115,7 +119,7 @@ def _import(args: argparse.Namespace) -> int:
         velocities = args.velocity and guard.call(
             _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
         )
-        prior = args.camera and recording.Prior(args.camera, tuple(args.alignment))
+        prior = args.camera and recording.Prior(args.camera, tuple(args.alignment) or (0.0,) * 4)
         made = recording.write_bag(
             args.output, files, options, guard, attitudes, velocities, prior, advance, further
         )
@@ -144,7 +148,7 @@ def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
 
 def _catalog(args: argparse.Namespace) -> int:
     """Make a catalog file from a table of Gaia."""
-    from starcal_ros.mission.ingest.gaia_catalog import write_deep_catalog
+    from starcal_ros.mission.ingest.gaia_catalog import refusals, write_deep_catalog
 
     output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
     check_outputs([output], [args.table])
@@ -153,6 +157,8 @@ def _catalog(args: argparse.Namespace) -> int:
         f'{made.added} stars of {args.table} to V = {made.faintest:.1f}, with the bundled ones'
         f' {len(made.columns["id"])}, written to {output}'
     )
+    if made.refused:
+        print_text(refusals(made.refused))
     print_text(
         f'in the parameter file: catalog: {output.absolute()}, magnitude_limit:'
         f' {made.faintest:.1f}'

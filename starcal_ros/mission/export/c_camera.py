@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import hashlib
 from importlib import resources
+import re
 import struct
 import sys
 import zlib
@@ -25,7 +26,7 @@ from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.temperature import camera_at
 from starcal_ros.formats.products.calibration_json import calibration_text
-from starcal_ros.mission.export.losses import origin
+from starcal_ros.mission.export.losses import ascii_line, origin
 from starcal_ros.records import Calibration, factored_field, ResidualField
 
 TABLE_FILE = 'starcal_camera.bin'
@@ -48,11 +49,16 @@ def c_files(calibration: Calibration) -> dict[str, str]:
         ', '.join(map(str, table[k : k + _BYTES_A_LINE])) + ','
         for k in range(0, len(table), _BYTES_A_LINE)
     )
-    about = ''.join(f' * {line.replace("*/", "* /")}\n' for line in origin(calibration))
+    about = ''.join(f' * {_comment(line)}\n' for line in origin(calibration))
     folder = resources.files('starcal_ros.mission.export') / 'c'
     header, source = ((folder / f'starcal_camera.{end}').read_text('utf-8') for end in 'hc')
     source = source.replace('@TABLE@', '\n'.join(lines))
     return {'starcal_camera.h': header, 'starcal_camera.c': f'/*\n{about} */\n{source}'}
+
+
+def _comment(text: str) -> str:
+    """Text within a comment of C: without what opens or closes one, and without trigraphs."""
+    return re.sub(r'(?<=[*/])(?=[*/])|(?<=\?)(?=\?)', ' ', ascii_line(text))
 
 
 def c_table(calibration: Calibration) -> bytes:
@@ -92,7 +98,7 @@ def c_table(calibration: Calibration) -> bytes:
     ]
     body = np.concatenate([np.ravel(one) for one in numbers]).astype('<f8').tobytes()
     for part in calibration.sigma_budget:
-        body += part.cause.encode('ascii', 'replace')[: _NAME_SIZE - 1].ljust(_NAME_SIZE, b'\0')
+        body += ascii_line(part.cause).encode()[: _NAME_SIZE - 1].ljust(_NAME_SIZE, b'\0')
         body += struct.pack('<2d', part.map_arcsec, part.pointing_arcsec)
     body += terms.astype('<u2').tobytes()
     body += triangle.T[np.triu_indices(len(triangle))].astype('<i2').tobytes()

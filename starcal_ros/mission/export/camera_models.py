@@ -27,7 +27,16 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
-from starcal_ros.mission.export.losses import about, Content, Files, fitted, GRID, Loss, origin
+from starcal_ros.mission.export.losses import (
+    about,
+    ascii_line,
+    Content,
+    Files,
+    fitted,
+    GRID,
+    Loss,
+    origin,
+)
 from starcal_ros.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
 from starcal_ros.records import Calibration
 
@@ -177,7 +186,7 @@ def mrcal_cameramodel(calibration: Calibration) -> Content:
 
 
 def _commented(lines: list[str]) -> list[str]:
-    return [f'# {line}' for line in lines]
+    return [f'# {ascii_line(line)}' for line in lines]
 
 
 def _yaml(content: object) -> str:

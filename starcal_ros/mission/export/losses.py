@@ -2,7 +2,8 @@
 """
 The parts of a calibration that another format cannot hold, and their cost in pixels.
 
-With its origin they are the comment of an exported file, in ASCII.
+With its origin they are the comment of an exported file.  Names and reasons hold anything: each
+comment, and each text in a format without escapes, passes `ascii_line`.
 """
 
 from __future__ import annotations
@@ -120,12 +121,12 @@ def origin(calibration: Calibration) -> list[str]:
     for name, value in sorted(calibration.provenance.items()):
         if name not in ('software', 'options', 'prior'):
             lines.append(f'{name}: {value}')
-    return [ascii_line(line) for line in lines]
+    return lines
 
 
 def ascii_line(text: str) -> str:
-    """Text in one line of ASCII, as SPICE kernels need it."""
-    return ' '.join(text.split()).encode('ascii', 'replace').decode()
+    """Text in one line of printable ASCII: a control character makes YAML and kernels invalid."""
+    return ''.join(c if ' ' <= c <= '~' else ' ' if c.isspace() else '?' for c in text)
 
 
 def about(calibration: Calibration, made: Content) -> list[str]:

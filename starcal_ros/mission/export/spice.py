@@ -341,7 +341,7 @@ def _quoted(text: str) -> str:
 
 def _wrapped(text: str) -> list[str]:
     # Only the first blanks of a line are its indent; a backslash would open a data block.
-    text = text.replace('\\', '/').encode('ascii', 'replace').decode()
+    text = ascii_line(text.replace('\\', '/'))
     indent = ' ' * (len(text) - len(text.lstrip()))
     below = indent + '  '
     return textwrap.wrap(

@@ -28,14 +28,9 @@ from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages.calibration_messages import calibration_to_message
 from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
 from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
-from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms, TermRemoval
+from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms
 
 WRITTEN_BY_0_1 = Path(__file__).resolve().parents[2] / 'data' / 'written_by_0_1'
-REMOVALS = (
-    TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
-    TermRemoval('k3', -1 / 3, 0.5, 1 / 7, True, 0.1 + 0.2, (0.1, 1 / 3), 1e-17),
-    TermRemoval('fx', 4e5, 1.6e11, 1.7e11, False, 700.5, (500.0, 600.0), 12.0),
-)
 GATE = (
     GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
     GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
@@ -50,7 +45,6 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         {},
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
         {'temperature': TemperatureTerms(20.0, note='left out: everything')},
-        {'removals': REMOVALS},
         {'model_checks': dataclasses.replace(calibration().model_checks, held=())},
     )
     records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
@@ -169,7 +163,7 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'c.json'
     write_calibration(calibration(), path)
     content = json.loads(path.read_text())
-    del content['temperature'], content['maps'], content['correlation'], content['removals']
+    del content['temperature'], content['maps'], content['correlation']
     del (
         content['gate'],
         content['star_trackers'],
@@ -255,9 +249,6 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         ),
         (lambda c: c['maps'].pop('stars'), "key 'maps.stars' is missing"),
         (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: rows of different length'),
-        (lambda c: c.update(removals=[1]), r'removals\[0\]: 1 is not an object'),
-        (lambda c: c['removals'][1].pop('wald'), r"key 'removals\[1\].wald' is missing"),
-        (lambda c: c['removals'][1].update(negligible=1), 'negligible: 1 is not true or'),
         (lambda c: c['gate'][0].pop('unit'), r"key 'gate\[0\].unit' is missing"),
         (lambda c: c['gate'][0].update(passed=1), r'gate\[0\].passed: 1 is not true or false'),
         (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix: 1 x 2 numbers, not'),

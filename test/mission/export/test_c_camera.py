@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 from pathlib import Path
 import shutil
@@ -258,6 +259,34 @@ def test_damaged_truncated_and_foreign_tables_are_refused(tmp_path: Path) -> Non
     place = len(table) - 2 * count * (2 * count + 1) - 4 * count
     wide[place : place + 2] = struct.pack('<H', 128)
     assert status(sealed(wide)) == TOO_LARGE
+
+
+def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path: Path) -> None:
+    """Each number in turn out of all range, with a CRC that fits: no result, or a finite one."""
+    budget = (SigmaPart('total', 0.16, 0.4, ''),)
+    made = dataclasses.replace(calibration('tilted', with_field=True), sigma_budget=budget)
+    program, table = built(made, tmp_path), c_table(made)
+    at = table.index(b'total')
+    numbers = [*range(120, 120 + 8 * 36, 8), *range(120 + 8 * 36, at - 8, 8 * 97)]
+    path, pixels = tmp_path / 'table.bin', np.array([[20.0, 3.0, 4.0], [31.0, 700.0, 500.0]])
+    refused = 0
+    for place in numbers:
+        for value in (1e308, -1e308, 1e160):
+            forged = bytearray(table)
+            forged[place : place + 8] = struct.pack('<d', value)
+            path.write_bytes(sealed(forged))
+            status, text = run(program, 'sights', path, lines=pixels)
+            assert status in (0, 8, 100 + DAMAGED), place
+            for row in map(str.split, text.splitlines()):
+                finite = np.isfinite([float.fromhex(word) for word in row[1:]])
+                assert finite.all(), (place, value, row[0])
+                refused += len(row) == 1
+    assert refused > 0
+    for value in (math.nan, math.inf):
+        forged = bytearray(table)
+        forged[at + 32 : at + 40] = struct.pack('<d', value)
+        path.write_bytes(sealed(forged))
+        assert run(program, 'status', path)[0] == DAMAGED
 
 
 def test_a_table_that_is_not_this_calibration_fails_its_self_test(tmp_path: Path) -> None:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Callable
 import dataclasses
 import json
 import math
 from pathlib import Path
+import subprocess
 
 import cv2
 from export_calibrations import calibration  # type: ignore[import-not-found]
@@ -23,7 +25,7 @@ from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.mission.export.export_formats import export, Exported, FORMATS
 from starcal_ros.mission.export.spice import SpiceNames
-from starcal_ros.records import Calibration
+from starcal_ros.records import Calibration, SigmaPart
 
 GRID = 25  # the grid over which an export states its error
 # OpenCV projects in double precision: some ten roundings of 1e-13 px each.
@@ -198,6 +200,38 @@ def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path: Path) -> No
     # 1, 2, 3 urad about x, y, z: sqrt(5) urad across the axis, more in a corner by the roll.
     across_px = 3642 * math.sqrt(5) * 1e-6
     assert across_px < cost['change of the alignment per degC'] < across_px + 3e-6 * 900
+
+
+# As foreign names may be: an escape sequence, line ends, comments and blocks of other formats.
+HOSTILE = '\x1b[31m\x00\x7f\x85\u2028\r\n...\n*/ #error /* // ??/ \\ \\begindata @TABLE@ "\' %s µ'
+READERS: dict[str, Callable[[str], object]] = {
+    '.yaml': lambda text: list(yaml.parse(text)),
+    '.json': json.loads,
+    '.cameramodel': lambda text: ast.literal_eval(text[text.index('{') :]),
+}
+
+
+@pytest.mark.parametrize('kind', [kind for kind in FORMATS if kind != 'ck'])
+def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> None:
+    made = dataclasses.replace(
+        calibration('plumb_bob'),
+        parent_frame=f'tracker {HOSTILE}',
+        child_frame=f'camera {HOSTILE}',
+        provenance={'software': HOSTILE, HOSTILE: HOSTILE},
+        accepted=False,
+        reasons=(HOSTILE,),
+        sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
+    )
+    names = SpiceNames(-999, camera_frame='CAMERA', star_tracker_frame='TRACKER')
+    for path in export(made, kind, tmp_path, names, topic=HOSTILE).files:
+        text = path.read_text('ascii')
+        assert all(line.isprintable() for line in text.split('\n')), path
+        READERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
+        if kind == 'spice':
+            assert text.count('\\begindata') == 1
+    if kind == 'c':
+        command = ['gcc', '-std=c99', '-Wall', '-Wextra', '-Werror', '-c', 'starcal_camera.c']
+        subprocess.run(command, cwd=tmp_path, check=True)
 
 
 def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:

@@ -166,11 +166,16 @@ def test_each_bad_file_is_one_line(night: Path, tmp_path: Path, capsys) -> None:
         ('--images {night}/0.fits --attitude {aem} --camera {aem}', 'a.aem'),
         ('--images {night}/0.fits --attitude {aem} --star-tracker ST7', 'choose one with'),
         ('--images {night}/0.fits --attitude {aem} --value-range 5 1', 'is empty'),
+        (
+            '--images {night}/0.fits --attitude {aem} --camera {camera} --more-star-trackers ST-2',
+            '--alignment: 0 numbers, 8 are needed: x y z w for each star tracker; only that of a ',
+        ),
     ],
 )
 def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, found: str) -> None:
     aem = write_aem(tmp_path / 'a.aem')
-    assert main(['import', *words(line, night=night, aem=aem), '-o', str(tmp_path / 'bag')]) == 2
+    given = words(line, night=night, aem=aem, camera=TINY / 'camera.yaml')
+    assert main(['import', *given, '-o', str(tmp_path / 'bag')]) == 2
     error = capsys.readouterr().err
     assert found in error and error.count('\n') == 1
 

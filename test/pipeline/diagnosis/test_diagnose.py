@@ -29,7 +29,7 @@ from starcal_ros.studies.simulation import scenario as synthetic
 
 pytestmark = pytest.mark.slow
 
-GRANASAT = Path('/work/shared/realsky/granasat')
+GRANASAT = Path(__file__).parents[4] / 'shared' / 'realsky' / 'granasat'
 START_NS = 1778829600_000000000
 
 

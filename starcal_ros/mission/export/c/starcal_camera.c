@@ -175,7 +175,7 @@ starcal_status starcal_load(const unsigned char *table, size_t size, starcal_cam
 {
   starcal_camera found;
   starcal_status status;
-  uint32_t declared;
+  uint32_t declared, k;
   if (table == NULL || camera == NULL) {
     return STARCAL_BAD_ARGUMENT;
   }
@@ -200,6 +200,11 @@ starcal_status starcal_load(const unsigned char *table, size_t size, starcal_cam
   if (!plausible_header(&found) || place_sections(&found) != declared ||
       !finite_numbers(table + HEADER_SIZE, (found.parts - HEADER_SIZE) / 8)) {
     return STARCAL_DAMAGED;
+  }
+  for (k = 0; k < found.part_count; ++k) {
+    if (!finite_numbers(table + found.parts + PART_SIZE * (size_t)k + STARCAL_NAME_SIZE, 2)) {
+      return STARCAL_DAMAGED;
+    }
   }
   status = count_waves(&found);
   if (status != STARCAL_OK) {
@@ -534,6 +539,12 @@ static int all_finite(const double *values, int count)
   return 1;
 }
 
+/* Status of results (count): no caller takes one that is not finite for a number. */
+static starcal_status checked(starcal_status status, const double *results, int count)
+{
+  return all_finite(results, count) ? status : STARCAL_NOT_FINITE;
+}
+
 static int unit_of(const double direction[3], double unit[3], double *length)
 {
   int k;
@@ -601,10 +612,13 @@ starcal_status starcal_project(const starcal_camera *camera, const double direct
       by_direction[k] = ((1 - slope[3]) * row_u[k] + slope[1] * row_v[k]) / determinant;
       by_direction[3 + k] = (slope[2] * row_u[k] + (1 - slope[0]) * row_v[k]) / determinant;
     }
+    if (!all_finite(by_direction, 6)) {
+      return STARCAL_NOT_FINITE;
+    }
   }
   pixel[0] = at[0];
   pixel[1] = at[1];
-  return on_detector(camera, pixel);
+  return checked(on_detector(camera, pixel), pixel, 2);
 }
 
 /* Keep a point within the fold: one beyond it is put halfway there by radius. */
@@ -730,9 +744,12 @@ starcal_status starcal_line_of_sight(const starcal_camera *camera, const double 
       by_pixel[2 * k] = a * (1 - slope[0]) - b * slope[2];
       by_pixel[2 * k + 1] = b * (1 - slope[3]) - a * slope[1];
     }
+    if (!all_finite(by_pixel, 6)) {
+      return STARCAL_NOT_FINITE;
+    }
   }
   memcpy(direction_camera, d, sizeof d);
-  return on_detector(camera, pixel);
+  return checked(on_detector(camera, pixel), d, 3);
 }
 
 static void jacobian_of_parameters(const starcal_camera *camera, const double xy[2],
@@ -768,7 +785,7 @@ starcal_status starcal_jacobians(const starcal_camera *camera, const double dire
   }
   jacobian_of_parameters(camera, xy, by_parameters);
   pixel_by_rotation(camera, xy, by_rotation);
-  return STARCAL_OK;
+  return checked(checked(STARCAL_OK, by_parameters, 2 * STARCAL_MAX_PARAMETERS), by_rotation, 6);
 }
 
 /* ---- covariance ---- */
@@ -919,8 +936,11 @@ starcal_status starcal_covariance(const starcal_camera *camera, const double pix
   }
   if (covariance2 != NULL) {
     in_tangents(d, found, covariance2);
+    if (!all_finite(covariance2, 4)) {
+      return STARCAL_NOT_FINITE;
+    }
   }
-  return on_detector(camera, pixel);
+  return checked(on_detector(camera, pixel), found, 9);
 }
 
 /* ---- temperature, alignment, budget, self-test ---- */
@@ -967,7 +987,8 @@ starcal_status starcal_at_temperature(const starcal_camera *camera, double degc,
   result->reference_degc = degc;
   result->focal_per_degc[0] = result->focal_per_degc[1] = 0.0;
   memset(result->alignment_rate_rad_per_degc, 0, sizeof result->alignment_rate_rad_per_degc);
-  return STARCAL_OK;
+  return checked(checked(STARCAL_OK, result->parameters, STARCAL_MAX_PARAMETERS),
+                 result->star_tracker_from_camera, 9);
 }
 
 starcal_status starcal_to_star_tracker(const starcal_camera *camera,
@@ -983,7 +1004,7 @@ starcal_status starcal_to_star_tracker(const starcal_camera *camera,
     turned[k] = dot(camera->star_tracker_from_camera + 3 * k, direction_camera);
   }
   memcpy(direction, turned, sizeof turned);
-  return STARCAL_OK;
+  return checked(STARCAL_OK, direction, 3);
 }
 
 starcal_status starcal_budget(const starcal_camera *camera, uint32_t k, starcal_part *part)

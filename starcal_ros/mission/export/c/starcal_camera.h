@@ -36,7 +36,8 @@ typedef enum {
   STARCAL_TRUNCATED = 7,
   STARCAL_DAMAGED = 8,          /* the CRC or a number in the table is wrong */
   STARCAL_TOO_LARGE = 9,        /* the field has more waves than STARCAL_MAX_WAVES */
-  STARCAL_SELF_TEST_FAILED = 10
+  STARCAL_SELF_TEST_FAILED = 10,
+  STARCAL_NOT_FINITE = 11       /* a number in the table, or of the argument, is out of range */
 } starcal_status;
 
 typedef enum {

@@ -11,7 +11,6 @@ import pytest
 from scipy.stats import chi2
 
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import estimated_parameters
@@ -19,6 +18,7 @@ from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry
 from starcal_ros.studies import trials
 from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.studies.term_removal import removal_study
 
 TRACKER_ARCSEC = 20.0
 

@@ -9,6 +9,7 @@ the calibration with all terms, so that the rise of chi^2 is due to the removal 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
@@ -21,11 +22,48 @@ from starcal_ros.estimation.minimise import minimise, Minimum, without_parameter
 from starcal_ros.estimation.problem import image_parameters, Problem, State
 from starcal_ros.estimation.star_equations import arrange, residuals_px
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, moved
-from starcal_ros.records import TermRemoval
 
 _HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero
 _LEAST_GAIN = 1e-9  # a step of 0.00005 sigma
 _SIGNIFICANT = 0.01  # p-value below which a rise of chi^2 shows that a term is needed
+
+
+@dataclass(frozen=True)
+class TermRemoval:
+    """
+    A calibration after one more term was removed; terms removed before stay removed.
+
+    Attributes
+    ----------
+    removed : str
+        The term; empty for the calibration with all of them.
+    significance : float
+        Distance of the term, with all terms estimated, from the value it is held at when removed,
+        in its sigma.
+    wald : float
+        Rise of chi^2 that the covariance before the removal predicts.
+    chi2_rise : float
+        Rise of chi^2 against the calibration with all terms, over its stars, with its weights.
+    negligible : bool
+        Whether this term and all removed before it may be dropped: the p-value of the rise is over
+        1 %.
+    residual_rms_px : float
+        Per axis, over the same stars.
+    residual_std_px : (float, float)
+        Standard deviation along u and along v.
+    map_change_px : float
+        RMS change over the detector against the calibration with all terms, common rotation
+        removed.
+    """
+
+    removed: str
+    significance: float
+    wald: float
+    chi2_rise: float
+    negligible: bool
+    residual_rms_px: float
+    residual_std_px: tuple[float, float]
+    map_change_px: float
 
 
 def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
