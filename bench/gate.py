@@ -23,7 +23,7 @@ from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.scenario import scenario
 from starcal_ros.studies.trials import draw_star_field, observe, pointing_error_arcsec, StarField
 
 SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # number of images, stars per image

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.random import Generator
 
 from starcal_ros.arrays import Floats
-from starcal_ros.studies.simulation.departures import unit
+from starcal_ros.simulation.departures import unit
 
 _HALF_WIDTH_PX = 648.0
 _HALF_HEIGHT = 1024 / 1296  # half widths

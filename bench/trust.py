@@ -34,10 +34,10 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
-from starcal_ros.studies.simulation import rendering
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.departures import aberrated
-from starcal_ros.studies.simulation.scenario import Inertial, Scenario, Scene
+from starcal_ros.simulation import rendering
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.departures import aberrated
+from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 
 # Displacement (n, 2) px of pixels (n, 2), of a size, and drawn from a generator.
 Lens = Callable[[CameraModel, float, Generator, Floats], Floats]

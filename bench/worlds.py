@@ -30,8 +30,8 @@ from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import MapCovariance
-from starcal_ros.studies.simulation.centroids import camera_information, scaled_inverse
-from starcal_ros.studies.simulation.departures import Campaign, MEMORY, simulate, World
+from starcal_ros.simulation.centroids import camera_information, scaled_inverse
+from starcal_ros.simulation.departures import Campaign, MEMORY, simulate, World
 
 _BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
 _BRIGHT60 = dataclasses.replace(_BRIGHT, images=60)

@@ -20,9 +20,9 @@ from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import pixel_grid
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.departures import simulate, World
-from starcal_ros.studies.simulation.scenario import Scenario
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.departures import simulate, World
+from starcal_ros.simulation.scenario import Scenario
 
 # In sound campaigns the principal point is 2 px off the prior, as after any ground calibration.
 _RENDERED = {

@@ -29,7 +29,7 @@ from starcal_ros.text import significant
 # --help answers at once.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.studies.simulation.simulated_bag import Mistakes
+    from starcal_ros.simulation.simulated_bag import Mistakes
 
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
@@ -285,8 +285,8 @@ def _request(args: argparse.Namespace) -> int:
 
 def _simulate(args: argparse.Namespace) -> int:
     """Render a named scenario."""
-    from starcal_ros.studies.simulation import scenario as synthetic
-    from starcal_ros.studies.simulation import simulated_bag
+    from starcal_ros.simulation import scenario as synthetic
+    from starcal_ros.simulation import simulated_bag
 
     camera_seed = args.seed if args.camera_seed is None else args.camera_seed
     scenario = synthetic.scenario(args.scenario, camera_seed)
@@ -310,8 +310,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _mistakes(args: argparse.Namespace) -> Mistakes:
-    from starcal_ros.studies.simulation.scenario import ATTITUDE_OFFSETS_S
-    from starcal_ros.studies.simulation.simulated_bag import Mistakes
+    from starcal_ros.simulation.scenario import ATTITUDE_OFFSETS_S
+    from starcal_ros.simulation.simulated_bag import Mistakes
 
     still_s = max(ATTITUDE_OFFSETS_S)
     if 0 < abs(args.clock_error) <= still_s:
@@ -431,8 +431,8 @@ def _paper(args: argparse.Namespace) -> int:
     import functools
 
     from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ros.simulation.scenario import scenario
     from starcal_ros.studies import monte_carlo, paper, summary
-    from starcal_ros.studies.simulation.scenario import scenario
     from starcal_ros.studies.workers import run_each, run_trials
 
     workers = _workers(args)

@@ -24,7 +24,7 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.studies.trials import (
     bound,
     calibration_options,

@@ -42,10 +42,10 @@ from starcal_ros.report.detector_figures import distortion_contours, distortion_
 from starcal_ros.report.figures import outline, term_worth
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import Curve, Drawing, GRID, INK, Panel, SERIES, sheet
+from starcal_ros.simulation.rendering import fixed_pattern, render
+from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.monte_carlo import Design, Row
-from starcal_ros.studies.simulation.rendering import fixed_pattern, render
-from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.studies.study_figures import removed_terms
 from starcal_ros.studies.summary import StudyResult
 from starcal_ros.studies.trials import PAPER_ESTIMATE, rms

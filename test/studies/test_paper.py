@@ -14,10 +14,10 @@ import pytest
 
 from starcal_ros.cli import main
 from starcal_ros.records import Ensemble
+from starcal_ros.simulation import centroids as simulated_centroids
+from starcal_ros.simulation import scenario
 from starcal_ros.studies import monte_carlo, paper, summary, workers
 from starcal_ros.studies.paper import judge, PaperStudy, spread
-from starcal_ros.studies.simulation import centroids as simulated_centroids
-from starcal_ros.studies.simulation import scenario
 
 pytestmark = pytest.mark.slow
 

@@ -23,8 +23,8 @@ from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
 from starcal_ros.ros.kept.state import Answer, CalibratorState
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=7)
 PAGE_S = 120.0  # the longest wait for a page on a machine that is busy

@@ -12,8 +12,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.departures import Campaign
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.departures import Campaign
 
 
 def residuals(made: Campaign, index: int) -> tuple[Floats, Floats]:

@@ -24,11 +24,11 @@ from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.centroids import observations
+from starcal_ros.simulation.scenario import Detector, Scenario, Scene
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
 from starcal_ros.sky.catalog import cone, load_catalog
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.centroids import observations
-from starcal_ros.studies.simulation.scenario import Detector, Scenario, Scene
 
 Lens = Callable[[Generator, Floats], Floats]
 """Displacement (n, 2) px of stars at points (n, 2) in half widths of the detector."""
