@@ -28,7 +28,7 @@ from starcal_ros.records import CameraGeometry, MapCovariance, StarObservations
 from starcal_ros.simulation import centroids
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Scenario
-from starcal_ros.studies.trials import map_bound_px
+from studies.trials import map_bound_px
 
 SIZE = (1296, 1024)
 IMAGES = 8

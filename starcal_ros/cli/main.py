@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        of_command = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
+        of_command = 'mission' if command == 'trend' else 'report'
         extra = 'pdf' if error.name == 'weasyprint' else of_command
         return arguments.complain(missing_package(error, extra))
 
@@ -380,88 +380,6 @@ def _demo(args: argparse.Namespace) -> int:
     return arguments.EXIT_ACCEPTED if good else arguments.EXIT_REFUSED
 
 
-def _campaign(args: argparse.Namespace) -> int:
-    """Run a Monte Carlo study."""
-    import time
-
-    from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.studies import monte_carlo, study_figures, summary
-    from starcal_ros.studies.workers import run_trials
-
-    if args.study == 'paper':
-        return _paper(args)
-    what, default = monte_carlo.STUDIES[args.study]
-    design = dataclasses.replace(
-        default,
-        trials=default.trials if args.trials is None else args.trials,
-        seed=args.seed,
-        images=tuple(args.images or default.images),
-        stars=tuple(args.stars or default.stars),
-        tracker_arcsec=tuple(args.tracker or default.tracker_arcsec),
-        methods=tuple(args.methods or default.methods),
-        assumed_arcsec=args.tracker_assumed,
-    )
-    monte_carlo.check(design)
-    workers = _workers(args)
-    make_folder(args.output)
-    start = time.monotonic()
-    with terminal.progress_bar(design.trials, 'trials') as advance:
-        rows = run_trials(design, workers, args.scheduler, advance)
-    seconds = time.monotonic() - start
-    found = summary.conclude(design, rows)
-    path = args.output / f'{design.study}.json'
-    write_atomically(path, summary.content(found, _software()))
-    write_atomically(path.with_suffix('.svg'), study_figures.svg(found))
-    terminal.print_text(
-        f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s'
-    )
-    terminal.print_table(*summary.table(found), left=0)
-    terminal.print_text(f'written to {path} and {path.with_suffix(".svg").name}')
-    return arguments.EXIT_ACCEPTED
-
-
-def _workers(args: argparse.Namespace) -> int:
-    from starcal_ros.studies.workers import processors
-
-    return processors() if args.workers is None else int(args.workers)
-
-
-def _paper(args: argparse.Namespace) -> int:
-    """Reproduce the paper."""
-    import functools
-
-    from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.simulation.scenario import scenario
-    from starcal_ros.studies import monte_carlo, paper, summary
-    from starcal_ros.studies.workers import run_each, run_trials
-
-    workers = _workers(args)
-    table1 = dataclasses.replace(
-        paper.TABLE_1, seed=args.seed, trials=args.trials or paper.TABLE_1.trials
-    )
-    monte_carlo.check(table1)
-    night = scenario(paper.NIGHT, args.seed).image_count
-    if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
-        raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
-    images = args.images[0] if args.images else night
-    make_folder(args.output / 'images')
-    with terminal.progress_bar(images, 'frames') as advance:
-        frame = functools.partial(paper.observe_frame_of, args.seed, images)
-        frames = run_each(frame, images, workers, args.scheduler, advance)
-    with terminal.progress_bar(table1.trials, 'trials') as advance:
-        rows = run_trials(table1, workers, args.scheduler, advance)
-    observations = [observed for _, observed in sorted(frames, key=lambda item: item[0])]
-    found = paper.study(observations, summary.conclude(table1, rows), args.seed)
-    for name, svg in paper.svgs(found).items():
-        write_atomically(args.output / 'images' / f'paper_{name}.svg', svg)
-    path = args.output / 'paper.md'
-    write_atomically(path, paper.page(found, _software()))
-    content = {'software': _software(), **paper.numbers(found)}
-    write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
-    terminal.print_text(f'written to {path}, with figures in {args.output / "images"}')
-    return arguments.EXIT_ACCEPTED
-
-
 def _software() -> str:
     from starcal_ros.pipeline.provenance import software_version
 
@@ -482,7 +400,6 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'monitor': _monitor,
     'request': _request,
     'simulate': _simulate,
-    'campaign': _campaign,
     **mission.COMMANDS,
 }
 

@@ -18,7 +18,7 @@ from starcal_ros.estimation.calibration_options import estimated_parameters
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry
 from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.studies import trials
+from studies import trials
 
 TRACKER_ARCSEC = 20.0
 

@@ -29,7 +29,7 @@ BY_COMMAND = {
     'make_nodes': {'nodes'},
     'make_phase': {'pixel_phase'},
     'make_trend': {'trend'},
-    # `starcal campaign paper`: test/studies/test_paper.py draws them from a few images.
+    # `python -m studies paper`: test/studies/test_paper.py draws them from a few images.
     'paper': {f'paper_figure_{k}' for k in (5, 6, 7, 8)},
 }
 
