@@ -25,10 +25,10 @@ from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import solve
 from starcal_ros.records import CameraGeometry, MapCovariance, StarObservations
-from starcal_ros.studies.simulation import centroids
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.scenario import Scenario
-from starcal_ros.studies.trials import map_bound_px
+from starcal_ros.simulation import centroids
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
+from studies.trials import map_bound_px
 
 SIZE = (1296, 1024)
 IMAGES = 8

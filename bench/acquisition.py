@@ -32,10 +32,10 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.simulation import rendering
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
-from starcal_ros.studies.simulation import rendering
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.scenario import Inertial, Scenario, Scene
 
 SEED = 20161
 IMAGES = 45  # rendered for each kind of field

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from bench.table import Table
 from bench.trials import memory_mb
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation import simulated_bag
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation import simulated_bag
 
 MOST_MB = 300.0
 # Scenario, images, most wall time in seconds, and as a multiple of the bare read.

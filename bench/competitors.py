@@ -30,8 +30,8 @@ from starcal_ros.estimation.minimise import minimise
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.star_equations import arrange, Measurements, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 FREE = np.array([k for k, name in enumerate(PARAMETER_NAMES) if name not in ('cx', 'cy')])
 SIGMA_PX = 0.1

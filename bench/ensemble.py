@@ -24,8 +24,8 @@ from starcal_ros.assessment.observability import (
 )
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 TARGET = 1.05
 RANDOM_CHOICES = 200

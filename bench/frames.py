@@ -18,11 +18,11 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import AttitudeSample, Ensemble, Image
+from starcal_ros.simulation import rendering, simulated_bag
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.studies.simulation import rendering, simulated_bag
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.scenario import Scenario
 
 Frame = tuple[Image, list[AttitudeSample]]
 

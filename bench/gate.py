@@ -2,7 +2,7 @@
 """
 The gate: rates of refused good campaigns and accepted spoilt campaigns.
 
-Star fields of the paper's camera with all their errors drawn, as in `starcal campaign`; then the
+Star fields of the paper's camera with all their errors drawn, as in `python -m studies`; then the
 same with one thing wrong.  The limits are the defaults.
 """
 
@@ -23,8 +23,8 @@ from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.scenario import scenario
-from starcal_ros.studies.trials import draw_star_field, observe, pointing_error_arcsec, StarField
+from starcal_ros.simulation.scenario import scenario
+from studies.trials import draw_star_field, observe, pointing_error_arcsec, StarField
 
 SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # number of images, stars per image
 TRACKER_ARCSEC = (5.0, 20.0, 40.0)

@@ -29,8 +29,8 @@ from starcal_ros.pipeline import night_sky
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry
-from starcal_ros.studies.simulation.rendering import images
-from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
+from starcal_ros.simulation.rendering import images
+from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 SIZE, IMAGES, CAMERAS = (800, 640), 12, 200
 FIELDS_DEG = (5.0, 120.0)  # of the diagonal

@@ -21,8 +21,8 @@ from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.pipeline.plan import plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 _FIRST, _RANDOM = 8, 16
 _SIGMAS = ('map', 'line_of_sight')

@@ -24,7 +24,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.workers import processors
+from studies.workers import processors
 
 ResultT = TypeVar('ResultT')
 

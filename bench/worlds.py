@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Worlds that differ from the calibration model, and the honesty of the sigma in each.
+Honesty of the sigma in worlds that differ from the calibration model (`studies.worlds`).
 
 ``python -m bench.worlds NAME... --seeds 10`` calibrates campaigns of these worlds and prints the
 errors divided by the reported 1-sigma, that sigma divided by its Cramer-Rao bound, and whether the
@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-import dataclasses
-from functools import partial
 import math
 
 import numpy as np
@@ -22,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from bench import trials
 from bench.frames import load_set_up
-from bench.lens_departures import corner_bump, kink, radial8, rings, ripple, rows, stitch, tilt
 from bench.table import Table
 from bench.trials import rms, Score
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
@@ -30,65 +27,14 @@ from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import MapCovariance
-from starcal_ros.studies.simulation.centroids import camera_information, scaled_inverse
-from starcal_ros.studies.simulation.departures import Campaign, MEMORY, simulate, World
+from starcal_ros.simulation.centroids import camera_information, scaled_inverse
+from studies.worlds import Campaign, campaign, WORLDS
 
-_BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
-_BRIGHT60 = dataclasses.replace(_BRIGHT, images=60)
-_LEO_M_S, _SLOW_DEG_S, _FAST_DEG_S, _BREATH = 7600.0, 0.055, 0.42, 3e-4
-# A lens departure is in px, its wave in rad per half width, the error of a star in arcsec.
-WORLDS = {
-    'plain': World(),
-    **{f'n{n}': World(images=n) for n in (3, 4, 6, 24, 100, 359, 1000)},
-    **{f'bright{n}': dataclasses.replace(_BRIGHT, images=n) for n in (24, 60, 359)},
-    'small24': World(24, 'small'),
-    'paper359': World(359, 'paper'),
-    'vel_leo_ram': World(pointing='ram', velocity_m_s=_LEO_M_S),
-    'vel_leo_side': World(pointing='side', velocity_m_s=_LEO_M_S),
-    'vel_leo': World(velocity_m_s=_LEO_M_S),
-    'vel_30': World(pointing='hemisphere', velocity_m_s=30000.0),
-    'vel_30_ram': World(pointing='ram', velocity_m_s=30000.0),
-    'vel_30_level': World(pointing='side_level', velocity_m_s=30000.0),
-    'rolling_slow': World(rate_deg_s=_SLOW_DEG_S, row_s=20e-6),
-    'rolling_fast': World(rate_deg_s=_FAST_DEG_S, row_s=20e-6),
-    'stamp_50ms': World(rate_deg_s=0.1, stamp_s=0.05),
-    **{f'breath{n}': World(images=n, breathing=_BREATH) for n in (3, 6, 18)},
-    'breath_walk6': World(images=6, breathing=_BREATH, memory=MEMORY),
-    'n6_walk': World(images=6, wander_arcsec=60.0),
-    'walk24': World(images=24, wander_arcsec=60.0),
-    'st_lfe_strip': World(60, 'strip', tracker_arcsec=5.0, smooth_arcsec=15.0),
-    'catalog03_bright24': dataclasses.replace(_BRIGHT, images=24, star_arcsec=0.3),
-    'catalog1_bright60': dataclasses.replace(_BRIGHT60, pointing='fields4', star_arcsec=0.1),
-    'catalog03_drift60': dataclasses.replace(_BRIGHT60, pointing='small', star_arcsec=0.3),
-    'fields4_cat': World(60, 'fields4', star_arcsec=3.0),
-    'wave11_050': World(lens=partial(ripple, 0.05, 11.0)),
-    'wave14_050': World(lens=partial(ripple, 0.05, 14.0)),
-    'rip7_010': World(lens=partial(ripple, 0.01, 7.0)),
-    'rip7_050': World(lens=partial(ripple, 0.05, 7.0)),
-    'rings': World(lens=partial(rings, 0.05, 20.0)),
-    'rows34': World(lens=partial(rows, 0.05, 34.0)),
-    'stitch': World(lens=partial(stitch, 0.05, 256.0)),
-    'hf24': World(lens=partial(ripple, 0.05, 24.0)),
-    'kink': World(lens=partial(kink, 0.4)),
-    'corner_bump': World(lens=partial(corner_bump, 0.2)),
-    'tilt': World(lens=partial(tilt, 0.7)),
-    'radial8_03': World(lens=partial(radial8, 0.3)),
-    'radial8_10': World(lens=partial(radial8, 1.0)),
-    'radial8_30': World(lens=partial(radial8, 3.0)),
-    'pp': World(principal_point_px=(17.0, -22.0)),
-    'out5': World(outlier_fraction=0.05),
-    'badstars': World(24, 'fields4', bad_stars=10),
-}
 NAMES = tuple(WORLDS)
 QUICK = ('plain', 'n3', 'vel_leo_ram', 'rolling_slow', 'n6_walk')
 _LARGE = ('n1000', 'paper359')  # minutes a seed: asked for by name
 _SOUND = ('plain', 'n', 'bright', 'small', 'paper')  # beginnings of names, before their images
 _FEW, _MANY = 24, 100  # images
-
-
-def campaign(name: str, seed: int, images: int | None = None) -> Campaign:
-    """Campaign of a world of `NAMES`, with as many images as the world has by default."""
-    return simulate(WORLDS[name], seed, images)
 
 
 def score(name: str, seed: int) -> tuple[Score, float]:

@@ -22,8 +22,8 @@ from starcal_ros.arrays import Floats, Picture
 from starcal_ros.pipeline import observe
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.report.pictures.annotation import annotate
+from starcal_ros.simulation import rendering, scenario
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.studies.simulation import rendering, scenario
 
 SCENARIO = scenario.scenario('tiny')
 PLAIN = setup_of(SCENARIO)

@@ -40,10 +40,10 @@ from starcal_ros.report.detector_figures import (
 )
 from starcal_ros.report.pictures.annotation import annotate_reduced
 from starcal_ros.report.svg import sheet
+from starcal_ros.simulation import rendering, simulated_bag
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.studies.simulation import rendering, simulated_bag
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.scenario import Scenario
 
 FOLDER = Path(__file__).parent / 'images'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'

@@ -18,11 +18,11 @@ from starcal_ros.arrays import Floats
 from starcal_ros.records import StarRefusal
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import Curve, MUTED, SERIES, sheet
+from starcal_ros.simulation.rendering import expose, star_electrons
+from starcal_ros.simulation.scenario import Detector
 from starcal_ros.stars.centroiding import measure_stars
 from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.image_model import CentroidOptions, model_image
-from starcal_ros.studies.simulation.rendering import expose, star_electrons
-from starcal_ros.studies.simulation.scenario import Detector
 
 FILE = Path(__file__).parent / 'images' / 'pixel_phase.svg'
 SHAPE = (1024, 1296)

@@ -27,8 +27,8 @@ from starcal_ros.formats.products.product_folder import write_observations, writ
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 MONTHS = 60
 SIZE = (1184, 1664)  # of the picture, px

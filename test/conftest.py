@@ -329,8 +329,8 @@ def other_client(ros_domain: None) -> Iterator[Client]:
 @pytest.fixture(scope='session')
 def tiny_observations() -> Any:
     """Simulated observations of scenario tiny, without pixels."""
-    synthetic = pytest.importorskip('starcal_ros.studies.simulation.scenario')
-    centroids = pytest.importorskip('starcal_ros.studies.simulation.centroids')
+    synthetic = pytest.importorskip('starcal_ros.simulation.scenario')
+    centroids = pytest.importorskip('starcal_ros.simulation.centroids')
     return centroids.true_observations(synthetic.scenario('tiny'))
 
 

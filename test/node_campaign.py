@@ -10,7 +10,7 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import StarObservations
-from starcal_ros.studies.simulation import scenario
+from starcal_ros.simulation import scenario
 
 
 class Campaign:

@@ -16,7 +16,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
+from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 WIDTH, HEIGHT = 1296, 1024
 

@@ -41,9 +41,12 @@ def hostile(tmp_path: Path) -> Path:
     [
         ['--version'],
         ['inspect', str(ROOT / 'bags' / 'tiny')],
-        ['campaign', 'coverage', '--trials', '2', '--workers', '1', '-o', 'out'],
+        [
+            *('trend', str(ROOT / 'bags'), '-o', 'out', '--workers', '1'),
+            *('--params', str(ROOT / 'bags' / 'tiny' / 'params.yaml')),
+        ],
     ],
-    ids=['version', 'inspect', 'campaign'],
+    ids=['version', 'inspect', 'trend'],
 )
 def test_modules_of_the_current_folder_are_not_run(
     hostile: Path, start: list[str], arguments: list[str]

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from starcal_ros.records import Ensemble, Image
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.rendering import render
+from starcal_ros.simulation.scenario import attitude_samples, scenario, scene
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.rendering import render
-from starcal_ros.studies.simulation.scenario import attitude_samples, scenario, scene
 
 SCENARIO = scenario('tiny', seed=7)
 TRUTH = SCENARIO.truth

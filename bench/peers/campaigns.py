@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench import trust, worlds
 from bench.competitors import Case, make_case
 from bench.frames import Frame, load_set_up, observed, render_frame
 from starcal_ros.arrays import Floats
@@ -20,18 +19,19 @@ from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import pixel_grid
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.departures import simulate, World
-from starcal_ros.studies.simulation.scenario import Scenario
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
+from studies import rendered_worlds
+from studies.worlds import simulate, World, WORLDS
 
 # In sound campaigns the principal point is 2 px off the prior, as after any ground calibration.
 _RENDERED = {
-    'images, sound': trust.world('principal point', 2.0),
-    'images, ripple of 0.3 px': trust.world('ripple', 0.3),
+    'images, sound': rendered_worlds.world('principal point', 2.0),
+    'images, ripple of 0.3 px': rendered_worlds.world('ripple', 0.3),
 }
 _SIMULATED = {
     'stars, sound': World(principal_point_px=(1.2, -1.6)),
-    'stars, ripple of 0.05 px': worlds.WORLDS['rip7_050'],
+    'stars, ripple of 0.05 px': WORLDS['rip7_050'],
 }
 
 
@@ -75,10 +75,12 @@ def all_campaigns(seeds: int, images: int) -> Iterator[Campaign]:
     for kind, seed in jobs:
         if kind in _RENDERED:
             world = _RENDERED[kind]
-            scenario = dataclasses.replace(trust.scenario_of(world, seed), image_count=images)
+            scenario = dataclasses.replace(
+                rendered_worlds.scenario_of(world, seed), image_count=images
+            )
             setup = load_set_up(scenario)
-            frames = tuple(trust.frames(world, scenario))
-            truth = trust.true_directions(world, scenario, pixels, 0)
+            frames = tuple(rendered_worlds.frames(world, scenario))
+            truth = rendered_worlds.true_directions(world, scenario, pixels, 0)
             stars = observed(frames, setup)
             yield Campaign(kind, scenario, setup, stars, pixels, truth, frames)
         else:

@@ -12,6 +12,7 @@ import numpy as np
 from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.gate_options import GateOptions, limit_check
 from starcal_ros.assessment.observability import map_sigma_px
+from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import (
     Calibration,
@@ -25,14 +26,6 @@ from starcal_ros.text import p_value_text, significant
 
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
-# Remedy if the stars contradict the assumed value of an unknown, by the start of its label.
-_REMEDIES = {
-    'velocity': 'the velocity or the clock is wrong, or air bends the light: check the velocity'
-    ' topic, the stamps and the site',
-    'readout': 'check shutter and readout_s',
-    'stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
-    'mounting': 'check more_alignments, or widen star_tracker_mounting_sigma_arcsec',
-}
 _PART_TOLERANCE = 0.05  # largest accepted deviation of a normalised residual from 1
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
 
@@ -252,8 +245,8 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         asked, assumed = significant(term.asked, 6), significant(term.assumed, 6)
         note = f'the stars put {term.name} at {asked}, assumed is {assumed}'
         if not check.passed:
-            note += '; ' + _REMEDIES.get(
-                term.name.replace(' ', '_').partition('_')[0],
+            note += '; ' + REMEDIES.get(
+                f'assumed {term.name.replace(" ", "_").partition("_")[0]}',
                 f'estimate {term.name}, or widen its prior (estimate, prior_sigma)',
             )
         yield dataclasses.replace(check, note=note)
@@ -265,7 +258,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         abs(step.size_px),
         'px',
         step.p_value,
-        'columns or rows are lost or shifted there: check the read-out',
+        REMEDIES['detector step'],
         _STEP_P_VALUE,
     )
     yield limit_check(
@@ -274,8 +267,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'change of the camera from image to image in a corner',
         found.image_variation_px,
         'px',
-        'focal length or lens changes between images: estimate with temperature, or calibrate'
-        ' each state separately',
+        f'focal length or lens changes between images: {REMEDIES["change from image to image"]}',
     )
     yield from _predicted(found.predictions, options)
 

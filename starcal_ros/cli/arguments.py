@@ -29,7 +29,6 @@ calibration; 2 bad input, named in one line; 130 interrupted."""
 
 TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
 MOST_POINTS = 2000  # pixels a side of a table of lines of sight: 1.8 GB of memory
-STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
 _BAGS = 'an .mcap file or a bag folder'
 _BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
@@ -415,28 +414,6 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
     mistakes.add_argument('--gamma', type=gamma, default=1.0, metavar='G', help=what)
 
 
-def _campaign(command: argparse.ArgumentParser) -> None:
-    what = f'study: {", ".join(STUDIES[:-1])} or {STUDIES[-1]}'
-    command.add_argument('study', metavar='STUDY', choices=STUDIES, help=what)
-    _output(command, 'DIR', 'folder for STUDY.json and STUDY.svg', required=True)
-    what = 'number of trials (default: depends on the study)'
-    command.add_argument('--trials', type=_number(int, 1, 1e6), metavar='N', help=what)
-    _seed(command, 'seed of all trials')
-    arcsec = _number(float, 0, 3600)
-    for name, kind, metavar, what in (
-        ('images', _number(int, 2, 1000), 'M', 'numbers of images in a calibration'),
-        ('stars', _number(int, 3, 1000), 'N', 'numbers of stars in an image'),
-        ('tracker', arcsec, 'ARCSEC', 'true star tracker 1-sigma values about each axis, arcsec'),
-    ):
-        command.add_argument(f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
-    methods = ('per_image', 'single', 'hierarchical')
-    what = f'methods to compare: {", ".join(methods)}'
-    command.add_argument('--methods', nargs='+', choices=methods, metavar='METHOD', help=what)
-    what = 'star tracker 1-sigma assumed by the calibration, arcsec (default: the true one)'
-    command.add_argument('--tracker-assumed', type=arcsec, metavar='ARCSEC', help=what)
-    _workers(command, 'worker processes; 0 runs in-process (default: one per CPU)', None)
-
-
 def _workers(command: argparse.ArgumentParser, what: str, default: int | None) -> None:
     where = command.add_mutually_exclusive_group()
     count = _number(int, 0, 1024)
@@ -559,7 +536,6 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'play': _play,
     'monitor': _monitor,
     'simulate': _simulate,
-    'campaign': _campaign,
     'export': _export,
     'import': _import,
     'catalog': _catalog,

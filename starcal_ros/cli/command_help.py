@@ -158,19 +158,6 @@ parameter file beside the bag.
   starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
   # a deliberate mistake, to practise the diagnosis
   starcal simulate -o mirrored --scenario tiny --flip""",
-    'campaign': """\
-run a Monte Carlo study of the calibration
-
-Calibrates many simulated campaigns and compares the estimates with the truth.
-
-  # method against star tracker noise, as in Table 1 of the paper
-  starcal campaign table1 -o studies
-  # a shorter run: two noise levels, twenty trials
-  starcal campaign table1 -o studies --trials 20 --tracker 0 20
-  # the whole night of the paper from pixels, with its figures, in some minutes
-  starcal campaign paper -o paper
-  # twelve frames of that night, in a minute
-  starcal campaign paper -o paper --images 12 --trials 20""",
     'export': """\
 write a calibration in the format of another tool
 

@@ -30,7 +30,7 @@ from starcal_ros.text import significant
 # --help answers at once.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.studies.simulation.simulated_bag import Mistakes
+    from starcal_ros.simulation.simulated_bag import Mistakes
 
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        of_command = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
+        of_command = 'mission' if command == 'trend' else 'report'
         extra = 'pdf' if error.name == 'weasyprint' else of_command
         return arguments.complain(missing_package(error, extra))
 
@@ -265,8 +265,8 @@ def _monitor(args: argparse.Namespace) -> int:
 
 def _simulate(args: argparse.Namespace) -> int:
     """Render a named scenario."""
-    from starcal_ros.studies.simulation import scenario as synthetic
-    from starcal_ros.studies.simulation import simulated_bag
+    from starcal_ros.simulation import scenario as synthetic
+    from starcal_ros.simulation import simulated_bag
 
     camera_seed = args.seed if args.camera_seed is None else args.camera_seed
     scenario = synthetic.scenario(args.scenario, camera_seed)
@@ -290,8 +290,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _mistakes(args: argparse.Namespace) -> Mistakes:
-    from starcal_ros.studies.simulation.scenario import ATTITUDE_OFFSETS_S
-    from starcal_ros.studies.simulation.simulated_bag import Mistakes
+    from starcal_ros.simulation.scenario import ATTITUDE_OFFSETS_S
+    from starcal_ros.simulation.simulated_bag import Mistakes
 
     still_s = max(ATTITUDE_OFFSETS_S)
     if 0 < abs(args.clock_error) <= still_s:
@@ -362,90 +362,6 @@ def _demo(args: argparse.Namespace) -> int:
     return arguments.EXIT_ACCEPTED if good else arguments.EXIT_REFUSED
 
 
-def _campaign(args: argparse.Namespace) -> int:
-    """Run a Monte Carlo study."""
-    import time
-
-    from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.studies import monte_carlo, study_figures, summary
-    from starcal_ros.studies.workers import run_trials
-
-    if args.study == 'paper':
-        return _paper(args)
-    what, default = monte_carlo.STUDIES[args.study]
-    design = dataclasses.replace(
-        default,
-        trials=default.trials if args.trials is None else args.trials,
-        seed=args.seed,
-        images=tuple(args.images or default.images),
-        stars=tuple(args.stars or default.stars),
-        tracker_arcsec=tuple(args.tracker or default.tracker_arcsec),
-        methods=tuple(args.methods or default.methods),
-        assumed_arcsec=args.tracker_assumed,
-    )
-    monte_carlo.check(design)
-    workers = _workers(args)
-    make_folder(args.output)
-    path = args.output / f'{design.study}.json'
-    check_outputs((path, path.with_suffix('.svg')))
-    start = time.monotonic()
-    with terminal.progress_bar(design.trials, 'trials') as advance:
-        rows = run_trials(design, workers, args.scheduler, advance)
-    seconds = time.monotonic() - start
-    found = summary.conclude(design, rows)
-    write_atomically(path, summary.content(found, _software()))
-    write_atomically(path.with_suffix('.svg'), study_figures.svg(found))
-    terminal.print_text(
-        f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s'
-    )
-    terminal.print_table(*summary.table(found), left=0)
-    terminal.print_text(f'written to {path} and {path.with_suffix(".svg").name}')
-    return arguments.EXIT_ACCEPTED
-
-
-def _workers(args: argparse.Namespace) -> int:
-    from starcal_ros.studies.workers import processors
-
-    return processors() if args.workers is None else int(args.workers)
-
-
-def _paper(args: argparse.Namespace) -> int:
-    """Reproduce the paper."""
-    import functools
-
-    from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.studies import monte_carlo, paper, summary
-    from starcal_ros.studies.simulation.scenario import scenario
-    from starcal_ros.studies.workers import run_each, run_trials
-
-    workers = _workers(args)
-    table1 = dataclasses.replace(
-        paper.TABLE_1, seed=args.seed, trials=args.trials or paper.TABLE_1.trials
-    )
-    monte_carlo.check(table1)
-    night = scenario(paper.NIGHT, args.seed).image_count
-    if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
-        raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
-    images = args.images[0] if args.images else night
-    path, figures = args.output / 'paper.md', args.output / 'images'
-    make_folder(figures)
-    check_outputs((path, path.with_suffix('.json'), *figures.glob('paper_*.svg')))
-    with terminal.progress_bar(images, 'frames') as advance:
-        frame = functools.partial(paper.observe_frame_of, args.seed, images)
-        frames = run_each(frame, images, workers, args.scheduler, advance)
-    with terminal.progress_bar(table1.trials, 'trials') as advance:
-        rows = run_trials(table1, workers, args.scheduler, advance)
-    observations = [observed for _, observed in sorted(frames, key=lambda item: item[0])]
-    found = paper.study(observations, summary.conclude(table1, rows), args.seed)
-    for name, svg in paper.svgs(found).items():
-        write_atomically(figures / f'paper_{name}.svg', svg)
-    write_atomically(path, paper.page(found, _software()))
-    content = {'software': _software(), **paper.numbers(found)}
-    write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
-    terminal.print_text(f'written to {path}, with figures in {figures}')
-    return arguments.EXIT_ACCEPTED
-
-
 def _software() -> str:
     from starcal_ros.pipeline.provenance import software_version
 
@@ -465,7 +381,6 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'play': _play,
     'monitor': _monitor,
     'simulate': _simulate,
-    'campaign': _campaign,
     **mission.COMMANDS,
 }
 

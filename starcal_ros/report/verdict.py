@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
 from starcal_ros.text import p_value_text, significant
 
@@ -21,37 +22,6 @@ VISIBLE_PX = 0.001
 
 _MOST_OF_DETECTOR = 0.98
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
-_REMEDIES = {
-    'stars': 'take more images',
-    'velocity': 'record the velocity of the spacecraft (velocity_topic, velocity_sigma_m_s)',
-    'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
-    'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
-    'field': 'take more images with stars at other places on the detector',
-    'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'estimate with temperature, or calibrate each state separately',
-    'star places': 'take more images of other star fields',
-    'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
-    'temperature': 'take images over a wider range of temperatures',
-    'star tracker noise': 'take more images',
-    'star tracker slow error': 'take images in more attitudes of the star tracker, or state the '
-    'size of this error (star_tracker_slow_arcsec)',
-    'held parameters': 'estimate the held parameters (estimate)',
-}
-"""Measures against the causes of a sigma."""
-
-_MEASURES = {
-    'max_residual_rms_px': 'look for smeared images and a wrong lens model (Residuals)',
-    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals)',
-    'max_misfit_fraction': 'check the attitudes and stamps of the misfit images (Alignment)',
-    'min_images': 'take more images',
-    'min_stars': 'take more images',
-    'min_coverage': 'take images with stars in the empty cells (Coverage)',
-    'max_rotation_deg': 'check the prior alignment (prior_alignment)',
-    'max_step_px': 'find out if the camera has changed',
-    'max_step_rotation_deg': 'find out if the mounting has changed',
-}
-"""Measures for failed checks, with the section of the report; other checks state theirs."""
-
 _SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
 
 
@@ -123,7 +93,7 @@ def next_step(calibration: Calibration) -> str:
     if calibration.accepted:
         return ' '.join(_against_sigma(calibration))
     failed = [check.option for check in calibration.gate if check.passed is False]
-    measures = dict.fromkeys(_MEASURES[option] for option in failed if option in _MEASURES)
+    measures = dict.fromkeys(REMEDIES[option] for option in failed if option in REMEDIES)
     causes = (
         f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
     )
@@ -141,7 +111,7 @@ def _against_sigma(calibration: Calibration) -> list[str]:
     scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
     for scope, of in scopes if calibration.has_alignment else scopes[:1]:
         largest = max(causes, key=lambda part: getattr(part, of))
-        remedy = _REMEDIES.get(largest.cause)
+        remedy = REMEDIES.get(largest.cause)
         if remedy:
             steps.append(
                 f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
@@ -181,13 +151,13 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
             'The detector has no step',
             f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
             _p(step.p_value),
-            'columns or rows are lost or shifted there: check the read-out',
+            REMEDIES['detector step'],
         ),
         ModelRow(
             'The camera is the same in all images',
             f'varies by {_px(found.image_variation_px)} in a corner',
             '',
-            'estimate with temperature, or calibrate each state separately',
+            REMEDIES['change from image to image'],
         ),
     ]
 

@@ -13,8 +13,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.amplitude_checks import model_checks
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Scenario
 
 CORNER_PX = float(np.hypot(WIDTH, HEIGHT)) / 2.0
 LIMIT_SIGMA = 5.0  # the gate's, of a held term

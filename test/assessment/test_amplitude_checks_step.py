@@ -9,7 +9,7 @@ from random_pointings import displaced, estimated, HEIGHT, of_random_pointings, 
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.amplitude_checks import detector_step
-from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.simulation.centroids import true_observations
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.shared_covariance import with_shared_errors
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, parts_that_matter, SigmaPart
-from starcal_ros.studies.simulation.departures import Campaign, simulate, World
+from studies.worlds import Campaign, simulate, World
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
 FIELDS = World(24, 'fields4', star_arcsec=3.0)

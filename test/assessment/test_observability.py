@@ -25,8 +25,8 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
-from starcal_ros.studies.simulation.centroids import cramer_rao_covariance, true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import cramer_rao_covariance, true_observations
+from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=4)
 PRIOR, TRUTH = SCENARIO.prior, SCENARIO.truth

@@ -13,8 +13,8 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 _OPTIONS = CalibrationOptions()
 

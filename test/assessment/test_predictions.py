@@ -18,8 +18,8 @@ from starcal_ros.assessment.predictions import predicted_residuals, predictions
 from starcal_ros.camera import line_of_sight, project
 from starcal_ros.estimation.star_equations import whitening
 from starcal_ros.records import Ensemble, ResidualBin, StarObservations
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Scenario
 
 MIDDLE_PX = np.array([647.5, 511.5])
 

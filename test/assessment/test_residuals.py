@@ -16,8 +16,8 @@ from starcal_ros.errors import ProductError
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.formats.products.product_folder import read_residuals, write_residuals
-from starcal_ros.studies.simulation import centroids as simulated_centroids
-from starcal_ros.studies.simulation import scenario
+from starcal_ros.simulation import centroids as simulated_centroids
+from starcal_ros.simulation import scenario
 
 SCENARIO = dataclasses.replace(scenario.scenario('small', seed=4), image_count=8)
 

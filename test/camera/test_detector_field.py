@@ -17,7 +17,7 @@ from starcal_ros.camera.detector_field import (
     FAMILIES,
     term_count,
 )
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.scenario import scenario
 
 
 def test_legendre_products_are_orthonormal_over_the_detector() -> None:

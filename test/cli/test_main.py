@@ -96,7 +96,7 @@ def test_help_is_there_at_once() -> None:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert time.monotonic() - start < 10  # only so that a hang is noticed
-    for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'campaign'):
+    for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
         assert command in done.stdout
     for heavy in ('numpy', 'scipy', 'cv2', 'contourpy', 'rclpy', 'rich', 'argcomplete'):
         assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
@@ -126,7 +126,7 @@ def test_help_is_there_at_once() -> None:
         (['compare', str(TINY), str(TINY)], [str(TINY), 'no calibration.json']),
         (['compare', *2 * [str(TINY / 'truth.json')]], ['truth.json', 'not a calibration']),
         (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
-        (['campaign', 'tabel1', '-o', 'x'], ['did you mean table1?']),
+        (['import', '--channel', 'grene'], ['did you mean green?']),
         (['calibrate'], ['BAG']),
         (['calibrate', 'a.mcap'], ['--output']),
         (['calibrate', str(TINY), '-o', 'x'], ['--params']),
@@ -499,10 +499,10 @@ def test_what_needs_ros_names_it(
 @pytest.mark.parametrize(
     ('line', 'expected'),
     [
-        ('starcal ca', ['calibrate', 'campaign', 'catalog']),
+        ('starcal ca', ['calibrate', 'catalog']),
         ('starcal inspect --ima', ['--image-topic']),
         ('starcal simulate --scenario ', ['paper', 'small', 'tiny']),
-        ('starcal campaign te', ['terms']),
+        ('starcal import --channel g', ['green']),
         (f'starcal inspect {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],
 )

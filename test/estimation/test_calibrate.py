@@ -27,12 +27,8 @@ from starcal_ros.estimation.reweighting import CentroidVariance
 from starcal_ros.estimation.shared_errors import SharedError
 from starcal_ros.estimation.star_equations import star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
-from starcal_ros.studies.simulation.centroids import (
-    bound_names,
-    cramer_rao_covariance,
-    true_observations,
-)
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import bound_names, cramer_rao_covariance, true_observations
+from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior

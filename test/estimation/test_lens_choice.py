@@ -13,8 +13,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera.conversion import convert
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Scenario
 
 
 def with_lens(model: str, **coefficients: float) -> Scenario:

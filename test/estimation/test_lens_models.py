@@ -20,8 +20,8 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Scenario, scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Scenario, scenario
 
 #           k1   k2    k3    p1     p2     k4    k5   k6
 RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]

@@ -33,8 +33,8 @@ from starcal_ros.estimation.minimise import (
 from starcal_ros.estimation.problem import image_blocks, Problem
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 Residuals = Callable[[np.ndarray], np.ndarray]
 

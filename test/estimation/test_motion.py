@@ -14,7 +14,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation.departures import Campaign, simulate, World
+from studies.worlds import Campaign, simulate, World
 
 ROLLING = World(rate_deg_s=0.42, row_s=20e-6, tracker_arcsec=5.0)
 READOUT_S = 20e-6 * 1024

@@ -19,8 +19,8 @@ from starcal_ros.assessment.gate_options import GateOptions
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.records import Ensemble, StarObservations, StarTrackerAlignment
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import Scenario, scene
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Scenario, scene
 
 SIGMA_ARCSEC = (5.0, 5.0, 30.0)
 # Far from each other, as optical heads are; the axes of their sigmas with them.

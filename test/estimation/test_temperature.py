@@ -30,8 +30,8 @@ from starcal_ros.records import (
     StarObservations,
     TemperatureTerms,
 )
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior

@@ -19,9 +19,9 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.departures import Campaign, simulate, World
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
+from studies.worlds import Campaign, campaign, simulate, World
 
 SEEDS = range(1, 21)
 
@@ -191,12 +191,12 @@ def test_departures_are_in_the_sigma(name: str) -> None:
 
 
 def test_outliers_and_bad_stars_are_left_out() -> None:
-    made = worlds.campaign('out5', 1, images=8)
+    made = campaign('out5', 1, images=8)
     found = estimated(made)
     # Displacements of 1 to 20 px of one star in twenty; those of under 4.5 sigma stay.
     assert 0.03 < (~found.kept).mean() < 0.06
     assert normalised(found, made.scenario.truth, slice(0, 10)) < chi2.isf(1e-4, 10) / 10
-    bad = worlds.campaign('badstars', 1)
+    bad = campaign('badstars', 1)
     dropped = estimated(bad).dropped_catalog_id
     assert 5 <= len(dropped) <= 10
     pairs = [

@@ -11,9 +11,9 @@ from starcal_ros.camera import project
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
 from starcal_ros.identification.prediction import in_image, predict, Prediction
+from starcal_ros.simulation.scenario import scenario, scene
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.detection import Sources
-from starcal_ros.studies.simulation.scenario import scenario, scene
 
 SCENARIO = scenario('tiny', seed=6)
 TRUTH = SCENARIO.truth

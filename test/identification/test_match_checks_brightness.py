@@ -17,14 +17,14 @@ from starcal_ros.identification.star_finder import (
     StarSearch,
 )
 from starcal_ros.records import StarRefusal
+from starcal_ros.simulation import rendering
+from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.centroiding import Centroids
 from starcal_ros.stars.detection import Background
 from starcal_ros.stars.image_model import ImageModel
 from starcal_ros.stars.pixel_noise import PixelNoise
 from starcal_ros.stars.psf_field import uniform_width
-from starcal_ros.studies.simulation import rendering
-from starcal_ros.studies.simulation import scenario as synthetic
 
 SHAPE = (512, 640)
 MIN_SNR = 5.0

@@ -20,9 +20,9 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars
 from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.simulation.rendering import render
+from starcal_ros.simulation.scenario import scenario, scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
-from starcal_ros.studies.simulation.rendering import render
-from starcal_ros.studies.simulation.scenario import scenario, scene
 
 SCENARIO = scenario('tiny', seed=31)
 PRIOR = SCENARIO.prior

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from starcal_ros.identification.prediction import in_image, predict, Prediction, within_image
+from starcal_ros.simulation.scenario import scenario, Scene, scene
 from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.studies.simulation.scenario import scenario, Scene, scene
 
 SCENARIO = scenario('tiny', seed=6)
 CATALOG = load_catalog(None, 9.0)

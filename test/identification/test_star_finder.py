@@ -27,10 +27,10 @@ from starcal_ros.records import (
     STAR_REFUSALS,
     StarObservations,
 )
+from starcal_ros.simulation.rendering import render
+from starcal_ros.simulation.scenario import Detector, scenario, Scene, scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.stars.image_model import CentroidOptions
-from starcal_ros.studies.simulation.rendering import render
-from starcal_ros.studies.simulation.scenario import Detector, scenario, Scene, scene
 
 SCENARIO = scenario('tiny', seed=6)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior

@@ -25,10 +25,10 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.simulation.rendering import render
+from starcal_ros.simulation.scenario import scenario, Scene, scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.stars.image_model import CentroidOptions
-from starcal_ros.studies.simulation.rendering import render
-from starcal_ros.studies.simulation.scenario import scenario, Scene, scene
 
 SCENARIO = scenario('tiny', seed=8)
 PRIOR = SCENARIO.prior

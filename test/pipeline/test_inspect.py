@@ -23,7 +23,7 @@ from starcal_ros.pipeline import inspect, topics
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image
-from starcal_ros.studies.simulation import simulated_bag
+from starcal_ros.simulation import simulated_bag
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 PARAMS = TINY / 'params.yaml'

@@ -28,8 +28,8 @@ from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.pipeline.from_stars import from_stars
 from starcal_ros.pipeline.night_sky import photographs_of
 from starcal_ros.records import Image
+from starcal_ros.simulation.rendering import images
 from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.studies.simulation.rendering import images
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 TOPIC = '/camera/image_raw'

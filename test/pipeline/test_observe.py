@@ -27,11 +27,11 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
+from starcal_ros.simulation.rendering import render, star_electrons
+from starcal_ros.simulation.scenario import attitude_samples, Inertial, scene
+from starcal_ros.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.sky.astrometry import apparent_directions, through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
-from starcal_ros.studies.simulation.rendering import render, star_electrons
-from starcal_ros.studies.simulation.scenario import attitude_samples, Inertial, scene
-from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 
 S = 1_000_000_000
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'

@@ -16,8 +16,8 @@ from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import camera_from_icrf, Inertial, scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import camera_from_icrf, Inertial, scenario
 
 
 @pytest.fixture(scope='module')

@@ -21,8 +21,8 @@ from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.pipeline import observe, solve, topics
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image
+from starcal_ros.simulation.scenario import attitude_samples, Detector
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.studies.simulation.scenario import attitude_samples, Detector
 
 S = 1_000_000_000
 

@@ -22,7 +22,7 @@ from starcal_ros.formats.messages.message_fields import (
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.records import Image
-from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 ODOMETRY, POSE, TF = (

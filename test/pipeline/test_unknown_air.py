@@ -20,6 +20,7 @@ from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.pipeline.from_stars import options_of, pinhole
 from starcal_ros.pipeline.unknown_air import with_air
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
+from starcal_ros.simulation.scenario import scenario
 from starcal_ros.sky.astrometry import (
     apparent_directions,
     refracted,
@@ -29,7 +30,6 @@ from starcal_ros.sky.astrometry import (
     zenith_of,
 )
 from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.studies.simulation.scenario import scenario
 
 SITE = SiteOptions(observer='ground', latitude_deg=47.0, longitude_deg=11.0, height_m=500.0)
 CAMERA = pinhole((1200, 900), 2000.0).replace(k1=-0.05, cx=611.0, p1=4e-4)

@@ -11,6 +11,8 @@ import pytest
 
 from starcal_ros.formats.bag import reader
 from starcal_ros.records import Image, StarRefusal
+from starcal_ros.simulation.rendering import expose, star_electrons
+from starcal_ros.simulation.scenario import Detector
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import (
     Background,
@@ -22,8 +24,6 @@ from starcal_ros.stars.detection import (
 from starcal_ros.stars.frame_checks import fingerprint, sample_rows, screen, ScreeningOptions
 from starcal_ros.stars.image_model import CentroidOptions, model_image
 from starcal_ros.stars.pixel_noise import NoiseSums
-from starcal_ros.studies.simulation.rendering import expose, star_electrons
-from starcal_ros.studies.simulation.scenario import Detector
 
 SHAPE = (512, 640)
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)

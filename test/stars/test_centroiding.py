@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from starcal_ros.records import StarRefusal
+from starcal_ros.simulation.centroids import centroid_bound
+from starcal_ros.simulation.rendering import expose, star_electrons
+from starcal_ros.simulation.scenario import Detector
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import detect, measure_background, sample_mesh
 from starcal_ros.stars.image_model import (
@@ -20,9 +23,6 @@ from starcal_ros.stars.image_model import (
 )
 from starcal_ros.stars.pixel_noise import PixelNoise
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums
-from starcal_ros.studies.simulation.centroids import centroid_bound
-from starcal_ros.studies.simulation.rendering import expose, star_electrons
-from starcal_ros.studies.simulation.scenario import Detector
 
 SHAPE = (512, 640)
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)

@@ -14,6 +14,7 @@ import pytest
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ImageRefused
 from starcal_ros.records import Image
+from starcal_ros.simulation import rendering, scenario
 from starcal_ros.stars.frame_checks import (
     Fingerprint,
     fingerprint,
@@ -22,7 +23,6 @@ from starcal_ros.stars.frame_checks import (
     ScreeningOptions,
     slope_left,
 )
-from starcal_ros.studies.simulation import rendering, scenario
 
 SCENARIO = scenario.scenario('tiny', seed=3)
 HEIGHT, WIDTH = SCENARIO.truth.camera.height, SCENARIO.truth.camera.width

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.records import StarRefusal
+from starcal_ros.simulation import rendering, scenario
 from starcal_ros.stars.hot_pixels import (
     hot_in_dark,
     HotPixels,
     learn_hot_pixels,
     refuse_on_hot_pixels,
 )
-from starcal_ros.studies.simulation import rendering, scenario
 
 UNKNOWN = HotPixels(np.empty(0, np.int64))
 SCENARIO = scenario.scenario('tiny', seed=3)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import dataclasses
 import functools
 import itertools
@@ -16,28 +15,28 @@ import sys
 import time
 from xml.etree import ElementTree
 
-from distributed import LocalCluster
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from starcal_ros.assessment.agreement import parameter_difference
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
-from starcal_ros.cli import arguments, main
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.records import CameraGeometry
-from starcal_ros.studies import monte_carlo, study_figures, summary, trials, workers
-from starcal_ros.studies.monte_carlo import Design, Row
-from starcal_ros.studies.summary import StudyResult
+from studies import __main__ as studies
+from studies import monte_carlo, study_figures, summary, trials
+from studies.monte_carlo import Design, Row
+from studies.summary import StudyResult
+from studies.workers import run_each
 
 pytestmark = pytest.mark.slow
 
+ROOT = Path(__file__).parents[2]
 METHODS = ('per_image', 'single', 'hierarchical')
 ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
 SMALL = {
@@ -56,7 +55,8 @@ def small(study: str) -> Design:
 @functools.cache
 def here(design: Design) -> StudyResult:
     """Run in this process."""
-    return summary.conclude(design, workers.run_trials(design))
+    trial = functools.partial(monte_carlo.run_trial, design)
+    return summary.conclude(design, itertools.chain(*run_each(trial, range(design.trials))))
 
 
 def only(rows: tuple[Row, ...], **values: object) -> Row:
@@ -65,9 +65,10 @@ def only(rows: tuple[Row, ...], **values: object) -> Row:
 
 
 def tool(*arguments: object) -> subprocess.Popen[str]:
-    """Start the tool as a person would, in a terminal's process group."""
+    """Start a study as a person would, in a terminal's process group."""
     return subprocess.Popen(
-        [sys.executable, '-m', 'starcal_ros.cli.main', 'campaign', *map(str, arguments)],
+        [sys.executable, '-m', 'studies', *map(str, arguments)],
+        cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -82,38 +83,10 @@ def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path: Path) -> No
         done = tool(*ARGUMENTS, '-o', folder, '--workers', count)
         out, err = done.communicate(timeout=100)
         assert done.returncode == 0, err
-        assert err == ''  # neither progress nor the words of Dask
+        assert err == ''  # no progress
         assert 'hierarchical' in out
         written.append((folder / 'coverage.json').read_bytes())
     assert written[0] == written[1] == written[2]
-
-
-@pytest.fixture
-def scheduler() -> Iterator[str]:
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol='tcp://',
-        host='127.0.0.1', dashboard_address=None,
-        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
-    ) as cluster:  # fmt: skip
-        yield str(cluster.scheduler_address)
-
-
-def test_a_cluster_that_is_there_gives_the_same_rows(scheduler: str) -> None:
-    design = small('coverage')
-    rows = workers.run_trials(design, scheduler=scheduler)
-    assert summary.conclude(design, rows) == here(design)
-
-
-def blas_threads(_: int) -> int:
-    blas = [one for one in threadpool_info() if one['user_api'] == 'blas']
-    return max(int(one['num_threads']) for one in blas)
-
-
-def test_a_worker_of_a_cluster_computes_on_one_thread(scheduler: str) -> None:
-    """One without a nanny has those of its processors; this one is in our process."""
-    with threadpool_limits(2, user_api='blas'):
-        assert workers.run_each(blas_threads, 1, scheduler=scheduler) == [(0, 1)]
-        assert blas_threads(0) == 2
 
 
 def test_workers_are_reached_through_no_socket() -> None:
@@ -133,48 +106,20 @@ def test_workers_are_reached_through_no_socket() -> None:
                 seen += 1
                 opened.update(sockets(child, 'all'))
 
-    workers.run_trials(small('coverage'), workers=1, on_trial=look)
+    trial = functools.partial(monte_carlo.run_trial, small('coverage'))
+    run_each(trial, range(4), workers=1, on_each=look)
     assert seen and not opened
 
 
 def test_an_error_and_the_end_of_a_worker_reach_the_caller() -> None:
     with pytest.raises(ValueError, match='invalid literal'):
-        workers.run_each(functools.partial(int, 'x'), 3, workers=1)  # int('x', 0)
-    with pytest.raises(StarcalError, match='a worker process ended with status 0, the last of 3'):
-        workers.run_each(os._exit, 1, workers=1)  # os._exit(0)
+        run_each(int, '1x2', workers=1)
+    with pytest.raises(StarcalError, match='a worker process ended with status 7: out of memory'):
+        run_each(os._exit, [7], workers=1)
 
 
-@pytest.mark.parametrize('count', [1, 2])
-def test_each_result_comes_once_whatever_workers_are_killed(count: int) -> None:
-    """Idle or at work; an exception and a process that ends each time cost themselves only."""
-    us = psutil.Process()
-    earlier = {child.pid for child in us.children()}  # of other tests
-    items, found = [*'1234', 'x', *'5678'], {}
-    for item, result in workers.stream_each(int, items, workers=count):
-        assert item not in found
-        found[item] = result
-        if len(found) < 6:
-            for child in us.children():
-                if child.pid not in earlier:
-                    child.kill()
-    assert isinstance(found.pop('x'), ValueError)
-    assert found == {item: int(item) for item in items if item != 'x'}
-    ended = dict(workers.stream_each(os._exit, [3, 4, 5], workers=count))
-    assert all('ended with status' in str(error) for error in ended.values()) and len(ended) == 3
-
-
-@pytest.mark.parametrize('count', [0, 2])
-def test_items_are_taken_when_they_are_submitted(count: int) -> None:
-    taken: list[int] = []
-
-    def items() -> Iterator[int]:
-        for k in range(100):
-            taken.append(k)
-            yield k
-
-    for done, _ in enumerate(workers.stream_each(abs, items(), workers=count)):
-        assert len(taken) <= done + 2 * count + 1
-    assert len(taken) == 100
+def test_results_are_in_the_order_of_the_items() -> None:
+    assert run_each(int, '987654321', workers=2) == [9, 8, 7, 6, 5, 4, 3, 2, 1]
 
 
 def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
@@ -194,7 +139,7 @@ def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
         os.killpg(started.pid, signal.SIGKILL)
         started.communicate()
         raise
-    assert (started.returncode, out, err) == (130, '', 'starcal: interrupted\n')
+    assert (started.returncode, out, err) == (130, '', 'studies: interrupted\n')
     assert not psutil.wait_procs(children, timeout=10)[1]
     assert not list((tmp_path / 'out').iterdir())
 
@@ -390,33 +335,21 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--tracker-assumed', '4000'], '4000 is not within'),
         (['table1', '--methods', 'all'], "--methods: invalid choice: 'all'"),
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
-        (['table1', '--workers', '1', '--scheduler', 'x'], 'not allowed with'),
-        (['table1', '--scheduler', 'tcp://127.0.0.1:1'], '--scheduler: tcp://127.0.0.1:1: '),
-        (['table1', '--scheduler', 'nonsense'], '--scheduler: nonsense: not tcp://HOST:PORT'),
-        (['table1', '--scheduler', 'ucx://127.0.0.1:1'], 'ucx://127.0.0.1:1: not tcp://HOST'),
-        (['table1', '--scheduler', 'inproc://1/2/3'], 'inproc://1/2/3: not tcp://HOST:PORT'),
     ],
 )
-def test_bad_arguments_are_one_line(
-    arguments: list[str],
-    words: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_bad_argument_is_named(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(workers, '_CONNECT_S', 0.5)
-    monkeypatch.setattr(os, 'environ', dict(os.environ))
     try:
-        status = main.main(['campaign', *arguments, '-o', str(tmp_path / 'out')])
+        status = studies.main([*arguments, '-o', str(tmp_path / 'out')])
     except SystemExit as error:
         status = int(error.code or 0)
     out, err = capsys.readouterr()
-    assert status == 2 and out == ''
-    assert err.startswith('starcal: ') and err.count('\n') == 1 and words in err
+    assert status == 2 and out == '' and words in err.splitlines()[-1]
+    assert not (tmp_path / 'out').exists()
 
 
 def test_check_takes_every_study_as_it_stands() -> None:
-    assert (*monte_carlo.STUDIES, 'paper') == arguments.STUDIES
     for name, (_, design) in monte_carlo.STUDIES.items():
         assert design.study == name
         monte_carlo.check(design)

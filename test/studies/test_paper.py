@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 import re
@@ -12,12 +13,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from starcal_ros.cli import main
 from starcal_ros.records import Ensemble
-from starcal_ros.studies import monte_carlo, paper, summary, workers
-from starcal_ros.studies.paper import judge, PaperStudy, spread
-from starcal_ros.studies.simulation import centroids as simulated_centroids
-from starcal_ros.studies.simulation import scenario
+from starcal_ros.simulation import centroids as simulated_centroids
+from starcal_ros.simulation import scenario
+from studies import __main__ as studies
+from studies import monte_carlo, paper, summary
+from studies.paper import judge, PaperStudy, spread
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +36,8 @@ def ensemble() -> Ensemble:
 @pytest.fixture(scope='module')
 def found(ensemble: Ensemble) -> PaperStudy:
     design = monte_carlo.Design('table1', 2, (15,), (20,), (0.0, 20.0), ('per_image', 'single'))
-    table1 = summary.conclude(design, workers.run_trials(design))
+    rows = itertools.chain(*(monte_carlo.run_trial(design, k) for k in range(design.trials)))
+    table1 = summary.conclude(design, rows)
     return paper.study(ensemble.images, table1, seed=3)
 
 
@@ -95,9 +97,9 @@ def test_one_command_makes_it_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     night = dataclasses.replace(NIGHT, image_count=5)
     monkeypatch.setattr(paper, 'TABLE_1', short)
     monkeypatch.setattr(paper, 'CALIBRATED_WITH', 4)
-    monkeypatch.setattr(scenario, 'scenario', lambda *_: night)  # what counts the frames
-    asked = ['campaign', 'paper', '--trials', '1', '--seed', '3', '--workers', '1']
-    assert main.main([*asked, '-o', str(tmp_path)]) == 0
+    monkeypatch.setattr(studies, 'scenario', lambda *_: night)  # what counts the frames
+    arguments = ['paper', '--trials', '1', '--seed', '3', '--workers', '1']
+    assert studies.main([*arguments, '-o', str(tmp_path)]) == 0
     numbers = json.loads((tmp_path / 'paper.json').read_text())
     assert (numbers['images'], numbers['used'], numbers['others']) == (5, 4, 1)
     text = (tmp_path / 'paper.md').read_text()

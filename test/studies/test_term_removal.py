@@ -16,9 +16,9 @@ from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import estimated_parameters
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry
-from starcal_ros.studies import trials
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.term_removal import removal_study
+from starcal_ros.simulation.centroids import true_observations
+from studies import trials
+from studies.term_removal import removal_study
 
 TRACKER_ARCSEC = 20.0
 

@@ -21,7 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ('CMakeLists.txt', 'package.xml', 'setup.cfg', 'msg', 'srv', 'starcal_ros')
-TESTED = ('bench', 'docs', 'pyproject.toml', 'test', 'tools', 'README.md', 'LICENSE')
+TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README.md', 'LICENSE')
 INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_ANSWERS_WITHIN_S = 30.0
 NODE_STOPS_WITHIN_S = 15.0

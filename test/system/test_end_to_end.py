@@ -27,8 +27,8 @@ from starcal_ros.formats.bag.reader import read_images, Topics
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Calibration, CameraGeometry, Image
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation import simulated_bag
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation import simulated_bag
 
 pytestmark = pytest.mark.slow
 

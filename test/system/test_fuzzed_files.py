@@ -41,8 +41,8 @@ from starcal_ros.pipeline.setup import load_setup, NODES
 from starcal_ros.records import Calibration, Ensemble, Image
 from starcal_ros.ros.kept.archive import Archive
 from starcal_ros.ros.kept.state import Activation
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny')
 BAG = Path(__file__).parents[2] / 'bags' / 'tiny'

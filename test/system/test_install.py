@@ -143,7 +143,7 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
     assert "pip install '.[report]'" in done.stdout.splitlines()[-1]
     for line, extra in (
         (('report', 'out'), 'report'),
-        (('campaign', 'images', '-o', 'study', '--scheduler', 'tcp://127.0.0.1:1'), 'studies'),
+        (('trend', '.', '-o', 'trend'), 'mission'),
     ):
         refused = run(starcal, *line, cwd=tmp_path)
         assert refused.returncode == 2

@@ -18,6 +18,7 @@ import pytest
 
 from bench import LONG, NAMES
 import starcal_ros
+from studies import __main__ as studies
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted(
@@ -48,7 +49,7 @@ SUFFIXES = (
     *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'png'),
     *('sh', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
 )
-FOLDERS = 'bench|config|docs|examples|launch|requirements|starcal_ros|test|tools'
+FOLDERS = 'bench|config|docs|examples|launch|requirements|starcal_ros|studies|test|tools'
 ROLE = re.compile(r'(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)')  # in a docstring: one backtick
 NAME = re.compile(r'(?:\w+/)*[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+')
 
@@ -213,13 +214,15 @@ def test_a_docstring_names_no_function_of_docstrings_alone() -> None:
     assert is_in_code('pixels_every') and not is_in_code('line_of_sight_jacobian')
 
 
-def test_lines_of_pytest_and_bench_in_documents_exist() -> None:
-    """In indented blocks too: files of tests, -m and -k, and names of benches."""
+def test_lines_of_pytest_bench_and_studies_in_documents_exist() -> None:
+    """In indented blocks too: files of tests, -m and -k, names of benches, options of studies."""
     for document in DOCUMENTS:
-        for line in re.findall(r'-m (pytest|bench) ([^\n#`]*)', document.read_text()):
+        for line in re.findall(r'-m (pytest|bench|studies) ([^\n#`]*)', document.read_text()):
             if line[0] == 'bench':
                 name = line[1].split()[:1]
                 assert not name or name[0].startswith('-') or is_bench(f'bench {name[0]}')
+            elif line[0] == 'studies':
+                studies.parser().parse_args(shlex.split(line[1].replace('STUDY', 'table1')))
             else:
                 words_of = [word for word in line[1].split() if word.startswith('test/')]
                 assert all((ROOT / word).exists() for word in words_of), line

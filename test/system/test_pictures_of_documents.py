@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from docs import make_gallery, make_images, make_nodes, make_phase, make_trend
-from starcal_ros.studies.simulation import scenario
+from starcal_ros.simulation import scenario
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
@@ -29,7 +29,7 @@ BY_COMMAND = {
     'make_nodes': {'nodes'},
     'make_phase': {'pixel_phase'},
     'make_trend': {'trend'},
-    # `starcal campaign paper`: test/studies/test_paper.py draws them from a few images.
+    # `python -m studies paper`: test/studies/test_paper.py draws them from a few images.
     'paper': {f'paper_figure_{k}' for k in (5, 6, 7, 8)},
 }
 

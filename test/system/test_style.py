@@ -8,9 +8,11 @@ from pathlib import Path
 import re
 
 ROOT = Path(__file__).parents[2]
-MODULES = {path.stem for path in (ROOT / 'starcal_ros').rglob('*.py')}
+MODULES = {
+    path.stem for folder in ('starcal_ros', 'studies') for path in (ROOT / folder).rglob('*.py')
+}
 FILES = sorted(
-    path for folder in ('starcal_ros', 'bench', 'tools', 'docs', 'examples')
+    path for folder in ('starcal_ros', 'studies', 'bench', 'tools', 'docs', 'examples')
     for path in (ROOT / folder).rglob('*.py')
 )  # fmt: skip
 # No longer than the longest of today: a new one must earn more.

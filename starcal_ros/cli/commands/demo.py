@@ -31,8 +31,8 @@ from starcal_ros.formats.products.calibration_json import prior_of, read_calibra
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_text, write_atomically
 from starcal_ros.records import Calibration, CameraGeometry
-from starcal_ros.studies.simulation import scenario, simulated_bag
-from starcal_ros.studies.simulation.simulated_bag import true_geometry
+from starcal_ros.simulation import scenario, simulated_bag
+from starcal_ros.simulation.simulated_bag import true_geometry
 from starcal_ros.text import significant, to_sigma
 from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 

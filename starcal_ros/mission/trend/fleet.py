@@ -13,7 +13,7 @@ from starcal_ros.mission.trend.answers import compute, failed, Seen
 from starcal_ros.mission.trend.rows import Row, START
 from starcal_ros.mission.trend.tasks import Task
 from starcal_ros.mission.trend.trend_table import Table
-from starcal_ros.studies.workers import stream_each
+from starcal_ros.mission.trend.workers import stream_each
 
 _PAUSES_S = (1.0, 10.0)  # before a file that could not be reached is tried again
 _MOST_AGAIN = 10_000  # such files; where a whole store is gone, others are tried by the next run
@@ -64,7 +64,7 @@ def update(
     What is computed is on disk within a batch, so a run that was stopped starts where it stopped.
     A worker writes the calibration of a bag (and its report) beside the table before its row is
     sent, so that each row on disk has its calibration.
-    ``workers`` and ``scheduler`` as for `run_each`; the workers of a cluster see the same files.
+    ``workers``, ``scheduler`` as for `stream_each`; the workers of a cluster see the same files.
     """
     done = Done()
     waiting = _not_known(table, tasks, done, with_reports)

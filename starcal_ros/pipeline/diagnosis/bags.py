@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
@@ -25,24 +26,6 @@ from starcal_ros.records import Image, StarObservations
 _MEASURED = 10  # images, for the reason of their refusal
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
 """Refusals after which the sky of an image cannot be held against the set-up."""
-_REMEDIES = {
-    'bad_encoding': 'record images of one channel, 8 or 16 bit, raw or as PNG',
-    'bad_layout': 'correct width, height, step and data where the message is made',
-    'bad_stamp': 'stamp the images in UTC since 1970, and check stamp_offset_s',
-    'bad_attitude': 'send unit quaternions, and none while the star tracker has no lock',
-    'no_attitude': 'record attitudes from before the first image to after the last',
-    'attitude_gap': (
-        'record attitudes more often, or raise max_attitude_gap_s if the vehicle turns evenly'
-    ),
-    'frozen_attitude': 'record the attitudes that the star tracker measures',
-    'out_of_order': 'use one topic for each camera',
-    'overexposed': 'expose for a shorter time',
-    'blank': 'check that the camera is read out',
-    'frozen': 'check that the camera is read out',
-    'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
-    'glare': 'keep Sun, Moon and Earth out of the field',
-    'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
-}
 
 
 def diagnose_bags(
@@ -147,7 +130,7 @@ def of_refusals(refused: Sequence[Refused], images: int) -> Diagnosis | None:
         return None
     most = refused[0]
     count = 'All' if most.count == images else f'{most.count} of'
-    remedy = _REMEDIES.get(most.reason)
+    remedy = REMEDIES.get(most.reason)
     return Diagnosis(
         most.reason,
         most.count,

@@ -20,7 +20,7 @@ from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.records import Image
-from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 
 pytestmark = pytest.mark.slow
 

@@ -22,10 +22,10 @@ from starcal_ros.pipeline.diagnosis.attitude_reading import WireAttitudes
 from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.simulation import rendering
+from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
-from starcal_ros.studies.simulation import rendering
-from starcal_ros.studies.simulation import scenario as synthetic
 
 pytestmark = pytest.mark.slow
 

@@ -131,7 +131,7 @@ def test_killed_at_any_instant(tmp_path: Path) -> None:
     """What was told of as kept is there after each of ten kills, and nothing is damaged."""
     processes = multiprocessing.get_context('forkserver')
     processes.set_forkserver_preload(
-        ['starcal_ros.ros.kept.archive', 'starcal_ros.studies.simulation.scenario']
+        ['starcal_ros.ros.kept.archive', 'starcal_ros.simulation.scenario']
     )
     random = np.random.default_rng(5)
     for _ in range(10):

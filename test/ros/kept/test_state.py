@@ -22,8 +22,8 @@ from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObs
 from starcal_ros.ros.kept.archive import Archive
 from starcal_ros.ros.kept.seal import CHECKSUMS
 from starcal_ros.ros.kept.state import Answer, CalibratorState
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.simulation.scenario import scenario
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=7)
 

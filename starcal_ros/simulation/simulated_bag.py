@@ -26,10 +26,10 @@ from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.formats.products.product_files import check_outputs, write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
+from starcal_ros.simulation import centroids
+from starcal_ros.simulation.rendering import images
+from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
 from starcal_ros.sky.astrometry import earth_velocity_c
-from starcal_ros.studies.simulation import centroids
-from starcal_ros.studies.simulation.rendering import images
-from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenes
 
 _AXIS = (0.8, 0.6, 0.0)  # axis of the alignment error, perpendicular to the line of sight
 

@@ -11,7 +11,7 @@ from tiny_campaign import image  # type: ignore[import-not-found]
 
 from starcal_ros.cli import main
 from starcal_ros.records import Image
-from starcal_ros.studies.simulation.simulated_bag import Mistakes, NO_MISTAKES
+from starcal_ros.simulation.simulated_bag import Mistakes, NO_MISTAKES
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ from scipy.special import erf
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.records import Image
-from starcal_ros.studies.simulation.scenario import (
+from starcal_ros.simulation.scenario import (
     Detector,
     PATTERN_STREAM,
     PIXEL_STREAM,

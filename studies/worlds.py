@@ -1,10 +1,14 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Simulated star observations of a world that departs from the calibration model, with their truth.
+Simulated star observations of worlds that differ from the calibration model, with their truth.
 
 The directions of the stars are those that an observer computes without the departures of the
 world; the measured pixels and the reported attitudes contain them.  The noise of each centroid has
-the stated covariance.
+the stated covariance.  `studies.rendered_worlds` has worlds with images.
+
+A lens departure draws phases and places from a random generator and returns the displacement in
+pixels (n, 2) of points ``x`` (n, 2) in half widths from the centre.  A generator in the same state
+gives the same lens.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass, field
+from functools import partial
 import math
 from typing import Any
 
@@ -24,11 +29,11 @@ from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.centroids import observations
+from starcal_ros.simulation.scenario import Detector, Scenario, Scene
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
 from starcal_ros.sky.catalog import cone, load_catalog
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.centroids import observations
-from starcal_ros.studies.simulation.scenario import Detector, Scenario, Scene
 
 Lens = Callable[[Generator, Floats], Floats]
 """Displacement (n, 2) px of stars at points (n, 2) in half widths of the detector."""
@@ -48,6 +53,9 @@ _PIXEL_STEPS = 4  # displacements change by 0.01 px per px at most
 _SMOOTH_RAD = math.radians(60.0)  # correlation length of errors that depend on the attitude
 # Random streams (seed, purpose)
 _POINTING, _NOISE, _TRACKER, _CHANGE, _STARS, _LENS, _VELOCITY, _RATE, _OUTLIERS = range(80, 89)
+_HALF_WIDTH_PX = 648.0
+_HALF_HEIGHT = 1024 / 1296  # half widths
+_CORNER = math.hypot(1.0, _HALF_HEIGHT)
 
 
 def no_departure(rng: Generator, x: Floats) -> Floats:
@@ -58,6 +66,70 @@ def no_departure(rng: Generator, x: Floats) -> Floats:
 def unit(vector: Floats) -> Floats:
     """Return vectors (..., d) scaled to unit length."""
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+
+
+def ripple(size_px: float, rad_per_half_width: float, rng: Generator, x: Floats) -> Floats:
+    """Lens with a product of waves along both axes, each component with its own phases."""
+    phase = rng.uniform(0.0, 2.0 * np.pi, (2, 2))
+    return np.asarray(size_px * np.sin(rad_per_half_width * x[:, None, :] + phase).prod(axis=2))
+
+
+def rings(size_px: float, rad_per_half_width: float, rng: Generator, x: Floats) -> Floats:
+    """Detector with rings about a point, as of the growth of its crystal."""
+    centre, phase = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.0, 2.0 * np.pi)
+    radius = np.linalg.norm(x - centre, axis=1, keepdims=True)
+    wave = np.sin(rad_per_half_width * radius + phase)
+    return np.asarray(size_px * wave * (x - centre) / np.maximum(radius, 1e-9))
+
+
+def rows(size_px: float, period_px: float, rng: Generator, x: Floats) -> Floats:
+    """Detector whose rows are displaced along the columns by a wave."""
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+    wave = 2.0 * np.pi * _HALF_WIDTH_PX / period_px
+    return np.asarray(np.array([0.0, size_px]) * np.sin(wave * x[:, [1]] + phase))
+
+
+def stitch(size_px: float, period_px: float, rng: Generator, x: Floats) -> Floats:
+    """Detector of blocks: steps of either sign along each axis at the borders."""
+    offset_px = size_px * np.cumsum(rng.choice([-1.0, 1.0], (16, 2)), axis=0)
+    offset_px -= offset_px[:5].mean(axis=0)
+    block = np.floor((x + np.array([1.0, _HALF_HEIGHT])) * _HALF_WIDTH_PX / period_px)
+    block = np.clip(block, 0, 15).astype(int)
+    return np.stack([offset_px[block[:, 0], 0], offset_px[block[:, 1], 1]], axis=-1)
+
+
+def kink(size_px: float, rng: Generator, x: Floats) -> Floats:
+    """Lens with a radial displacement that begins at a radius and is size_px at the corners."""
+    radius, start = np.linalg.norm(x, axis=1, keepdims=True), 0.9
+    beyond = np.maximum(radius - start, 0.0) / (_CORNER - start)
+    return np.asarray(size_px * beyond * x / np.maximum(radius, start))
+
+
+def corner_bump(size_px: float, rng: Generator, x: Floats) -> Floats:
+    """Lens with a Gaussian displacement about a point near one of the corners."""
+    centre, width = rng.choice([-1.0, 1.0], 2) * [0.85, 0.65], 0.1
+    distance2 = ((x - centre) ** 2).sum(axis=1, keepdims=True)
+    return np.asarray(size_px * np.exp(-distance2 / (2 * width**2)) * unit(rng.normal(size=2)))
+
+
+def tilt(size_px: float, rng: Generator, x: Floats) -> Floats:
+    """Detector that is tilted: keystone of size_px at the corner that it leans to."""
+    return keystone(size_px, unit(rng.normal(size=2)), x / _CORNER)
+
+
+def radial8(size_px: float, rng: Generator, x: Floats) -> Floats:
+    """Lens with a further radial term, ``r^8``, of size_px at the corners."""
+    return eighth_order(size_px, x / _CORNER)
+
+
+def keystone(size_px: float, way: Floats, from_centre: Floats) -> Floats:
+    """Displacement by a tilt of points (n, 2), in units of the distance to a corner."""
+    return np.asarray(size_px * (from_centre @ way)[:, None] * from_centre)
+
+
+def eighth_order(size_px: float, from_centre: Floats) -> Floats:
+    """Displacement along the radius of points (n, 2), in the same units."""
+    return np.asarray(size_px * from_centre * (from_centre**2).sum(axis=1, keepdims=True) ** 4)
 
 
 @dataclass(frozen=True)
@@ -320,3 +392,56 @@ def _outliers_px(world: World, count: int, rng: Generator) -> Floats:
     """Displacements (n, 2) of 1 to 20 px of a fraction of the stars."""
     length_px = rng.uniform(1.0, 20.0, count) * (rng.random(count) < world.outlier_fraction)
     return np.asarray(length_px[:, None] * unit(rng.normal(size=(count, 2))))
+
+
+_BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
+_BRIGHT60 = dataclasses.replace(_BRIGHT, images=60)
+_LEO_M_S, _SLOW_DEG_S, _FAST_DEG_S, _BREATH = 7600.0, 0.055, 0.42, 3e-4
+# A lens departure is in px, its wave in rad per half width, the error of a star in arcsec.
+WORLDS = {
+    'plain': World(),
+    **{f'n{n}': World(images=n) for n in (3, 4, 6, 24, 100, 359, 1000)},
+    **{f'bright{n}': dataclasses.replace(_BRIGHT, images=n) for n in (24, 60, 359)},
+    'small24': World(24, 'small'),
+    'paper359': World(359, 'paper'),
+    'vel_leo_ram': World(pointing='ram', velocity_m_s=_LEO_M_S),
+    'vel_leo_side': World(pointing='side', velocity_m_s=_LEO_M_S),
+    'vel_leo': World(velocity_m_s=_LEO_M_S),
+    'vel_30': World(pointing='hemisphere', velocity_m_s=30000.0),
+    'vel_30_ram': World(pointing='ram', velocity_m_s=30000.0),
+    'vel_30_level': World(pointing='side_level', velocity_m_s=30000.0),
+    'rolling_slow': World(rate_deg_s=_SLOW_DEG_S, row_s=20e-6),
+    'rolling_fast': World(rate_deg_s=_FAST_DEG_S, row_s=20e-6),
+    'stamp_50ms': World(rate_deg_s=0.1, stamp_s=0.05),
+    **{f'breath{n}': World(images=n, breathing=_BREATH) for n in (3, 6, 18)},
+    'breath_walk6': World(images=6, breathing=_BREATH, memory=MEMORY),
+    'n6_walk': World(images=6, wander_arcsec=60.0),
+    'walk24': World(images=24, wander_arcsec=60.0),
+    'st_lfe_strip': World(60, 'strip', tracker_arcsec=5.0, smooth_arcsec=15.0),
+    'catalog03_bright24': dataclasses.replace(_BRIGHT, images=24, star_arcsec=0.3),
+    'catalog1_bright60': dataclasses.replace(_BRIGHT60, pointing='fields4', star_arcsec=0.1),
+    'catalog03_drift60': dataclasses.replace(_BRIGHT60, pointing='small', star_arcsec=0.3),
+    'fields4_cat': World(60, 'fields4', star_arcsec=3.0),
+    'wave11_050': World(lens=partial(ripple, 0.05, 11.0)),
+    'wave14_050': World(lens=partial(ripple, 0.05, 14.0)),
+    'rip7_010': World(lens=partial(ripple, 0.01, 7.0)),
+    'rip7_050': World(lens=partial(ripple, 0.05, 7.0)),
+    'rings': World(lens=partial(rings, 0.05, 20.0)),
+    'rows34': World(lens=partial(rows, 0.05, 34.0)),
+    'stitch': World(lens=partial(stitch, 0.05, 256.0)),
+    'hf24': World(lens=partial(ripple, 0.05, 24.0)),
+    'kink': World(lens=partial(kink, 0.4)),
+    'corner_bump': World(lens=partial(corner_bump, 0.2)),
+    'tilt': World(lens=partial(tilt, 0.7)),
+    'radial8_03': World(lens=partial(radial8, 0.3)),
+    'radial8_10': World(lens=partial(radial8, 1.0)),
+    'radial8_30': World(lens=partial(radial8, 3.0)),
+    'pp': World(principal_point_px=(17.0, -22.0)),
+    'out5': World(outlier_fraction=0.05),
+    'badstars': World(24, 'fields4', bad_stars=10),
+}
+
+
+def campaign(name: str, seed: int, images: int | None = None) -> Campaign:
+    """Campaign of a world of `WORLDS`, with as many images as the world has by default."""
+    return simulate(WORLDS[name], seed, images)

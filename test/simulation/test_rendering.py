@@ -11,14 +11,14 @@ import pytest
 from sample_sky import QUIET  # type: ignore[import-not-found]
 
 from starcal_ros.camera import project
-from starcal_ros.studies.simulation.rendering import (
+from starcal_ros.simulation.rendering import (
     cosmic_ray_electrons,
     expose,
     fixed_pattern,
     render,
     star_electrons,
 )
-from starcal_ros.studies.simulation.scenario import scenario, scene
+from starcal_ros.simulation.scenario import scenario, scene
 
 
 @pytest.mark.parametrize('sigma_px', [0.6, 0.95, 1.5])

@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.studies.monte_carlo import Design, Row
-from starcal_ros.studies.trials import ESTIMATED, rms
+from studies.monte_carlo import Design, Row
+from studies.trials import ESTIMATED, rms
 
 CONFIDENCE = 0.99
 

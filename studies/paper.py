@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
+from pathlib import Path
 
 import jinja2
 import numpy as np
@@ -41,14 +42,14 @@ from starcal_ros.report.detector_figures import distortion_contours, distortion_
 from starcal_ros.report.figures import outline
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import Curve, Drawing, GRID, INK, Panel, SERIES, sheet
+from starcal_ros.simulation.rendering import fixed_pattern, render
+from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.studies.monte_carlo import Design, Row
-from starcal_ros.studies.simulation.rendering import fixed_pattern, render
-from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenario, scene
-from starcal_ros.studies.study_figures import removed_terms, term_worth
-from starcal_ros.studies.summary import StudyResult
-from starcal_ros.studies.term_removal import removal_study, TermRemoval
-from starcal_ros.studies.trials import PAPER_ESTIMATE, rms
+from studies.monte_carlo import Design, Row
+from studies.study_figures import removed_terms, term_worth
+from studies.summary import StudyResult
+from studies.term_removal import removal_study, TermRemoval
+from studies.trials import PAPER_ESTIMATE, rms
 
 NIGHT = 'paper'
 CALIBRATED_WITH = 15
@@ -279,7 +280,7 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
 def page(found: PaperStudy, software: str) -> str:
     """Page in Markdown that compares the results with those of the paper."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader('starcal_ros.report'),
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -12,15 +12,15 @@ from sample_sky import QUIET  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import project, project_jacobians
-from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.studies.simulation.centroids import (
+from starcal_ros.simulation.centroids import (
     bound_names,
     centroid_bound,
     cramer_rao_covariance,
     true_observations,
 )
-from starcal_ros.studies.simulation.rendering import expose, star_electrons
-from starcal_ros.studies.simulation.scenario import camera_from_icrf, scenario
+from starcal_ros.simulation.rendering import expose, star_electrons
+from starcal_ros.simulation.scenario import camera_from_icrf, scenario
+from starcal_ros.sky.catalog import load_catalog
 
 
 def test_observations_are_exact_without_noise() -> None:

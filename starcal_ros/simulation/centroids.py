@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.records import Ensemble, refused_image, StarObservations
-from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
-from starcal_ros.sky.attitude import rate_between
-from starcal_ros.studies.simulation.rendering import pixel_stamps
-from starcal_ros.studies.simulation.scenario import (
+from starcal_ros.simulation.rendering import pixel_stamps
+from starcal_ros.simulation.scenario import (
     attitude_samples,
     CENTROID_STREAM,
     Detector,
@@ -29,6 +27,8 @@ from starcal_ros.studies.simulation.scenario import (
     Scene,
     scenes,
 )
+from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
+from starcal_ros.sky.attitude import rate_between
 
 BOUND_SNR = 5.0
 

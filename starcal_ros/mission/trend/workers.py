@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parallel trials and tasks, in processes of this machine or on a running Dask cluster."""
+"""Parallel tasks, in processes of this machine or on a running Dask cluster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import contextlib
 import functools
 import itertools
 import logging
-import os
 import re
 import threading
 from typing import Any, TypeVar
@@ -18,7 +17,6 @@ from typing import Any, TypeVar
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.child_process import ChildProcess, ProcessEnded
 from starcal_ros.errors import OptionError, StarcalError
-from starcal_ros.studies.monte_carlo import Design, Row, run_trial
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')
@@ -29,55 +27,6 @@ _CONNECT_S = 10.0
 _TRIES = 3  # of an item whose process ends: the first with others, then at the end, alone
 _AHEAD = 8  # items submitted ahead for each thread of a cluster: cancelling 100,000 is slow
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
-
-
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
-def run_trials(
-    design: Design,
-    workers: int = 0,
-    scheduler: str = '',
-    on_trial: Callable[[], None] = lambda: None,
-) -> list[Row]:
-    """Rows of all trials of a design, in any order; see `run_each`."""
-    trial = functools.partial(run_trial, design)
-    found = run_each(trial, design.trials, workers, scheduler, on_trial)
-    return [row for _, rows in found for row in rows]
-
-
-def run_each(
-    function: Callable[[int], Result],
-    count: int,
-    workers: int = 0,
-    scheduler: str = '',
-    on_each: Callable[[], None] = lambda: None,
-) -> list[tuple[int, Result]]:
-    """
-    Pairs (number, result) of a function called with 0 to count - 1, in any order.
-
-    Raises OptionError when no scheduler answers at the address. Raises StarcalError when the
-    processes of a call end early, each time that it is tried.
-
-    Parameters
-    ----------
-    workers : int
-        Processes to start on this machine; 0 runs in-process.
-    scheduler : str
-        Address of a Dask scheduler, whose workers have this package; then no process is started.
-    on_each : callable
-        Called after each result.
-    """
-    results = []
-    with contextlib.closing(stream_each(function, range(count), workers, scheduler)) as found:
-        for number, result in found:
-            if isinstance(result, Exception):
-                raise result
-            results.append((number, result))
-            on_each()
-    return results
 
 
 def stream_each(
@@ -91,8 +40,14 @@ def stream_each(
 
     An item is taken when it is submitted, and let go with its result.  The result of an item whose
     function raises, or whose process ends early each time that it is tried, is the exception.
-    ``workers`` and ``scheduler`` as for `run_each`.  Raises OptionError when no scheduler answers
-    at the address.
+    Raises OptionError when no scheduler answers at the address.
+
+    Parameters
+    ----------
+    workers : int
+        Processes to start on this machine; 0 runs in-process.
+    scheduler : str
+        Address of a Dask scheduler, whose workers have this package; then no process is started.
     """
     items = iter(items)
     first = list(itertools.islice(items, 1))

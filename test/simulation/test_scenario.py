@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.studies.simulation.scenario import (
+from starcal_ros.simulation.scenario import (
     attitude_samples,
     camera_from_icrf,
     Inertial,

@@ -25,8 +25,8 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
-from starcal_ros.studies.simulation.centroids import scaled_inverse
-from starcal_ros.studies.simulation.scenario import Scenario, scenario
+from starcal_ros.simulation.centroids import scaled_inverse
+from starcal_ros.simulation.scenario import Scenario, scenario
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # half side of the square over which misidentified stars scatter

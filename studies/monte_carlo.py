@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 import dataclasses
 from dataclasses import dataclass
 import itertools
+import math
 import zlib
 
 import numpy as np
@@ -23,9 +24,9 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
-from starcal_ros.studies.simulation.centroids import true_observations
-from starcal_ros.studies.term_removal import removal_study
-from starcal_ros.studies.trials import (
+from starcal_ros.simulation.centroids import true_observations
+from studies.term_removal import removal_study
+from studies.trials import (
     bound,
     calibration_options,
     draw_scenario,
@@ -100,8 +101,26 @@ STUDIES: Mapping[str, tuple[str, Design]] = {
 """Name -> title and default design."""
 
 
+_LIMITS = {
+    'trials': (1, 10**6),
+    'seed': (0, math.inf),
+    'images': (2, 1000),
+    'stars': (3, 1000),
+    'tracker_arcsec': (0, 3600),
+    'assumed_arcsec': (0, 3600),
+}
+_OPTIONS = {'tracker_arcsec': 'tracker', 'assumed_arcsec': 'tracker-assumed'}  # or by field
+
+
 def check(design: Design) -> None:
-    """Raise OptionError for duplicate values in a list, and for a list that the study ignores."""
+    """Raise OptionError for values out of range, duplicates, and a list that the study ignores."""
+    for name, (low, high) in _LIMITS.items():
+        values = getattr(design, name)
+        for value in values if isinstance(values, tuple) else (values,):
+            if value is not None and not low <= value <= high:  # nor is NaN
+                raise OptionError(
+                    f'--{_OPTIONS.get(name, name)}: {value:g} is not within {low:g} to {high:g}'
+                )
     if design.study == 'terms' and design.stars:
         raise OptionError(
             '--stars: not applicable to the study terms, which uses the stars of the catalog'
@@ -109,8 +128,9 @@ def check(design: Design) -> None:
     for name in ('images', 'stars', 'tracker_arcsec', 'methods'):
         values = getattr(design, name)
         if len(set(values)) < len(values):
-            option = name.removesuffix('_arcsec')
-            raise OptionError(f'--{option}: duplicate values: {" ".join(map(str, values))}')
+            raise OptionError(
+                f'--{_OPTIONS.get(name, name)}: duplicate values: {" ".join(map(str, values))}'
+            )
 
 
 def run_trial(design: Design, trial: int) -> tuple[Row, ...]:

@@ -13,10 +13,10 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.report.figures import outline
 from starcal_ros.report.plots import plot
 from starcal_ros.report.svg import Curve, Drawing, INK, Panel, Scale, SERIES, sheet, WIDTH, words
-from starcal_ros.studies.monte_carlo import ENOUGH, Row, UNUSED_IMAGES
-from starcal_ros.studies.summary import column, StudyResult
-from starcal_ros.studies.term_removal import TermRemoval
-from starcal_ros.studies.trials import ESTIMATED
+from studies.monte_carlo import ENOUGH, Row, UNUSED_IMAGES
+from studies.summary import column, StudyResult
+from studies.term_removal import TermRemoval
+from studies.trials import ESTIMATED
 
 # Colour, mark, and width that keeps coinciding lines visible.
 _LOOKS: Mapping[str, tuple[str, str, float]] = {

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench import worlds
+from bench.worlds import score
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.departures import Campaign
+from starcal_ros.simulation import scenario as synthetic
+from studies import worlds
+from studies.worlds import Campaign
 
 
 def residuals(made: Campaign, index: int) -> tuple[Floats, Floats]:
@@ -100,6 +101,6 @@ def test_a_late_stamp_turns_the_reported_attitude_by_the_rate() -> None:
 
 @pytest.mark.slow
 def test_a_sound_world_is_honest_and_near_its_bound() -> None:
-    scores = [worlds.score('plain', seed) for seed in (1, 2, 3)]
+    scores = [score('plain', seed) for seed in (1, 2, 3)]
     assert 0.5 < np.sqrt(np.mean([s.shape**2 for s, _ in scores])) < 1.6
     assert all(0.9 < over_bound < 1.6 for _, over_bound in scores)

@@ -1,0 +1,148 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+``python -m studies STUDY -o DIR``: Monte Carlo studies of calibrations with known truth.
+
+``paper`` instead simulates the night of the paper and compares the results with its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import dataclasses
+import functools
+import json
+from pathlib import Path
+import sys
+import time
+
+from starcal_ros.cli import terminal
+from starcal_ros.errors import OptionError, StarcalError
+from starcal_ros.estimation.problem import METHODS
+from starcal_ros.formats.products.product_files import make_folder, write_atomically
+from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.simulation.scenario import scenario
+from studies import monte_carlo, paper, study_figures, summary
+from studies.monte_carlo import Design, Row
+from studies.workers import processors, run_each
+
+NAMES = (*monte_carlo.STUDIES, 'paper')
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a study; returns the exit status: 2 for bad input, 130 when interrupted."""
+    args = parser().parse_args(argv)
+    try:
+        if args.study == 'paper':
+            _paper(args)
+        else:
+            _monte_carlo(args)
+    except StarcalError as error:
+        print(f'studies: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print('studies: interrupted', file=sys.stderr)
+        return 130
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Parser of the arguments."""
+    made = argparse.ArgumentParser(
+        prog='python -m studies', description='Monte Carlo studies, and the night of the paper.'
+    )
+    what = '; '.join(f'{name}: {title}' for name, (title, _) in monte_carlo.STUDIES.items())
+    what += '; paper: its night from pixels, with its figures and Table 1'
+    made.add_argument('study', metavar='STUDY', choices=NAMES, help=what)
+    what = 'folder for STUDY.json and STUDY.svg, or for paper.md with its figures'
+    made.add_argument('-o', '--output', type=Path, metavar='DIR', required=True, help=what)
+    what = 'number of trials (default: depends on the study)'
+    made.add_argument('--trials', type=int, metavar='N', help=what)
+    what = 'seed of all trials (default: 1)'
+    made.add_argument('--seed', type=int, default=1, metavar='S', help=what)
+    for name, kind, metavar, what in (
+        ('images', int, 'M', 'numbers of images in a calibration; paper: frames of the night'),
+        ('stars', int, 'N', 'numbers of stars in an image'),
+        ('tracker', float, 'ARCSEC', 'true star tracker sigmas about each axis, arcsec'),
+    ):
+        made.add_argument(f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
+    what = f'methods to compare: {", ".join(METHODS)}'
+    made.add_argument('--methods', nargs='+', choices=METHODS, metavar='METHOD', help=what)
+    what = 'star tracker sigma that the calibration assumes, arcsec (default: the true one)'
+    made.add_argument('--tracker-assumed', type=float, metavar='ARCSEC', help=what)
+    what = 'worker processes; 0 runs in-process (default: one per CPU)'
+    made.add_argument('--workers', type=int, default=processors(), metavar='N', help=what)
+    return made
+
+
+def _monte_carlo(args: argparse.Namespace) -> None:
+    """Run a Monte Carlo study."""
+    title, default = monte_carlo.STUDIES[args.study]
+    design = dataclasses.replace(
+        default,
+        trials=default.trials if args.trials is None else args.trials,
+        seed=args.seed,
+        images=tuple(args.images or default.images),
+        stars=tuple(args.stars or default.stars),
+        tracker_arcsec=tuple(args.tracker or default.tracker_arcsec),
+        methods=tuple(args.methods or default.methods),
+        assumed_arcsec=args.tracker_assumed,
+    )
+    start_s = time.monotonic()
+    result = summary.conclude(design, _rows(design, args))
+    path = args.output / f'{design.study}.json'
+    write_atomically(path, summary.content(result, _software()))
+    write_atomically(path.with_suffix('.svg'), study_figures.svg(result))
+    print(
+        f'{design.study}: {title}; {design.trials} trials, seed {design.seed},'
+        f' {time.monotonic() - start_s:.1f} s'
+    )
+    terminal.print_table(*summary.table(result), left=0)
+    print(f'written to {path} and {path.with_suffix(".svg").name}')
+
+
+def _rows(design: Design, args: argparse.Namespace) -> list[Row]:
+    """Rows of all trials of a design."""
+    _check(design, args)
+    make_folder(args.output)
+    trial = functools.partial(monte_carlo.run_trial, design)
+    with terminal.progress_bar(design.trials, 'trials') as advance:
+        rows = run_each(trial, range(design.trials), args.workers, advance)
+    return [row for of_trial in rows for row in of_trial]
+
+
+def _check(design: Design, args: argparse.Namespace) -> None:
+    monte_carlo.check(design)
+    if not 0 <= args.workers <= 1024:
+        raise OptionError(f'--workers: {args.workers} is not within 0 to 1024')
+
+
+def _paper(args: argparse.Namespace) -> None:
+    """Reproduce the paper."""
+    trials = paper.TABLE_1.trials if args.trials is None else args.trials
+    table1 = dataclasses.replace(paper.TABLE_1, seed=args.seed, trials=trials)
+    _check(table1, args)
+    night = scenario(paper.NIGHT, args.seed).image_count
+    if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
+        raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
+    images = args.images[0] if args.images else night
+    make_folder(args.output / 'images')
+    frame = functools.partial(paper.observe_frame_of, args.seed, images)
+    with terminal.progress_bar(images, 'frames') as advance:
+        observations = run_each(frame, range(images), args.workers, advance)
+    result = paper.study(observations, summary.conclude(table1, _rows(table1, args)), args.seed)
+    for name, svg in paper.svgs(result).items():
+        write_atomically(args.output / 'images' / f'paper_{name}.svg', svg)
+    path = args.output / 'paper.md'
+    write_atomically(path, paper.page(result, _software()))
+    content = {'software': _software(), **paper.numbers(result)}
+    write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
+    print(f'written to {path}, with figures in {args.output / "images"}')
+
+
+def _software() -> str:
+    return f'starcal {software_version()}'
+
+
+if __name__ == '__main__':
+    sys.exit(main())

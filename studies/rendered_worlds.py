@@ -1,0 +1,279 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Rendered images of worlds with a fault of the lens, the detector or the star tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import dataclasses
+from dataclasses import dataclass
+from functools import partial
+import math
+
+import numpy as np
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
+from starcal_ros.records import AttitudeSample, CameraGeometry, Image
+from starcal_ros.simulation import rendering
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
+from starcal_ros.sky.astrometry import earth_velocity_c
+from studies.worlds import aberrated, eighth_order, keystone
+
+# Displacement (n, 2) px of pixels (n, 2), of a size, and drawn from a generator.
+Lens = Callable[[CameraModel, float, Generator, Floats], Floats]
+Pair = tuple[CameraGeometry, CameraGeometry]
+
+IMAGES = 14
+COPIES = 30
+_WANDER_IMAGES = 10.0  # correlation length of the star tracker that wanders
+_ABBBA = (0, 1, 1, 1, 0)
+
+
+def _as_modelled(camera: CameraModel, size: float, rng: Generator, pixels: Floats) -> Floats:
+    return np.zeros_like(pixels)
+
+
+@dataclass(frozen=True)
+class World:
+    """
+    A fault of the world and its size, and words of which a refusal must hold one.
+
+    The other fields are the parts of a campaign that a fault changes: ``geometries`` the truth and
+    the prior; ``lens`` the pixels of stars; ``focal_change`` the focal length in an image, in
+    units of the size; ``read_out`` the pixels of an image, by ``mean_shift_px`` along a row.
+    """
+
+    name: str
+    size: float = 0.0
+    unit: str = ''
+    causes: tuple[str, ...] = ()
+    images: int = IMAGES
+    geometries: Callable[[Pair, float, Generator], Pair] | None = None
+    lens: Lens = _as_modelled
+    focal_change: Callable[[Scenario, int], float] | None = None
+    read_out: Callable[[Pixels, int], Pixels] | None = None
+    mean_shift_px: float = 0.0
+    has_one_image: bool = False
+    has_aberration_reversed: bool = False
+    has_wandering_tracker: bool = False
+
+
+def scenario_of(world: World, seed: int) -> Scenario:
+    """A campaign of random pointings; the faults of the camera itself are in its truth."""
+    base = synthetic.scenario('small', seed)
+    rng, count = np.random.default_rng([seed, 77]), world.images
+    ra_deg, z = rng.uniform(0.0, 360.0, count), rng.uniform(-0.95, 0.95, count)
+    fields = np.stack([ra_deg, np.degrees(np.arcsin(z)), rng.uniform(0.0, 360.0, count)], axis=-1)
+    if world.has_one_image:
+        fields[:] = fields[0]
+    truth, prior = base.truth, base.prior
+    if world.geometries:
+        truth, prior = world.geometries((truth, prior), world.size, rng)
+    return dataclasses.replace(
+        base,
+        truth=truth,
+        prior=prior,
+        pointing=Inertial(tuple((a, b, c) for a, b, c in fields.tolist())),
+        start_ns=base.start_ns + seed * 8_640_000_000_000,
+        cadence_s=60.0,
+        image_count=count,
+    )
+
+
+def frames(world: World, scenario: Scenario) -> Iterator[tuple[Image, list[AttitudeSample]]]:
+    """Frames of a campaign in a world, with the star tracker's samples about each."""
+    pattern = rendering.fixed_pattern(scenario)
+    rng = np.random.default_rng([scenario.seed, 78])
+    wander_rad: Floats = np.zeros(3)
+    step = math.exp(-1.0 / _WANDER_IMAGES)
+    first: Image | None = None
+    for index in range(scenario.image_count):
+        shown = synthetic.scene(scenario, index)
+        moved = dataclasses.replace(shown, pixel_px=_seen_at(world, scenario, shown, index))
+        if world.has_one_image and first is not None:
+            noise = rng.integers(-1, 2, first.pixels.shape)
+            pixels = np.clip(first.pixels.astype(np.int64) + noise, 0, scenario.detector.full_dn)
+            image = Image(shown.time_ns, pixels.astype(np.uint16))
+        else:
+            image = rendering.render(scenario, moved, index, pattern)
+        first = first or image
+        samples = list(synthetic.attitude_samples(scenario, index))
+        if world.has_wandering_tracker:
+            sigma_rad = world.size * ARCSECOND_RAD
+            keep, add = (step, math.sqrt(1.0 - step**2)) if index else (0.0, 1.0)
+            wander_rad = keep * wander_rad + add * sigma_rad * rng.normal(size=3)
+            samples = [_rotated(sample, wander_rad) for sample in samples]
+        if world.read_out:
+            pixels = world.read_out(image.pixels, int(world.size))
+            image = dataclasses.replace(image, pixels=pixels)
+        yield image, samples
+
+
+def _rotated(sample: AttitudeSample, error_rad: Floats) -> AttitudeSample:
+    reported = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
+    rotated = reported * Rotation.from_rotvec(error_rad)
+    return dataclasses.replace(sample, icrf_from_star_tracker_xyzw=rotated.as_quat())
+
+
+def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floats:
+    """Pixels (n, 2) of the stars of a scene on the detector of a world."""
+    camera, seen = _camera_at(world, scenario, index), shown.direction_icrf
+    if world.has_aberration_reversed:
+        seen = aberrated(seen, -2.0 * earth_velocity_c(shown.time_ns) * SPEED_OF_LIGHT_M_S)
+    if world.has_aberration_reversed or world.focal_change:
+        return np.asarray(project(camera, seen @ shown.camera_from_icrf.T))
+    return np.asarray(shown.pixel_px + _displacement(world, scenario, shown.pixel_px))
+
+
+def _camera_at(world: World, scenario: Scenario, index: int) -> CameraModel:
+    """True camera of an image; the displacement by the lens of the world comes on top."""
+    camera = scenario.truth.camera
+    if not world.focal_change:
+        return camera
+    fx, _, fy = camera.intrinsics[:3]
+    change_px = world.focal_change(scenario, index) * world.size
+    return camera.replace(fx=fx + change_px, fy=fy + change_px * fy / fx)
+
+
+def _displacement(world: World, scenario: Scenario, pixels: Floats) -> Floats:
+    """Displacement that the world adds to the true camera at pixels (n, 2), px."""
+    rng = np.random.default_rng([scenario.seed, 80])
+    return world.lens(scenario.truth.camera, world.size, rng, pixels)
+
+
+def true_directions(world: World, scenario: Scenario, pixels: Floats, index: int) -> Floats:
+    """True lines of sight (n, 3) in the camera frame of measured pixels (n, 2) of an image."""
+    pixels = pixels - [world.mean_shift_px, 0.0]
+    at = pixels.copy()
+    for _ in range(60):  # the displacement is a contraction: 0.1 px of 10 px at most
+        at = pixels - _displacement(world, scenario, at)
+    return line_of_sight(_camera_at(world, scenario, index), at)
+
+
+def _from_middle(camera: CameraModel, pixels: Floats) -> tuple[Floats, float]:
+    """Pixels (n, 2) from the middle of the detector, and the distance of its corners."""
+    middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
+    return pixels - middle, float(np.hypot(*middle))
+
+
+def _tilted(camera: CameraModel, size_px: float, rng: Generator, pixels: Floats) -> Floats:
+    angle_rad, (xy, corner_px) = rng.uniform(0.0, 2.0 * np.pi), _from_middle(camera, pixels)
+    way = np.array([math.cos(angle_rad), math.sin(angle_rad)])
+    return keystone(size_px, way, xy / corner_px)
+
+
+def _radial8(camera: CameraModel, size_px: float, rng: Generator, pixels: Floats) -> Floats:
+    xy, corner_px = _from_middle(camera, pixels)
+    return eighth_order(size_px, xy / corner_px)
+
+
+def _ripple(camera: CameraModel, size_px: float, rng: Generator, pixels: Floats) -> Floats:
+    """Eight waves of 0.35 to 1.2 detector widths; size_px is the rms along each axis."""
+    count = 8
+    rng.uniform()  # the documented figures are of the waves after this number
+    wave_px = rng.uniform(0.35, 1.2, count) * camera.width
+    direction = rng.uniform(0.0, 2.0 * np.pi, count)
+    vectors = 2.0 * np.pi / wave_px * np.stack([np.cos(direction), np.sin(direction)])
+    phase = rng.uniform(0.0, 2.0 * np.pi, (2, count))
+    gain = size_px * math.sqrt(2.0 / count) * rng.choice([-1.0, 1.0], (2, count))
+    at = pixels @ vectors
+    return np.stack([(gain[k] * np.sin(at + phase[k])).sum(axis=1) for k in (0, 1)], -1)
+
+
+def _fisheye(camera: CameraModel, size: float, rng: Generator, pixels: Floats) -> Floats:
+    focal_px = camera.parameters[0]
+    xy = _from_middle(camera, pixels)[0] / focal_px
+    r = np.linalg.norm(xy, axis=1, keepdims=True)
+    return np.asarray(focal_px * xy * (np.arctan(r) / np.maximum(r, 1e-12) - 1.0))
+
+
+def _wide(pair: Pair, size: float, rng: Generator) -> Pair:
+    """Cameras with a third of the focal length and hardly any distortion."""
+
+    def wide(geometry: CameraGeometry) -> CameraGeometry:
+        fx, _, fy = geometry.camera.intrinsics[:3] / 3.0
+        camera = geometry.camera.replace(fx=fx, fy=fy, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
+        return dataclasses.replace(geometry, camera=camera)
+
+    return wide(pair[0]), wide(pair[1])
+
+
+def _off_axis(pair: Pair, size_px: float, rng: Generator) -> Pair:
+    """True principal point off the prior."""
+    angle, (truth, prior) = rng.uniform(0.0, 2.0 * np.pi), pair
+    cx, cy = truth.camera.intrinsics[3:] + size_px * np.array([np.cos(angle), np.sin(angle)])
+    camera = truth.camera.replace(cx=float(cx), cy=float(cy))
+    return dataclasses.replace(truth, camera=camera), prior
+
+
+def _by_lens(lenses: tuple[int, ...], scenario: Scenario, index: int) -> float:
+    """Change for lens 0 or 1 of an image, in turns; the size is the shift at a corner."""
+    camera = scenario.truth.camera
+    corner = float(camera.parameters[0]) / math.hypot(camera.width / 2, camera.height / 2)
+    return lenses[index % len(lenses)] * corner
+
+
+def _breathing(scenario: Scenario, index: int) -> float:
+    return float(np.random.default_rng([scenario.seed, 79, index]).uniform(-1.0, 1.0))
+
+
+def _without_columns(pixels: Pixels, count: int) -> Pixels:
+    middle, left = pixels.shape[1] // 2, pixels.copy()
+    left[:, middle:-count] = pixels[:, middle + count :]
+    return left
+
+
+def _with_odd_rows_shifted(pixels: Pixels, size: int) -> Pixels:
+    shifted = pixels.copy()
+    shifted[1::2, 1:] = pixels[1::2, :-1]
+    return shifted
+
+
+_FIELD = ('residual over predicted sigma',)
+_LARGE = (*_FIELD, '1-sigma of the distortion map')
+_CHANGE = ('image to image',)
+_WANDER = ('1-sigma of a line of sight',)
+_LENSES = partial(_by_lens, (0, 1))
+_LENSES_ABBBA = partial(_by_lens, _ABBBA)
+WORLDS = (
+    World('sound'),
+    *(
+        World('principal point', s, 'px', ('cx', 'cy'), geometries=_off_axis)
+        for s in (2.0, 20.0, 60.0)
+    ),
+    *(World('tilted detector', s, 'px', _FIELD, lens=_tilted) for s in (0.3, 1.0, 3.0)),
+    *(World('8th-order radial', s, 'px', _FIELD, lens=_radial8) for s in (0.3, 1.0, 3.0)),
+    *(World('ripple', s, 'px', _LARGE, lens=_ripple) for s in (0.03, 0.1, 0.3, 1.0)),
+    World('fisheye', causes=('lens', *_LARGE), geometries=_wide, lens=_fisheye),
+    *(World('columns lost', s, 'px', ('step',), read_out=_without_columns) for s in (1.0, 3.0)),
+    # A star lies on both kinds of rows: half of the shift.
+    World(
+        *('odd rows shifted', 1.0, 'px', ('rows', 'step')),
+        read_out=_with_odd_rows_shifted,
+        mean_shift_px=0.5,
+    ),
+    World('two lenses', 1.0, 'px', _CHANGE, focal_change=_LENSES),
+    *(
+        World('two lenses as ABBBA', s, 'px', _CHANGE, len(_ABBBA), focal_change=_LENSES_ABBBA)
+        for s in (0.3, 1.0)
+    ),
+    World('one image', COPIES, 'times', _FIELD, COPIES, has_one_image=True),
+    *(
+        World('focal breathing', s, 'px', _CHANGE, focal_change=_breathing)
+        for s in (0.5, 2.0, 4.0)
+    ),
+    World(
+        *('aberration reversed', 0.5, 'year', ('velocity', 'aberration')),
+        has_aberration_reversed=True,
+    ),
+    World('tracker wanders', 60.0, 'arcsec', _WANDER, 2 * IMAGES, has_wandering_tracker=True),
+)
+
+
+def world(name: str, size: float = 0.0) -> World:
+    """World of a name and size."""
+    return next(one for one in WORLDS if (one.name, one.size) == (name, size))
