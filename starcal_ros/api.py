@@ -30,8 +30,8 @@ from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import night_sky, solve
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import inputs_of
-from starcal_ros.pipeline.setup import load_setup, read_setup
-from starcal_ros.pipeline.topics import Topics
+from starcal_ros.pipeline.setup import load_setup, read_setup, read_values
+from starcal_ros.pipeline.topics import Topics, without_attitudes
 from starcal_ros.record_codec import check_shape, plain_record, read_record, read_value
 from starcal_ros.record_fields import fields_of
 from starcal_ros.records import Calibration, CameraGeometry, refused_image, StarObservations
@@ -200,6 +200,8 @@ def calibrate_bag(
     """
     Calibration from MCAP bags, as by ``starcal calibrate``; nothing is written.
 
+    Bags without attitudes give the camera alone, as images do.
+
     Parameters
     ----------
     bags : path or sequence of paths
@@ -215,7 +217,7 @@ def calibrate_bag(
         One line that names the cause: a bag, an option, a file or too few observations.
     """
     paths = [Path(bag) for bag in ([bags] if isinstance(bags, (str, Path)) else bags)]
-    setup = read_setup(Path(params))
+    values = Path(params)
     asked = Topics(
         image=image_topic,
         attitude=attitude_topic,
@@ -223,8 +225,12 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
-    inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
-    return calibrate_bags(paths, setup, asked, inputs).calibration
+    inputs = inputs_of((*reader.mcap_files(paths), values))
+    if not without_attitudes(paths, asked):
+        return calibrate_bags(paths, read_setup(values), asked, inputs).calibration
+    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+        sky = night_sky.from_bags(paths, asked, read_values(values), Path(folder))
+        return calibrate_bags(sky.bags, sky.setup, asked, inputs, sky.through_air).calibration
 
 
 def calibrate_images(images: Path | str | Sequence[Path | str], **options: object) -> Calibration:

@@ -9,13 +9,14 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from mission_files import TINY  # type: ignore[import-not-found]
+from mission_files import images, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
 
 import starcal_ros
 from starcal_ros.cli.main import main
+from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.mission.trend import answers, tasks
 from starcal_ros.mission.trend.rows import Row
 from starcal_ros.mission.trend.tasks import Cameras
@@ -103,6 +104,21 @@ def test_all_entrances_give_one_calibration(
     for name, number in entrance(*given).items():
         # JSON and Parquet keep all digits; the process has solved it with one BLAS thread.
         np.testing.assert_allclose(number, numbers_of(expected)[name], rtol=1e-9, err_msg=name)
+
+
+def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
+    bag, params = tmp_path / 'images.mcap', tmp_path / 'params.yaml'
+    with BagWriter(bag) as writer:
+        for image in images():
+            writer.write_image('/camera/image_raw', image, 'camera')
+    params.write_text('/**:\n  ros__parameters:\n    observer: space\n')
+    by_tool = ['calibrate', str(bag), '--params', str(params), '-o', str(tmp_path / 'out')]
+    assert main([*by_tool, '--no-report']) in (0, 3)
+    written = starcal_ros.read_calibration(tmp_path / 'out')
+    calibration = starcal_ros.calibrate_bag(bag, params)
+    assert not calibration.has_alignment and calibration.provenance == written.provenance
+    for name, number in numbers_of(calibration).items():
+        np.testing.assert_allclose(number, numbers_of(written)[name], rtol=1e-9, err_msg=name)
 
 
 def test_an_inspection_reads_as_a_calibration(
