@@ -323,7 +323,8 @@ def _failure(
         found = of_a_failure(job.bags, job.asked, job.setup, groups)
     if found is None:
         return NotCalibrated(words, named, refused)
-    words += f'. {found.in_a_sentence("starcal diagnose" if job.through_air is None else "")}'
+    command = 'starcal diagnose' if job.through_air is None else ''
+    words = f'{found.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
     return NotCalibrated(words, named, refused, found.cause, found.evidence, found.mend)
 
 
