@@ -249,6 +249,7 @@ def placed(
             yield frame
             continue
         image = frame.image
+        bag_topics.warn_of_clock(image.time_ns)
         height, width = image.pixels.shape
         try:
             check_order(image, latest_ns)

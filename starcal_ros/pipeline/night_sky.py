@@ -44,7 +44,7 @@ from starcal_ros.pipeline.from_stars import (
 )
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.pipeline.topics import choose_image_topic, stated_tracker, Topics
+from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
@@ -186,6 +186,8 @@ def from_bags(
     found = camera_of_bags(bags, choose_image_topic(bags, asked), values)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
+    if is_located and min(found.icrf_from_camera) < CLOCKS_SET_NS:
+        values = {'velocity_sigma_m_s': EARTH_M_S, **values}
     return _set_up(found, bags, values, folder, is_located, asked)
 
 

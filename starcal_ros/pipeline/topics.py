@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import re
 
+from starcal_ros.constants import utc_text
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import Frame, read_frames
@@ -25,6 +26,7 @@ from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 _OF_A_STAR_TRACKER = ('prior_alignment', 'star_tracker_sigma_arcsec', 'more_star_trackers')
+CLOCKS_SET_NS = 631_152_000_000_000_000  # 1990-01-01
 _LIKE_ATTITUDES = re.compile('Odometry|Pose|TFMessage|Transform|Quaternion|Attitude|Orientation')
 _CAMERA_ALONE = 'starcal calibrate --camera-alone estimates the camera without an alignment'
 
@@ -138,6 +140,16 @@ def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str
         raise BagError(f'{error}{remedy and "; "}{remedy}') from error
 
 
+def warn_of_clock(time_ns: int) -> None:
+    """Log a warning, once, where a stamp is of a clock that was never set."""
+    if time_ns < CLOCKS_SET_NS:
+        reader.log_damage(
+            f'images are stamped before {utc_text(CLOCKS_SET_NS)[:10]}: the clock was not set, and'
+            ' motions of stars and velocity of the Earth are those of a wrong date, which the'
+            ' sigmas do not include: stamp images and attitudes in UTC'
+        )
+
+
 def read(
     paths: Sequence[Path],
     topics: Topics,
@@ -160,7 +172,9 @@ def read(
     for frame in _frames(paths, topics, setup):
         if isinstance(frame, StarObservations):
             yield frame
-        elif wanted is None or wanted(frame.image.time_ns):
+            continue
+        warn_of_clock(frame.image.time_ns)
+        if wanted is None or wanted(frame.image.time_ns):
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
             if on_image is not None:

@@ -39,6 +39,7 @@ _OUTLIER = 4.0  # times the median residual
 # 1-sigma per axis, less the velocity of the Earth: of a spacecraft about the Sun, and of the Earth
 # on another date.
 SPACE_M_S, EARTH_M_S = 50000.0, 24000.0
+_FASTEST_M_S = 200000.0  # of a spacecraft about the Sun, at its perihelion
 _FIELD_PX = 0.1  # rms of what the lens model leaves, of _OCTAVES
 _OCTAVES = 2
 _LATITUDES_RAD = np.radians(np.arange(-84.0, 85.0, 6.0))
@@ -89,7 +90,14 @@ def with_air(
         # A zenith found by chance would be trusted: only the change of the focal length is left.
         zenith = np.array([one.boresight for one in images])
         text = 'observer: ground or space: the stars do not show it; state it (option observer)'
-    if site.gain < -_TELLING:
+    speed_m_s = _speed_m_s(images)
+    if site.gain < _TELLING and speed_m_s > _FASTEST_M_S:
+        text = (
+            'observer: ground or space: something else than air shifts the stars, such as trees or'
+            f' lights in the images (by as much as a velocity of {speed_m_s / 1000:.0f} km/s'
+            ' would): leave out those images'
+        )
+    elif site.gain < -_TELLING:
         size = sigma = 0.0
         text = 'observer: space: the stars show no refraction'
     through = {
@@ -111,6 +119,13 @@ def with_air(
         refused = refused_image(one.time_ns, one.width, one.height, 'no_match', detail)
         return with_air([refused if each is one else each for each in observations], camera)
     return [through.get(one.time_ns, one) for one in observations], text
+
+
+def _speed_m_s(images: Sequence[_Seen]) -> float:
+    """Speed of the observer that explains the shifts of the stars where there is no air."""
+    inverse, h = _common(images, SPACE_M_S)
+    own = images[0].of_camera
+    return float(np.linalg.norm((inverse @ h)[own : own + 3]))
 
 
 def _shapes_px(images: Sequence[_Seen], zenith: Floats, size_arcsec: float) -> Floats:

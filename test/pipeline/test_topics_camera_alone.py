@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,30 @@ def test_the_camera_alone_is_calibrated_where_it_is_requested(
     assert main([*command, '--params', str(TINY / 'params.yaml')]) in (0, 3)
     assert not read_calibration(tmp_path / 'out' / 'calibration.json').has_alignment
     assert 'not used, since the attitudes are those of the stars: prior' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('command', ['inspect', 'inspect --params', 'calibrate --params'])
+def test_a_clock_that_was_never_set_is_named(
+    command: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reader.log_damage.cache_clear()
+    bag = tmp_path / 'bag.mcap'
+    start_ns = next(reader.read_images([TINY], IMAGE_TOPIC)).time_ns
+    with BagWriter(bag) as writer:
+        for image in itertools.islice(reader.read_images([TINY], IMAGE_TOPIC), 2):
+            assert isinstance(image, Image)
+            unset = Image(image.time_ns - start_ns + 5 * 10**9, image.pixels)
+            writer.write_image(IMAGE_TOPIC, unset, 'camera')
+        for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC]):
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            if time_ns - start_ns > -5 * 10**9:
+                after_ns = time_ns - start_ns + 5 * 10**9
+                writer.write_attitude(ATTITUDE_TOPIC, after_ns, xyzw, 'icrf')
+    name, *with_params = command.split()
+    given = [*with_params, str(TINY / 'params.yaml')] if with_params else []
+    out = ['-o', str(tmp_path / 'out'), '--no-report'] if name == 'calibrate' else []
+    main([name, str(bag), *given, *out])
+    words = [
+        record.message for record in caplog.records if 'the clock was not set' in record.message
+    ]
+    assert len(words) == 1 and 'stamp images and attitudes in UTC' in words[0]

@@ -168,3 +168,17 @@ def test_one_clock_has_one_time() -> None:
     times: Floats = np.asarray(1.0 + 7.292115e-14 * stamps, np.float64)
     zenith = zenith_of(0.3, times)
     assert Refraction(stamps, zenith, 54.0, 6.0).labels == ('latitude_rad', 'sidereal_time_1_rad')
+
+
+def test_no_velocity_of_a_star_is_blamed_for_what_stands_before_the_sky() -> None:
+    """Of images with a tree, space was found, and then a velocity of 570 km/s."""
+    shift = np.array([0.0, 570.0, 0.0]) / 299792.458
+    images = []
+    for one in seen_from(SiteOptions(observer='space'), 5):
+        camera_from_icrf = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).inv()
+        moved = one.direction_icrf + shift
+        moved /= np.linalg.norm(moved, axis=1)[:, None]
+        shifted_px = project(CAMERA, camera_from_icrf.apply(moved))
+        images.append(dataclasses.replace(one, measured_px=shifted_px))
+    _, text = with_air(images, CAMERA)
+    assert 'something else than air shifts the stars' in text and ' km/s' in text

@@ -293,7 +293,8 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
         cause = of_a_failure(source.bags, source.topics, source.setup, groups)
     if cause is None:
         return NotCalibrated(words, named, refused)
-    words += f'. {cause.in_a_sentence("starcal diagnose" if source.through_air is None else "")}'
+    command = 'starcal diagnose' if source.through_air is None else ''
+    words = f'{cause.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
     return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
 
 

@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from starcal_ros.blas_threads import one_blas_thread
+from starcal_ros.camera import CameraModel
 from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
 from starcal_ros.pipeline.diagnosis.attitude_reading import (
     Case,
@@ -119,11 +120,7 @@ def _nothing_found(found: Identified, setup: Setup) -> Diagnosis:
     """The cause where no image was identified."""
     camera, seen = setup.prior.camera, found.seen
     if not seen and found.other_sizes:
-        width, height = found.other_sizes[0]
-        sizes = f'{width} x {height}, the prior camera is of {camera.width} x {camera.height}'
-        evidence = 'images of another size are of another camera, binned, or cut'
-        mend = '# in the file of camera_info_url: size of the images, focal length in their pixels'
-        return Diagnosis('unknown', None, f'The images are {sizes}.', (evidence,), (mend,))
+        return _of_another_size(*found.other_sizes[0], camera)
     if not seen:
         return Diagnosis('no_stars', 0, 'There is no image that can be read.')
     count = int(np.median([len(sources.xy_px) for sources in seen]))
@@ -154,6 +151,32 @@ def _nothing_found(found: Identified, setup: Setup) -> Diagnosis:
         ),
         ('# check camera_info_url: focal length in pixels, size of the image',),
     )
+
+
+def _of_another_size(width: int, height: int, camera: CameraModel) -> Diagnosis:
+    """The cause where images are not of the size of the prior camera: binned, cut, or another."""
+    sizes = f'{width} x {height}, the prior camera is of {camera.width} x {camera.height}'
+    fields = 'binning_x, binning_y of CameraInfo'
+    fx, _, fy, cx, cy = (float(value) for value in camera.intrinsics)
+    bins = camera.width // width
+    of_file = f'# in the file of camera_info_url: image_width: {width}, image_height: {height}'
+    if bins > 1 and (camera.width // bins, camera.height // bins) == (width, height):
+        # The centre of the first pixel is (0, 0), and of a bin the mean of its pixels.
+        binned = (fx / bins, fy / bins, *((c + 0.5) / bins - 0.5 for c in (cx, cy)))
+        numbers = ', '.join(f'{value:.2f}' for value in binned)
+        return Diagnosis(
+            'unknown',
+            bins,
+            f'The images are {sizes}: binned {bins} x {bins} ({fields}).',
+            mend=(f'{of_file}, and fx, fy, cx, cy = {numbers}',),
+        )
+    if width <= camera.width and height <= camera.height:
+        sentence = f'The images are {sizes}: a part of the detector (roi of CameraInfo).'
+        centre = f'cx = {cx:.2f} - x_offset, cy = {cy:.2f} - y_offset of the region'
+        return Diagnosis('unknown', None, sentence, mend=(f'{of_file}, {centre}',))
+    evidence = 'images of another size are of another camera or mode'
+    mend = f'{of_file}, and the focal length in their pixels'
+    return Diagnosis('unknown', None, f'The images are {sizes}.', (evidence,), (mend,))
 
 
 def _smeared(length_px: float, looked: str) -> Diagnosis:

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from starcal_ros.camera import CameraModel
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.telemetry import attitude_from_message
-from starcal_ros.pipeline.diagnosis.attitude_reading import WireAttitudes
+from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
 from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
-from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation import rendering
 from starcal_ros.simulation import scenario as synthetic
@@ -370,3 +370,28 @@ def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
     assert found_in(turned(resting, 10), catalog).cause == 'prior_alignment'
     # Which of the two is wrong cannot be seen: neither is blamed.
     assert found_in(turned(conjugated(resting), 30), catalog).cause == 'unknown'
+
+
+@pytest.mark.parametrize(
+    ('shape', 'words', 'remedy'),
+    [
+        # Pixel 0 of 2 x 2 is at 0.5 of the detector.
+        ((256, 320), 'binned 2 x 2 (binning_x, binning_y of CameraInfo)', 'fx, fy, cx, cy = '),
+        ((128, 160), 'binned 4 x 4 (binning_x, binning_y of CameraInfo)', 'fx, fy, cx, cy = '),
+        ((400, 600), 'a part of the detector (roi of CameraInfo)', '- x_offset, cy = '),
+        ((1024, 1280), 'The images are 1280 x 1024, the prior', 'focal length in their pixels'),
+    ],
+)
+def test_images_of_another_size_are_named_with_their_remedy(
+    shape: tuple[int, int], words: str, remedy: str
+) -> None:
+    setup = read_setup(Path(__file__).parents[3] / 'bags' / 'tiny' / 'params.yaml')
+    pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)
+    found = diagnose([Image(k, pixels) for k in range(3)], wire_attitudes([], []), setup)
+    assert words in found.sentence and remedy in found.mend[0]
+    assert f'image_width: {shape[1]}, image_height: {shape[0]}' in found.mend[0]
+    if found.found == 2:
+        fx, _, _, cx, _ = setup.prior.camera.intrinsics.tolist()
+        numbers = [float(n) for n in found.mend[0].rpartition('= ')[2].split(', ')]
+        assert numbers[0] == pytest.approx(fx / 2, abs=0.01)
+        assert numbers[2] == pytest.approx((cx + 0.5) / 2 - 0.5, abs=0.01)
