@@ -7,9 +7,9 @@ stars, of its star-tracker attitude and of the prior of its shape, with its own 
 eliminated.  The image that lowers a variance most is chosen, then the next one
 given it.  That needs no data, only where the stars are.
 
-What the estimate would then report depends on its amplitudes too, which more images determine
-better: it is found by the estimator itself, on observations drawn from the estimate
-(`pipeline.plan`).
+Amplitudes and variances stay those of the estimate, but for structure finer than the field that
+the stars do not show: its bound falls as stars are added (`forecast`).  So a forecast draws
+nothing at random, never rises with an image, and does not depend on the order of the images.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from starcal_ros.records import Ensemble, StarObservations
 MAP, LINE_OF_SIGHT = 'map', 'line_of_sight'
 _GROUPS = 20  # of stars by magnitude
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
+_SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
 _AT_ONCE = 32  # candidates: their rows take some 10 MB
 
 
@@ -129,6 +130,24 @@ class Prospect:
         added = np.cumsum(self.information[list(chosen)], axis=0)
         seen = self.root.T @ squares @ self.root
         return np.array([_variance(one, seen) for one in (none, *(none + one for one in added))])
+
+
+def forecast(
+    estimate: Estimate, wanted: Target, variances: Floats, stars: Sequence[int]
+) -> Floats:
+    """
+    Return the sigma (n + 1,) to expect now and after each of n images.
+
+    ``variances`` (n + 1,) are those of `Prospect.variances`, ``stars`` (n,) the stars of images.
+    A variance of fine structure that the stars show stays; one that they do not is their bound on
+    it, which falls as their number grows.
+    """
+    fine = [error for error in estimate.shared_errors if not error.of_star]
+    hidden = sum(error.variance_px2 for error in fine if error.likelihood_ratio < _SHOWN)
+    share = hidden / max(sum(error.variance_px2 for error in fine), 1e-300)
+    added = np.concatenate([[0.0], np.cumsum(stars)])
+    falls = 1.0 - share * added / (estimate.kept.sum() + added)
+    return np.asarray(np.sqrt(variances.clip(0.0) + wanted.constant * falls) / wanted.unit)
 
 
 def _variance(information: Floats, squares: Floats) -> float:

@@ -2,8 +2,7 @@
 """
 The next pointings of a campaign: where to point the camera so that a sigma falls fastest.
 
-Candidates are scored by the stars that the catalog has there (`assessment.plan`).  The sigma after
-each image is what the estimator itself reports on observations drawn from the present estimate.
+Candidates are scored by the stars that the catalog has there (`assessment.plan`).
 """
 
 from __future__ import annotations
@@ -17,10 +16,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.assessment.plan import expected_noise_px2, Prospect, prospect, Target, target
+from starcal_ros.assessment.plan import (
+    expected_noise_px2,
+    forecast,
+    Prospect,
+    prospect,
+    Target,
+    target,
+)
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
@@ -32,7 +38,6 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _FAINTEST = 0.99  # share of the stars observed so far that are brighter than those predicted
 _HELPS = 0.01  # an image that lowers the sigma by less has ceased to help
 _SAME_COSINE = 1e-12  # rounding: a pointing can be reached from itself
-_SEED = 1
 _MOST_IMAGES = 1000
 
 
@@ -149,14 +154,13 @@ def plan_pointings(ensemble: Ensemble, setup: Setup, request: Request) -> Plan:
         raise OptionError('no pointing that is allowed shows a star')
     each = prospect(found, images, setup.calibration)
     chosen = _chosen(each, wanted, request, pointings, np.array([len(i) > 0 for i in images]))
-    sigmas = _sigmas(found, ensemble, setup, request.minimise, [images[k] for k in chosen])
-    steps = tuple(
-        Step(pointings[k], len(images[k]), sigma) for k, sigma in zip(chosen, sigmas, strict=True)
-    )
-    falls = np.sqrt(each.variances(chosen, wanted.squares) + wanted.constant)
-    few = np.flatnonzero(falls[1:] > (1.0 - _HELPS) * falls[:-1])
+    stars = [len(images[k]) for k in chosen]
+    sigmas = forecast(found, wanted, each.variances(chosen, wanted.squares), stars)
+    few = np.flatnonzero(sigmas[1:] > (1.0 - _HELPS) * sigmas[:-1])
     enough = int(few[0]) if len(few) else None
-    return Plan(wanted.name, wanted.sigma(found.posterior.covariance), steps, enough)
+    now, *after = sigmas.tolist()
+    chosen_pointings = [pointings[k] for k in chosen]
+    return Plan(wanted.name, now, tuple(map(Step, chosen_pointings, stars, after)), enough)
 
 
 def _chosen(
@@ -245,37 +249,3 @@ def _expected(
         # A camera at rest, where the rates of the images are known.
         star_tracker_rate_rad_s=0.0 * last.star_tracker_rate_rad_s,
     )
-
-
-def _sigmas(
-    estimate: Estimate,
-    ensemble: Ensemble,
-    setup: Setup,
-    minimise: str,
-    images: Sequence[StarObservations],
-) -> list[float]:
-    """
-    Return the sigma after each image, by the estimator, from observations that are drawn.
-
-    Errors are plus or minus one sigma, at random: their squares, from which the estimator finds
-    the noise, are those to expect.
-    """
-    rng = np.random.default_rng(_SEED)
-    tracker_rad = estimate.star_tracker_sigma_rad
-    times_ns = np.array([image.time_ns for image in ensemble.images])
-    step_ns = int(np.median(np.diff(np.sort(times_ns)))) if len(times_ns) > 1 else 0
-    found, after = [], ensemble
-    for k, image in enumerate(images):
-        noise_px = np.sqrt(image.covariance_px2[:, [0, 2]])
-        error = Rotation.from_rotvec(tracker_rad * rng.choice((-1.0, 1.0), 3))
-        reported = Rotation.from_quat(image.icrf_from_star_tracker_xyzw) * error
-        drawn = dataclasses.replace(
-            image,
-            time_ns=int(times_ns.max()) + (k + 1) * max(step_ns, 1),
-            measured_px=image.measured_px + noise_px * rng.choice((-1.0, 1.0), noise_px.shape),
-            icrf_from_star_tracker_xyzw=reported.as_quat(),
-        )
-        after = dataclasses.replace(after, images=(*after.images, drawn))
-        then = estimate_calibration(after, estimate.geometry, setup.calibration)
-        found.append(target(then, minimise).sigma(then.posterior.covariance))
-    return found

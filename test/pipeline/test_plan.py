@@ -73,6 +73,24 @@ def test_the_images_then_give_the_sigma_that_was_expected(
     assert planned.in_a_sentence().startswith('map_arcsec 0.')
 
 
+@pytest.mark.parametrize('name', ['map', 'line_of_sight', 'fx'])
+def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
+    setup: Setup, ensemble: Ensemble, name: str
+) -> None:
+    """No draw decides: a sigma rises with no image, and equal images have equal effects."""
+    here, there = Pointing(10.0, 40.0, 5.0), Pointing(200.0, -20.0, 70.0)
+
+    def sigmas(*allowed: Pointing) -> list[float]:
+        plan = plan_pointings(ensemble, setup, Request(len(allowed), name, allowed))
+        return [plan.sigma, *(step.sigma for step in plan.steps)]
+
+    same, pair, back = sigmas(here, here, here), sigmas(here, there), sigmas(there, here)
+    for each in (same, pair):
+        assert (np.diff(each) < 0).all()
+    assert same[1] == sigmas(here)[1]
+    assert pair == pytest.approx(back, rel=1e-9)  # rounding
+
+
 @pytest.mark.slow
 def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(
     setup: Setup, ensemble: Ensemble
