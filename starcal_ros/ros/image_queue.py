@@ -227,6 +227,15 @@ class StarTrackers:
             self._may_follow(which, time_ns) for which in range(len(self.histories))
         )
 
+    def awaited(self, time_ns: int) -> frozenset[int]:
+        """
+        Star trackers that have sent nothing at or after a time, by their places.
+
+        Delays are learnt from samples, so that `has_come` does not wait for the first late ones.
+        """
+        latest = (history.latest_ns for history in self.histories)
+        return frozenset(k for k, ns in enumerate(latest) if ns is None or ns < time_ns)
+
     def _is_settled(self, history: AttitudeHistory, time_ns: int) -> bool:
         """True if the samples about a time are there, or can no longer arrive."""
         latest_ns = history.latest_ns

@@ -121,6 +121,8 @@ class StarObserver(StarcalNode):
             self._setup.attitude.max_attitude_gap_s,
             self._own.attitude_timeout_s,
         )
+        # By the stamps of images that matched nothing: the star trackers awaited then.
+        self._awaiting: dict[int, frozenset[int]] = {}
         self._track = observe.Track(self._geometry)
         self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
@@ -260,6 +262,8 @@ class StarObserver(StarcalNode):
         time_ns, quaternion = telemetry.attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
         self._star_trackers.add(which, time_ns, attitude_sample(time_ns, quaternion, direction))
+        if self._awaiting:
+            self._in_worker(self._measure_awaiting)
         self._queue.wake()
 
     def _on_velocity(self, message: Any) -> None:
@@ -345,6 +349,8 @@ class StarObserver(StarcalNode):
             self._publish(self._refused(waiting, 'no_match', detail))
             return
         before = self._track
+        # Asked first: an attitude that comes during the measurement was awaited.
+        awaited = self._star_trackers.awaited(image.time_ns)
         observations, self._track = self._observe_next(image, before)
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
@@ -352,6 +358,9 @@ class StarObserver(StarcalNode):
         self._publish(observations)
         if observations.refusal == 'no_match':
             self._unmatched.add(image)
+            if awaited:
+                self._awaiting[image.time_ns] = awaited
+                self._measure_awaiting()
         elif not observations.refusal:
             self._unmatched.matched()
         if self._annotated.get_subscription_count():
@@ -391,18 +400,39 @@ class StarObserver(StarcalNode):
 
     def _measure_again(self) -> None:
         """Measure the images that matched nothing, with the calibration or alignment found."""
-        kept = self._unmatched.take()
-        for image in kept:
+        images = self._unmatched.images()
+        self._retry(images)
+        self._unmatched.drop(images)
+
+    def _measure_awaiting(self) -> None:
+        """Measure the images that matched nothing and whose awaited attitude has come."""
+        images = self._unmatched.images()
+        kept = {image.time_ns for image in images}
+        before = {stamp: which for stamp, which in self._awaiting.items() if stamp in kept}
+        now = {stamp: self._star_trackers.awaited(stamp) for stamp in before}
+        images = [image for image in images if now.get(image.time_ns) != before.get(image.time_ns)]
+        self._awaiting = {stamp: which for stamp, which in now.items() if which}
+        # The others are kept for a diagnosis, a calibration or an alignment.
+        if used := self._retry(images):
+            self._unmatched.drop(used)
+            self._unmatched.matched()
+
+    def _retry(self, images: Sequence[Image]) -> list[Image]:
+        """Measure images again that matched nothing; return those that are used."""
+        used = []
+        for image in images:
             observations, _ = self._observe_next(image, observe.Track(self._geometry))
             self._retried += 1
             if not observations.refusal:
+                used.append(image)
                 self._retried_used += 1
                 self._counts['no_match'] -= 1
                 self._publish(observations)
-        if kept:
+        if images:
             self.get_logger().info(
-                f'{len(kept)} images without a match measured again: {self._retried_used} used'
+                f'{len(images)} images without a match measured again: {len(used)} used'
             )
+        return used
 
     def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
         width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import dataclasses
 import os
 import threading
@@ -83,12 +83,18 @@ class Unmatched:
             )
             self._thread.start()
 
-    def take(self) -> list[Image]:
-        """Take the images kept, which are then measured again."""
+    def images(self) -> list[Image]:
+        """Return the images kept, which may be measured again."""
         with self._lock:
-            taken = list(self._images)
+            return list(self._images)
+
+    def drop(self, images: Sequence[Image]) -> None:
+        """Keep these images no longer."""
+        stamps_ns = {image.time_ns for image in images}
+        with self._lock:
+            kept = [image for image in self._images if image.time_ns not in stamps_ns]
             self._images.clear()
-            return taken
+            self._images.extend(kept)
 
     def aligned(self, setup: Setup) -> None:
         """Go on with the alignment found."""

@@ -51,6 +51,26 @@ def test_one_that_falls_silent_is_waited_for_twice_its_delay() -> None:
     assert trackers.has_come(6150 * MS)
 
 
+@pytest.mark.parametrize(
+    ('first_ms', 'other_ms', 'expected'),
+    [
+        ([], [], {0, 1}),
+        ([0, 300], [], {1}),  # of a delay that is not known yet
+        ([0, 300], [0], {1}),
+        ([0, 300], [0, 300], set()),
+        ([0, 20_000], [100], {1}),  # however late it is
+        ([0], [250], {0}),
+    ],
+)
+def test_a_star_tracker_is_awaited_until_it_has_sent_something_after_a_time(
+    first_ms: list[int], other_ms: list[int], expected: set[int]
+) -> None:
+    trackers = two()
+    send(trackers, 0, *first_ms)
+    send(trackers, 1, *other_ms)
+    assert trackers.awaited(250 * MS) == expected
+
+
 @pytest.mark.parametrize('stamps_ms', [[], [-(10**9), -(10**9) + 100]])
 def test_one_that_sends_nothing_or_by_another_clock_is_not(stamps_ms: list[int]) -> None:
     trackers = two()

@@ -124,3 +124,34 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
     client.until(lambda: values().get('attitudes_not_used') == 'other: 1')
     status = health[-1].status[0]
     assert status.level == DiagnosticStatus.WARN and status.message == found[1].detail
+
+
+@pytest.mark.parametrize('wrong_by_deg', [5.0, 40.0])
+def test_the_first_images_wait_for_a_late_one_beside_a_wrong_one(
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path, wrong_by_deg: float
+) -> None:
+    """No delay is known yet: images are refused by the wrong one, then used by the late one."""
+    params = parameter_file(tiny_bag, tmp_path / 'params.yaml', wrong_by_deg)
+    start_node('star_observer', ros=('--params-file', str(params)))
+    observed = client.collect(StarObservations, 'observations')
+    client.until_listened()
+    late = client.publisher(QuaternionStamped, '/attitude')
+    wrong = client.publisher(QuaternionStamped, '/other/attitude')
+    shown = client.publisher(Image, '/image', 10)
+
+    def send_attitudes(publisher: Any, mounted: Rotation, until_ns: int) -> None:
+        for time_ns, xyzw in attitudes():
+            if time_ns <= until_ns:
+                quaternion = (Rotation.from_quat(xyzw) * mounted).as_quat()
+                publisher.publish(attitude_to_message(time_ns, quaternion, 'icrf', make_message))
+
+    first = images()[:3]
+    for image in first:
+        shown.publish(image_to_message(image, 'camera', make_message))
+    send_attitudes(wrong, FIRST_FROM_OTHER, first[-1].time_ns + 2 * SECOND_NS)
+    client.until(lambda: len(observed) == len(first))
+    assert {one.refusal for one in observed} == {'no_match'}
+    send_attitudes(late, Rotation.identity(), first[-1].time_ns + 2 * SECOND_NS)
+    client.until(lambda: len(observed) == 2 * len(first))
+    again = observed[len(first) :]
+    assert [(one.refusal, one.star_tracker) for one in again] == len(first) * [('', '')]
