@@ -315,7 +315,7 @@ def _round(
 ) -> _Round:
     """Return a share of a step from a state of residuals (n, 2), with the weights judged."""
     table, camera = data.table, data.prior.camera
-    problem = weighted_attitudes(problem, data, judged.attitudes)
+    problem = weighted_attitudes(problem, data, judged.attitudes, state)
     rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
     size = camera.width, camera.height
     layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data))

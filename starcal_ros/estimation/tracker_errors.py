@@ -28,6 +28,9 @@ _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
 _LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma
 _NOISE_SIGMA = 0.5  # of ln n: data sheets are right to a factor of 1.6
 _UNSTATED_SIGMA = 3.0  # of ln n where no sigma is stated
+_WRONG_SHEETS = 0.02  # of data sheets: four times too small and more, as if none were stated
+_LEAST_WRONG = 4  # place in the grid of the least noise of these, from its sheet's
+_BEYOND = 1.0  # of the grid over the RMS of the errors, in logarithms
 _SLOW_SIGMA = 1.25  # of ln s about the stated noise
 _STATED_SLOW_SIGMA = 0.3  # of ln s about star_tracker_slow_arcsec
 # Groups of a correlation: neighbours in time are joined to at most so many, 1/100 of a campaign
@@ -103,15 +106,20 @@ def tracker_errors(
         False where the stated sigma is a guess.
     stated_slow : float
         Slow error by the data sheet, in stated sigmas; 0: not stated, of the size of the noise.
+
+    Notes
+    -----
+    The stated sigma is a prior of the noise: log-normal, with a tail of wrong data sheets.
     """
     m, group = len(error), correlations.group
     size = np.bincount(group)
     slow_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
-    noise_sigma = _NOISE_SIGMA if is_stated else _UNSTATED_SIGMA
-    slow2 = ((stated_slow or 1.0) * np.exp(_LOG_SLOW)) ** 2
     of_stars = float(np.median(variance))
-    noise2 = np.exp(2.0 * _LOG_NOISE)
-    prior = -0.5 * (_LOG_SLOW[:, None] / slow_sigma) ** 2 - 0.5 * (_LOG_NOISE / noise_sigma) ** 2
+    log_noise, centre, noise_prior = _noise_grid(error, is_stated)
+    if stated_slow:
+        centre = np.full(len(centre), math.log(stated_slow))
+    slow2, noise2 = np.exp(2.0 * (centre + _LOG_SLOW[:, None])), np.exp(2.0 * log_noise)
+    prior = noise_prior - 0.5 * (_LOG_SLOW[:, None] / slow_sigma) ** 2
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
     within = float(((error - of_group[group]) ** 2).sum())
     log_weight, mean_information = [], []
@@ -121,7 +129,7 @@ def tracker_errors(
         # Within a group there is noise, and the slow error that its members do not share.
         if m > len(K):
             apart = m / (m - len(K)) * (1.0 - float(size @ np.diag(K)) / m)
-            alone = slow2[:, None] * max(apart, 0.0) + noise2 + of_stars
+            alone = slow2 * max(apart, 0.0) + noise2 + of_stars
             likelihood = likelihood - 0.5 * (3.0 * (m - len(K)) * np.log(alone) + within / alone)
         log_weight.append(likelihood + prior)
         mean_information.append(information)
@@ -130,7 +138,7 @@ def tracker_errors(
     weight /= weight.sum()
     noise = float(weight.sum(axis=(0, 1)) @ noise2)
     of_mean = interval_factor(np.array(mean_information).ravel() ** -0.5, weight.ravel())
-    per_kernel = weight.sum(axis=2) @ slow2
+    per_kernel = (weight * slow2).sum(axis=(1, 2))
     shared = np.einsum('k,kij->ij', per_kernel, correlations.kernels)
     covariance = noise * np.eye(len(size)) + shared
     # Long tails of s: the covariance of the mean is that of its interval.
@@ -148,6 +156,27 @@ def tracker_errors(
         likelihood_ratio=2.0 * ratio,
         correlation=correlations.names[best],
         independent=shrunk * noise,
+    )
+
+
+def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]:
+    """
+    Return a grid (n,) of ln n for errors (m, 3), the centres of ln s there, and its log prior.
+
+    First data sheets that are right, then those that are wrong, as far as the errors may ask for:
+    of these the slow error is as large as the noise, not as the stated one.
+    """
+    sigma = _NOISE_SIGMA if is_stated else _UNSTATED_SIGMA
+    step = _LOG_NOISE[1] - _LOG_NOISE[0]
+    log_rms = 0.5 * math.log(max(float((error**2).mean()), 1e-300))
+    top = max(float(_LOG_NOISE[-1]), log_rms + _BEYOND)
+    wrong = step * np.arange(_LEAST_WRONG, math.ceil(top / step) + 1)
+    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * sigma / _UNSTATED_SIGMA)
+    log_prior = [-0.5 * (_LOG_NOISE / sigma) ** 2, odds - 0.5 * (wrong / _UNSTATED_SIGMA) ** 2]
+    return (
+        np.concatenate([_LOG_NOISE, wrong]),
+        np.concatenate([np.zeros(len(_LOG_NOISE)), wrong]),
+        np.concatenate(log_prior),
     )
 
 
@@ -209,7 +238,7 @@ def _restricted(
     """
     ones = vectors.sum(axis=0)
     along = vectors.T @ error
-    alone = slow2[:, None, None] * np.maximum(values, 0.0) + noise2[:, None] / members
+    alone = slow2[..., None] * np.maximum(values, 0.0) + noise2[:, None] / members
     total = alone + of_stars / members
     information = (ones**2 / total).sum(axis=2)
     mean = np.einsum('snm,ma->sna', ones / total, along) / information[..., None]

@@ -64,6 +64,7 @@ from starcal_ros.records import CameraGeometry
 # Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
 # thousand times the stated one, and of a milliarcsecond.
 FREE_FACTOR, EXACT_RAD = 1e3, 1e-3 * ARCSECOND_RAD
+_SIGMA_PER_MEDIAN = 1.5  # of the sizes of normal errors
 
 
 @dataclass(frozen=True)
@@ -122,13 +123,23 @@ class Judged:
         return self.covariance_px2(table) + np.outer(inflation_px2, [1.0, 0.0, 1.0])
 
 
-def weighted_attitudes(problem: Problem, data: Data, attitudes: Attitudes | None) -> Problem:
-    """Return the problem with the working sigmas of the star trackers."""
+def weighted_attitudes(
+    problem: Problem, data: Data, attitudes: Attitudes | None, state: State
+) -> Problem:
+    """
+    Return the problem with the working sigmas of the star trackers.
+
+    Until their errors are known, by the scatter at the state of the robust search: a stated sigma
+    that is too small would bend the camera to the attitudes, which then seem to be right.
+    """
     m = data.table.image_count
     if data.options.method == 'single':
         return dataclasses.replace(problem, star_tracker_sigma_rad=np.full((m, 3), EXACT_RAD))
     factor = np.ones(m)
-    if attitudes is not None:
+    if attitudes is None:
+        error = attitude_errors(problem, state, state.camera_from_icrf) / data.stated_rad
+        factor *= max(1.0, _SIGMA_PER_MEDIAN * float(np.median(np.abs(error))))
+    else:
         for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
             factor[images] = tracker.working
         factor[attitudes.misfit] = np.inf

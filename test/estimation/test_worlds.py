@@ -250,6 +250,21 @@ def test_an_image_with_a_wrong_attitude_is_a_misfit_and_moves_nothing() -> None:
     assert found.kept[found.table.image == 2].all()
 
 
+@pytest.mark.parametrize('stated_arcsec', [0.1, 2.0])
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_a_stated_sigma_that_is_far_too_small_bends_nothing(
+    seed: int, stated_arcsec: float
+) -> None:
+    made = sound(seed)  # of 20 arcsec
+    found = estimated(made, star_tracker_sigma_arcsec=(stated_arcsec,) * 3)
+    assert found.termination == 'converged' and not found.misfit_image.any()
+    assert normalised(found, made.scenario.truth, slice(10, 13)) < chi2.isf(0.01, 3) / 3
+    assert normalised(found, made.scenario.truth, slice(0, 10)) < chi2.isf(0.001, 10) / 10
+    # Six images hardly tell noise from slow errors.
+    tracker = found.tracker_errors[0]
+    assert 10.0 < stated_arcsec * np.hypot(tracker.noise, tracker.slow) < 60.0
+
+
 def test_the_order_of_images_and_the_length_of_the_list_change_nothing() -> None:
     made = sound(5)
     turned = dataclasses.replace(made, ensemble=Ensemble(made.ensemble.images[::-1]))
