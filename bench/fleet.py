@@ -1,24 +1,16 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-A fleet of small bags by `starcal trend` on two worker processes, client and a worker killed.
-
-Bags and results are on an S3 server of this machine where moto and s3fs are installed
-(``pip install 'moto[server]' s3fs``), else on its disk.
-"""
+"""A fleet of small bags by `starcal trend` on two worker processes, client and a worker killed."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-import contextlib
 import dataclasses
 from dataclasses import dataclass, field
 import hashlib
-import importlib.util
 import itertools
-import os
 from pathlib import Path
-import socket
+import shutil
 import statistics
 import subprocess
 import sys
@@ -33,7 +25,7 @@ from bench.table import Table, verdict
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend import fleet, places, tasks
+from starcal_ros.mission.trend import fleet, tasks
 from starcal_ros.mission.trend.rows import COMPUTED, kept_name, Row
 from starcal_ros.mission.trend.series import SECONDS_PER_YEAR
 from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
@@ -70,7 +62,7 @@ class Watch:
     def on_row(self) -> None:
         """Note the memory, and kill a worker when its time has come."""
         us = psutil.Process()
-        workers = [p for p in us.children() if 'starcal_ros.child_process' in p.cmdline()]
+        workers = [p for p in us.children() if 'spawn_main' in ' '.join(p.cmdline())]
         self.parent_mb.append(us.memory_info().rss / 1e6)
         self.worker_mb.append(max(p.memory_info().rss / 1e6 for p in workers))
         if len(self.parent_mb) == self.kill_at:
@@ -82,61 +74,31 @@ def run(quick: bool) -> Iterator[Table]:
     """Bags that are calibrated, then runs over simulated rows with nothing new."""
     with tempfile.TemporaryDirectory(prefix='starcal-fleet-') as name:
         folder = Path(name)
-        with store(folder / 'store') as root:
-            yield of_bags(root, folder, *((8, 2) if quick else (500, 20)))
-            made = Table('starcal trend with nothing new', ('rows', 'place', 's', 'peak MB'))
-            cameras = 4 if quick else 400
-            made.add(25 * cameras, root[:5], *nothing_new(f'{root}/rows', cameras, 25))
-        cameras = 10 if quick else 1000
-        made.add(100 * cameras, 'disk', *nothing_new(str(folder / 'rows'), cameras, 100))
+        yield of_bags(folder, *((8, 2) if quick else (500, 20)))
+        made = Table('starcal trend with nothing new', ('rows', 's', 'peak MB'))
+        for k, cameras in enumerate((4, 10) if quick else (400, 1000)):
+            each = 100 if k else 25
+            made.add(each * cameras, *nothing_new(folder / f'rows{k}', cameras, each))
         made.notes.append(f'limits: {MOST_S:g} s over 10,000 keys, {MOST_MB:g} MB at 100,000 rows')
         yield made
 
 
-@contextlib.contextmanager
-def store(folder: Path) -> Iterator[str]:
-    """A bucket of an S3 server while the block runs, or a folder."""
-    if not all(map(importlib.util.find_spec, ('moto', 's3fs'))):
-        yield str(folder)
-        return
-    with socket.create_server(('127.0.0.1', 0)) as free:
-        port = free.getsockname()[1]
-    os.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{port}'
-    os.environ |= dict.fromkeys(('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'), 'test')
-    line = [sys.executable, '-m', 'moto.server', '-H', '127.0.0.1', '-p', str(port)]
-    server = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        import s3fs  # type: ignore[import-not-found,import-untyped,unused-ignore]
-
-        for _ in range(300):
-            with contextlib.suppress(OSError):
-                socket.create_connection(('127.0.0.1', port), 1).close()
-                break
-            time.sleep(0.1)
-        s3fs.S3FileSystem().mkdir('archive')
-        yield 's3://archive'
-    finally:
-        server.kill()
-        server.wait()
-
-
-def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
+def of_bags(folder: Path, count: int, alone: int) -> Table:
     """One bag after another alone, then all: a client that is killed, and one that goes on."""
-    copy_bags(f'{root}/fleet', count)
-    found = list(tasks.find(f'{root}/fleet', Cameras(params=str(_PARAMS))))
-    before_s = one_bag_s(found[:alone], f'{root}/before')
-    watch, output = Watch(kill_at=count // 4), f'{root}/out'
+    root, output = folder / 'fleet', folder / 'out'
+    copy_bags(root, count)
+    found = list(tasks.find(str(root), Cameras(params=str(_PARAMS))))
+    before_s = one_bag_s(found[:alone], folder / 'before')
+    watch = Watch(kill_at=count // 4)
     start_s = time.perf_counter()
-    killed_client(f'{root}/fleet', output, folder, count // 4)
-    with Rows(output) as table:
-        fleet.update(table, found, _WORKERS, on_row=watch.on_row)
+    killed_client(root, output, count // 4)
+    fleet.update(Rows(output), found, _WORKERS, on_row=watch.on_row)
     wall_s = time.perf_counter() - start_s
-    after_s = one_bag_s(found[-alone:], f'{root}/after')
+    after_s = one_bag_s(found[-alone:], folder / 'after')
     rows = Rows(output).rows()
     efficiency = count * (before_s + after_s) / 2 / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
-    kept = {entry.name for entry in places.entries(f'{output}/{KEPT_FOLDER}')}
-    title = f'starcal trend over {count} bags on {root[:5]} with {_WORKERS} workers'
+    title = f'starcal trend over {count} bags with {_WORKERS} workers'
     made = Table(title, ('quantity', 'value'))
     made.add('one bag alone, before, s', before_s)
     made.add('one bag alone, after, s', after_s)
@@ -149,7 +111,7 @@ def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
     made.add('bags failed', sum(bool(row.error) for row in rows))
     made.add(
         'calibrations lost or left over',
-        len(kept ^ {f'{kept_name(row)}/calibration.json' for row in rows}),
+        len(set(kept(output)) ^ {output / KEPT_FOLDER / kept_name(row) for row in rows}),
     )
     for who, values in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
         tenth = max(1, len(values) // 10)
@@ -159,58 +121,65 @@ def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
     return made
 
 
-def killed_client(root: str, output: str, folder: Path, kept: int) -> None:
-    """Run the command in a folder, and kill it once so many calibrations are kept."""
-    line = [sys.executable, '-m', 'starcal_ros.cli.main', 'trend', root, '-o', output]
+def kept(output: Path) -> list[Path]:
+    """Folders of kept calibrations."""
+    return [path.parent for path in (output / KEPT_FOLDER).rglob('calibration.json')]
+
+
+def killed_client(root: Path, output: Path, count: int) -> None:
+    """Run the command, and kill it once so many calibrations are kept."""
+    line = [sys.executable, '-m', 'starcal_ros.cli.main', 'trend', str(root), '-o', str(output)]
     line += ['--params', str(_PARAMS), '--workers', str(_WORKERS)]
-    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL) as client:
-        while client.poll() is None and len(places.entries(f'{output}/{KEPT_FOLDER}')) < kept:
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL) as client:
+        while client.poll() is None and len(kept(output)) < count:
             time.sleep(0.5)
         client.kill()
 
 
-def nothing_new(root: str, cameras: int, each: int) -> tuple[float, float]:
+def nothing_new(folder: Path, cameras: int, each: int) -> tuple[float, float]:
     """Wall time and peak memory of a client, all of whose keys are rows of its table."""
     rng = np.random.default_rng(each)
     names = [f'sat{k:04d}' for k in range(cameras)]
     for name, k in itertools.product(names, range(each)):
-        url = f'{root}/fleet/{name}/{k:03d}/calibration.json'
-        if places.is_remote(root):
-            places.write(url, b'')
-        else:  # without waiting for the disk
-            Path(url).parent.mkdir(parents=True)
-            Path(url).touch()
-    found = tasks.find(f'{root}/fleet', Cameras())
-    with Rows(f'{root}/out') as table:
+        path = folder / f'fleet/{name}/{k:03d}/calibration.json'
+        path.parent.mkdir(parents=True)
+        path.touch()
+    found = tasks.find(str(folder / 'fleet'), Cameras())
+    (folder / 'out').mkdir()
+    table = Rows(folder / 'out')
+    with table.transaction():
         for name in names:
             truth = simulated_truth(rng)
             months = [truth.of_month(month) for month in range(each)]
             for row, task in zip(simulated_rows(name, months, rng), found, strict=False):
                 table.add(dataclasses.replace(row, stamp=task.stamp))
-    line = [sys.executable, '-c', _CLIENT, 'trend', f'{root}/fleet', '-o', f'{root}/out']
+    line = [sys.executable, '-c', _CLIENT, 'trend', str(folder / 'fleet')]
     start_s = time.perf_counter()
-    done = subprocess.run(line, check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [*line, '-o', str(folder / 'out')], check=True, capture_output=True, text=True
+    )
     wall_s = time.perf_counter() - start_s
-    if f'0 new, {cameras * each} known before, 0 failed' not in done.stdout:
+    if f'0 new, {cameras * each} known, 0 failed' not in done.stdout:
         raise AssertionError(done.stdout)
     return wall_s, int(done.stdout.split()[-2]) * 1024 / 1e6
 
 
-def copy_bags(folder: str, count: int) -> None:
+def copy_bags(folder: Path, count: int) -> None:
     """Copies of the small bag, each with a digest of its own."""
     content = (_TINY / 'tiny_0.mcap').read_bytes()
     assert content[:64].count(_LIBRARY) == 1
     for k in range(count):
-        bag = places.join(folder, f'{k:04d}')
-        places.write(f'{bag}/metadata.yaml', (_TINY / 'metadata.yaml').read_bytes())
-        places.write(f'{bag}/tiny_0.mcap', content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
+        bag = folder / f'{k:04d}'
+        bag.mkdir(parents=True)
+        shutil.copy(_TINY / 'metadata.yaml', bag)
+        (bag / 'tiny_0.mcap').write_bytes(content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
 
 
-def one_bag_s(found: list[Task], folder: str) -> float:
+def one_bag_s(found: list[Task], folder: Path) -> float:
     """Median wall time of a bag on one worker, without the first, before which it starts."""
     ends_s: list[float] = []
-    with Rows(folder) as table:
-        fleet.update(table, found, 1, on_row=lambda: ends_s.append(time.perf_counter()))
+    folder.mkdir()
+    fleet.update(Rows(folder), found, 1, on_row=lambda: ends_s.append(time.perf_counter()))
     return statistics.median(b - a for a, b in itertools.pairwise(ends_s))
 
 

@@ -23,26 +23,21 @@ import time
 from unittest import mock
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from bench.fleet import simulated_rows, simulated_truth
 from bench.table import Table
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.mission.trend import fleet, places, tasks, trend_page
+from starcal_ros.mission.trend.answers import Answer
 from starcal_ros.mission.trend.places import Entry
-from starcal_ros.mission.trend.rows import folder_of, PARTITIONS, Row
+from starcal_ros.mission.trend.rows import Row
 from starcal_ros.mission.trend.tasks import Cameras, Task
-from starcal_ros.mission.trend.trend_table import SCHEMA, TABLE_FOLDER
 from starcal_ros.mission.trend.trend_table import Table as Rows
-from starcal_ros.record_codec import json_object
 
 _PARAMS = Path(__file__).parents[1] / 'bags/tiny/params.yaml'
 _ROOT = 's3://archive/fleet'
 _NAMES = Cameras(re.compile('(?P<spacecraft>[^/]+)/'), params=str(_PARAMS))
 _DAY_NS = 86400 * NANOSECONDS_PER_SECOND
-_listings = places.listings
-_FILE_ROWS = 1000
 
 
 def run(cameras: int, days: int, with_page: bool) -> Table:
@@ -55,8 +50,7 @@ def run(cameras: int, days: int, with_page: bool) -> Table:
         for run, last in (('nothing new', days), ('a new day', days + 1)):
             listings = functools.partial(listings_of, names, last)
             add = functools.partial(made.add, run)
-            with step(add, 'index of the table'):
-                table = Rows(folder)
+            table = Rows(folder)
             with (
                 step(add, 'list, skip, add'),
                 mock.patch.object(places, 'listings', listings),
@@ -65,12 +59,11 @@ def run(cameras: int, days: int, with_page: bool) -> Table:
                 done = fleet.update(table, tasks.find(_ROOT, _NAMES))
             if with_page:
                 with step(add, 'page'):
-                    trend_page.write_page(table.cameras(), table.camera_count(), folder, _ROOT)
+                    trend_page.write_page(table.cameras(), len(names), Path(folder), _ROOT)
             expected = fleet.Done(computed=cameras * (last - days), known=cameras * days)
             if done != expected:
                 raise AssertionError(done)
-        sizes = [entry.size for entry in places.entries(table.folder)]
-        made.notes.append(f'table {sum(sizes) / 1e6:.0f} MB in {len(sizes)} files')
+        made.notes.append(f'table {table.path.stat().st_size / 1e6:.0f} MB')
         if with_page:
             page_mb = Path(folder, trend_page.TREND_FILE).stat().st_size / 1e6
             made.notes.append(f'page {page_mb:.1f} MB')
@@ -109,10 +102,7 @@ def days_of_a_camera(count: int) -> list[Row]:
 
 
 def listings_of(names: Sequence[str], days: int, root: str) -> Iterator[list[Entry]]:
-    """Lists of the files of each camera after so many days; the table is listed as it is."""
-    if root != _ROOT:
-        yield from _listings(root)
-        return
+    """Lists of the files of each camera after so many days."""
     for camera in names:
         found = []
         for day in range(days):
@@ -123,9 +113,9 @@ def listings_of(names: Sequence[str], days: int, root: str) -> Iterator[list[Ent
         yield found
 
 
-def answer(rows: Sequence[Row], task: Task) -> Row:
+def answer(rows: Sequence[Row], task: Task) -> Answer:
     """Row of a bag in place of its calibration."""
-    return dataclasses.replace(
+    row = dataclasses.replace(
         rows[int(posixpath.basename(task.url))],
         key=hashlib.sha256(task.url.encode()).hexdigest(),
         path=task.url,
@@ -133,31 +123,17 @@ def answer(rows: Sequence[Row], task: Task) -> Row:
         size_bytes=task.size,
         spacecraft=task.spacecraft,
     )
+    return Answer(row.key, row)
 
 
 def write_table(folder: Path, names: Sequence[str], rows: Sequence[Row]) -> None:
     """Write the table that runs on each of the days leave."""
-    base = pa.Table.from_pylist([json_object(row) for row in rows], SCHEMA)
-    base = base.drop_columns(list(PARTITIONS))
-    for name in names:
-        with mock.patch.object(
-            places, 'listings', functools.partial(listings_of, [name], len(rows))
-        ):
-            found = list(tasks.find(_ROOT, _NAMES))
-        columns = {
-            'key': [hashlib.sha256(task.url.encode()).hexdigest() for task in found],
-            'path': [task.url for task in found],
-            'stamp': [task.stamp for task in found],
-            'size_bytes': [task.size for task in found],
-        }
-        table = base
-        for column, values in columns.items():
-            place = table.column_names.index(column)
-            table = table.set_column(place, SCHEMA.field(column), pa.array(values))
-        own = folder / TABLE_FOLDER / folder_of(name, '')
-        own.mkdir(parents=True)
-        for start in range(0, len(rows), _FILE_ROWS):
-            pq.write_table(table.slice(start, _FILE_ROWS), own / f'{start:06d}.parquet')
+    table, listings = Rows(folder), functools.partial(listings_of, names, len(rows))
+    with table.transaction(), mock.patch.object(places, 'listings', listings):
+        for task in tasks.find(_ROOT, _NAMES):
+            row = answer(rows, task).row
+            assert row
+            table.add(row)
 
 
 if __name__ == '__main__':

@@ -196,11 +196,13 @@ def calibrate_bag(
     velocity_topic: str = '',
     temperature_topic: str = '',
     observations_topic: str = '',
+    camera_alone: bool = False,
 ) -> Calibration:
     """
     Calibration from MCAP bags, as by ``starcal calibrate``; nothing is written.
 
-    Bags without attitudes give the camera alone, as images do.
+    Bags without attitudes give the camera alone, as images do, unless the parameter file states a
+    star tracker.
 
     Parameters
     ----------
@@ -210,6 +212,8 @@ def calibrate_bag(
         ROS parameter file with the prior camera, the prior alignment and all other options.
     image_topic, attitude_topic, velocity_topic, temperature_topic, observations_topic : str
         Needed where a bag has more than one topic of the type.
+    camera_alone : bool
+        True: by the stars alone, with attitudes in the bags and a stated star tracker or not.
 
     Raises
     ------
@@ -217,7 +221,6 @@ def calibrate_bag(
         One line that names the cause: a bag, an option, a file or too few observations.
     """
     paths = [Path(bag) for bag in ([bags] if isinstance(bags, (str, Path)) else bags)]
-    values = Path(params)
     asked = Topics(
         image=image_topic,
         attitude=attitude_topic,
@@ -225,12 +228,15 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
-    inputs = inputs_of((*reader.mcap_files(paths), values))
-    if not without_attitudes(paths, asked):
-        return calibrate_bags(paths, read_setup(values), asked, inputs).calibration
+    inputs, values = (
+        inputs_of((*reader.mcap_files(paths), Path(params))),
+        read_values(Path(params)),
+    )
+    if not without_attitudes(paths, asked, values, camera_alone):
+        return calibrate_bags(paths, read_setup(Path(params)), asked, inputs).calibration
     with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-        sky = night_sky.from_bags(paths, asked, read_values(values), Path(folder))
-        return calibrate_bags(sky.bags, sky.setup, asked, inputs, sky.through_air).calibration
+        sky = night_sky.from_bags(paths, asked, values, Path(folder))
+        return calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air).calibration
 
 
 def calibrate_images(images: Path | str | Sequence[Path | str], **options: object) -> Calibration:

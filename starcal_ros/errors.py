@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
+import sys
 
 # Modules of the extras in setup.cfg.
 _OF_EXTRAS = (
-    'astropy', 'contourpy', 'dask', 'distributed', 'jinja2', 'markupsafe', 'PIL', 'pyarrow',
-    'rawpy', 'spiceypy', 'weasyprint',
+    'astropy', 'contourpy', 'cryptography', 'dask', 'distributed', 'fsspec', 'jinja2',
+    'markupsafe', 'PIL', 'pyarrow', 'rawpy', 'spiceypy', 'weasyprint',
 )  # fmt: skip
+_OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
 _WITHOUT_KEY = ('mcap', 'rosbags')  # needed, but rosdep has no key for them
 
 
@@ -72,12 +74,19 @@ class TooFewObservations(StarcalError):
 
 
 def missing_package(error: ModuleNotFoundError, extra: str) -> str:
-    """One line that names the extra to install; raises what is missing for another reason."""
+    """
+    One line with the command that installs a package for this interpreter.
+
+    Raises the error where something else is missing.
+    """
+    install = f'{error.name} is not installed: {sys.executable} -m pip install'
     if error.name in _WITHOUT_KEY:
-        return f'{error.name} is not installed: pip install {" ".join(_WITHOUT_KEY)}'
+        return f'{install} {" ".join(_WITHOUT_KEY)}'
+    if error.name in _OF_STORES:
+        return f'{install} {error.name}'
     if error.name not in _OF_EXTRAS:
         raise error
-    return f"{error.name} is not installed: pip install '.[{extra}]' in the folder of starcal"
+    return f"{install} '.[{extra}]' in the folder of starcal"
 
 
 @contextlib.contextmanager

@@ -9,20 +9,19 @@ from pathlib import Path
 import signal
 
 from starcal_ros.mission.trend import answers
-from starcal_ros.mission.trend.answers import Seen
-from starcal_ros.mission.trend.rows import Row
+from starcal_ros.mission.trend.answers import Answer
 from starcal_ros.mission.trend.tasks import Task
 
 
-def kill_on_poison(task: Task) -> Row | Seen:
-    """Row of a task; a poisonous one kills the process that it runs in."""
-    if task.url == 'poison':
+def kill_on_poison(task: Task) -> Answer:
+    """Answer to a task; a poisonous one kills the process that it runs in."""
+    if task.url.startswith('poison'):
         os.kill(os.getpid(), signal.SIGKILL)
     return answers.compute(task)
 
 
-def kill_once(task: Task) -> Row | Seen:
-    """Row of a task; the first to find the marker kills its process."""
+def kill_once(task: Task) -> Answer:
+    """Answer to a task; the first to find the marker kills its process."""
     marker = Path(task.params)
     try:
         marker.unlink()

@@ -505,7 +505,7 @@ def _catalog(command: argparse.ArgumentParser) -> None:
 def _trend(command: argparse.ArgumentParser) -> None:
     what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
     command.add_argument('root', metavar='ROOT', help=what)
-    what = 'folder or URL for trend.html, the table trend.parquet and the calibrations of bags'
+    what = 'folder for trend.html, the table trend.sqlite and the calibrations of bags'
     command.add_argument('-o', '--output', required=True, metavar='DIR', help=what)
     what = (
         'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '
@@ -517,9 +517,8 @@ def _trend(command: argparse.ArgumentParser) -> None:
         'CSV file with columns path, spacecraft, camera, params'
     )
     command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
-    command.add_argument('--retry', action='store_true', help='try what failed before again')
-    what = 'write report.html beside the calibration of each bag that is calibrated in this run'
-    command.add_argument('--reports', action='store_true', help=what)
+    what = 'write the table as trend.parquet too, for other tools'
+    command.add_argument('--parquet', action='store_true', help=what)
     _workers(command, 'worker processes (default: 0, in-process)', 0)
 
 

@@ -205,10 +205,10 @@ parallax, phot_g_mean_mag and bp_rp, or their VizieR names.
     'trend': """\
 follow calibrations over years
 
-Adds every calibration.json and state folder under ROOT to a Parquet table. With --params it
-calibrates bags too. Observations of older versions are calibrated again. Writes trend.html: each
-parameter, boresight and alignment over time, steps and drifts with p-values, and the change that a
-recalibration would have made.
+Adds every calibration.json and state folder under ROOT to a table in DIR, one SQLite file. With
+--params it calibrates bags too. Observations of older versions are calibrated again. Writes
+trend.html: each parameter, boresight and alignment over time, steps and drifts with p-values, and
+the change that a recalibration would have made.
 
   # all calibrations of a mission; another run adds only new ones
   starcal trend mission -o trend

@@ -36,6 +36,7 @@ from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.mission.trend.trend_table import Table
 from starcal_ros.records import Image
 
 SLOWEST_S = 300.0
@@ -207,7 +208,7 @@ def _cut_outputs(
     after = digests(out) if state is None else state
     cut = []
     for name, digest in after.items():
-        if name.endswith(('.part', '.log')) or digest == before.get(name):
+        if name.endswith(('.part', '.log', '-journal')) or digest == before.get(name):
             continue
         if state is not None and not command.is_repeatable and not (out / name).exists():
             continue  # merged into another file since: a kill at random reads it while it is there
@@ -228,6 +229,8 @@ def _reads(path: Path) -> bool:
         elif path.suffix == '.mcap':
             for _ in reader.read_raw([path], on_damage=damage.append):
                 pass
+        elif path.suffix == '.sqlite':
+            Table(path.parent).rows()
         elif path.suffix == '.html':
             return path.read_text().rstrip().endswith('</html>')
         else:

@@ -147,7 +147,7 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
     ):
         refused = run(starcal, *line, cwd=tmp_path)
         assert refused.returncode == 2
-        assert f"is not installed: pip install '.[{extra}]'" in refused.stderr
+        assert f"python -m pip install '.[{extra}]'" in refused.stderr
         assert refused.stderr.count('\n') == 1
 
 

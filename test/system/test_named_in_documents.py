@@ -47,7 +47,7 @@ ELSEWHERE = {
 NOT_OURS = {'rotation.py', 'env.sh', 'STUDY.json', 'STUDY.svg', '00000012.mcap'}
 SUFFIXES = (
     *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'png'),
-    *('sh', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
+    *('sh', 'sqlite', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
 )
 FOLDERS = 'bench|config|docs|examples|launch|requirements|starcal_ros|studies|test|tools'
 ROLE = re.compile(r'(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)')  # in a docstring: one backtick

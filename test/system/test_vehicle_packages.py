@@ -59,7 +59,7 @@ except ArchiveError as error:
 """
     done = run(vehicle, '-c', source)
     assert done.returncode == 0, done.stderr
-    assert 'is not installed: pip install mcap rosbags, or leave state_dir' in done.stdout
+    assert 'python -m pip install mcap rosbags, or leave state_dir' in done.stdout
     params = TINY / 'params.yaml'
     for words in (
         ('starcal_ros.entry_points', 'bag_player'),
@@ -67,7 +67,7 @@ except ArchiveError as error:
     ):
         refused = run(vehicle, '-m', *words)
         assert refused.returncode == 2, refused.stderr
-        assert 'is not installed: pip install mcap rosbags' in refused.stderr
+        assert 'python -m pip install mcap rosbags' in refused.stderr
         assert refused.stderr.count('\n') == 1
 
 

@@ -173,6 +173,8 @@ def _trend(args: argparse.Namespace) -> int:
     from starcal_ros.mission.trend.trend_table import Table
 
     root, cameras = places.absolute(args.root), read_cameras(args.cameras, args.params)
+    if places.is_remote(args.output):
+        raise OptionError(f'-o: {args.output}: results are written to a local folder, no URL')
     with _reading(args.root):
         if not places.exists(root):
             raise OptionError(f'{args.root}: no such folder')
@@ -181,24 +183,29 @@ def _trend(args: argparse.Namespace) -> int:
         with _reading(args.root):
             yield from find(root, cameras)
 
-    if not places.is_remote(args.output):
-        make_folder(Path(args.output))
-        check_outputs([Path(args.output, trend_page.TREND_FILE)])
-    table = Table(args.output)
-    # A file that was repaired or removed is no longer among the tasks.
-    table.forget_failed(() if args.retry else (task.stamp for task in tasks()))
+    folder = Path(places.absolute(args.output))
+    make_folder(folder)
+    check_outputs([folder / trend_page.TREND_FILE])
+    table = Table(folder)
     with progress_bar(None, 'calibrations') as advance:
-        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance, args.reports)
+        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance)
     if done == fleet.Done():
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
         )
-    page = trend_page.write_page(table.cameras(), table.camera_count(), args.output, args.root)
-    copies = f', {done.repeated} the same as another' if done.repeated else ''
-    print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed{copies}')
+    page = trend_page.write_page(table.cameras(), len(table.names()), folder, args.root)
+    print_text(f'{done.computed} new, {done.known} known, {done.failed} failed')
     for row in page.failures[:_FAILURES_SHOWN]:
         print_text(f'failed: {row.path}: {row.error}')
+    if args.parquet:
+        print_text(f'written to {table.write_parquet()}')
     print_text(f'{page.years:.2f} years; look at {page.path}')
+    if done.silent == fleet.MOST_SILENT:
+        complain(
+            f'{args.root}: no answer for {done.silent} files; run again when the store answers:'
+            ' the others are left for that run'
+        )
+        return EXIT_REFUSED
     return EXIT_ACCEPTED if page.calibrations else EXIT_REFUSED
 
 

@@ -1,36 +1,27 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The answer to a task, made where the file is read: a row, or that there is one already."""
+"""The answer to a task, made where the file is read: a row, or the key of the one there is."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
-import hashlib
+import errno
 import math
-import os
 from pathlib import Path
-import posixpath
 import socket
 
 import numpy as np
 
+from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json
-from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
 from starcal_ros.mission.trend import places
-from starcal_ros.mission.trend.rows import (
-    COMPUTED,
-    failure,
-    kept_name,
-    RECORDED,
-    Row,
-    row_of,
-    START,
-)
-from starcal_ros.mission.trend.tasks import digest, KEPT_FOLDER, Task
+from starcal_ros.mission.trend.rows import COMPUTED, failure, RECORDED, Row, row_of
+from starcal_ros.mission.trend.tasks import digest, Task
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
@@ -39,82 +30,94 @@ from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.untrusted import json_value, METADATA_BYTES, read_text, yaml_value
 
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
+_NO_ANSWER = (errno.EIO, errno.ETIMEDOUT)  # of a store; other errors are answers
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Nothing new: the start of the key of the row there is, or empty where none is due."""
+class Answer:
+    """
+    The answer to a task.
+
+    Attributes
+    ----------
+    key : str
+        Of the row that the table has; empty where none is due.
+    row : Row or None
+        New row.
+    calibration : str
+        Content of ``calibration.json`` of a bag.
+    is_silence : bool
+        True if the store of the file did not answer.
+    """
 
     key: str = ''
+    row: Row | None = None
+    calibration: str = ''
+    is_silence: bool = False
 
 
-def compute(task: Task) -> Row | Seen:
-    """The row of a task, or `Seen`; of one that fails, the row with its error."""
+def compute(task: Task) -> Answer:
+    """Answer to a task; for one that fails, the row with its error."""
     try:
         if task.size >= 0 and not places.exists(task.url):
-            raise FileNotFoundError(2, _NOT_SEEN, task.url)
-        with places.fetched(task.url, task.files) as path:
+            raise FileNotFoundError(errno.ENOENT, _NOT_SEEN, task.url)
+        # The result must not depend on the threads of BLAS.
+        with places.fetched(task.url, task.files, task.size) as path, one_blas_thread():
             return _answer(task, path)
-    except OSError as error:
+    except (OSError, ModuleNotFoundError) as error:
         return _unreachable(task, error)
     # One bag must not end a run over thousands, whatever is in it.
     except Exception as error:
         return failed(task, f'{type(error).__name__}: {error}')
 
 
-def failed(task: Task, error: str, key: str = '', is_passing: bool = False) -> Row:
-    """The row of a task that failed."""
-    key = key or hashlib.sha256(f'{task.url!r} {error}'.encode()).hexdigest()
-    return _of_task(failure(key, task.url, error), task, is_passing=is_passing)
+def failed(task: Task, error: str, is_passing: bool = False, is_silence: bool = False) -> Answer:
+    """Answer to a task that failed."""
+    row = dataclasses.replace(failure(task.url, error), is_passing=is_passing)
+    return Answer(row=_of_task(row, task), is_silence=is_silence)
 
 
-def _unreachable(task: Task, error: OSError) -> Row:
+def _unreachable(task: Task, error: OSError | ModuleNotFoundError) -> Answer:
     """The row of a file that could not be read; it passes unless the client saw that too."""
-    reason = f'cannot be read: {error.strerror or error}'
+    reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
     if task.size < 0:
         return failed(task, reason)
-    return failed(task, f'{socket.gethostname()}: {reason}', is_passing=True)
+    is_silence = places.is_remote(task.url) and getattr(error, 'errno', None) in _NO_ANSWER
+    return failed(task, f'{socket.gethostname()}: {reason}', True, is_silence)
 
 
-def _answer(task: Task, path: Path) -> Row | Seen:
-    version, key = software_version() if task.is_bag else '', ''
+def _answer(task: Task, path: Path) -> Answer:
+    version = software_version() if task.is_bag else ''
     try:
         if task.is_bag and not task.params:
             beside = path.with_name(calibration_json.CALIBRATION_FILE)
             if not _is_older(beside, version):
-                return Seen()
+                return Answer()
             settings: tuple[str | Path, ...] = (beside,)
         else:
             settings = task.settings
         # By content: a copy counts once, a tree may move, and what is repaired is another task.
         files = reader.files_of_bags([path]) if task.is_bag else (path,)
         key = digest((*files, *settings), version)
-        if key[:START] in task.known:
-            return Seen(key[:START])
+        if key in task.known:
+            return Answer(key)
         if not task.is_bag:
             made, temperature = _recorded(path)
-            return _of_task(row_of(made, key, task.url, RECORDED, temperature), task)
+            return Answer(key, _of_task(row_of(made, key, task.url, RECORDED, temperature), task))
         setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
         campaign = calibrate_bags([path], setup, Topics())
         made, records = campaign.calibration, campaign.observations
         row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
-        row = _of_task(row, task, path)
-        products = {calibration_json.CALIBRATION_FILE: calibration_json.calibration_text(made)}
-        if task.with_report:
-            from starcal_ros.report import page  # seldom needed, slow to load
-
-            # Pictures of images would be most of its bytes.
-            contents = page.Found(made, campaign.residuals, records, (), ())
-            products[REPORT_FILE] = page.render(contents, Path(task.url))
-        return _kept(row, products, task) if task.table else row
+        text = calibration_json.calibration_text(made)
+        return Answer(key, _of_task(row, task, path), text)
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
             raise cause from error
-        return failed(task, str(error).replace(str(path), task.url), key)
+        return failed(task, str(error).replace(str(path), task.url))
 
 
-def _of_task(row: Row, task: Task, bag: Path = Path(), is_passing: bool = False) -> Row:
+def _of_task(row: Row, task: Task, bag: Path = Path()) -> Row:
     """A row with what its task and the metadata of the bag add."""
     names = _custom_data(bag / 'metadata.yaml') if task.is_bag else {}
     return dataclasses.replace(
@@ -123,7 +126,6 @@ def _of_task(row: Row, task: Task, bag: Path = Path(), is_passing: bool = False)
         size_bytes=max(task.size, 0),
         spacecraft=task.spacecraft or names.get('spacecraft', ''),
         camera=task.camera or names.get('camera', ''),
-        is_passing=is_passing,
     )
 
 
@@ -135,21 +137,6 @@ def _custom_data(metadata: Path) -> dict[str, str]:
         return {name: value for name, value in found.items() if isinstance(value, str)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
-
-
-def _kept(row: Row, products: Mapping[str, str], task: Task) -> Row:
-    """The row after the products are written; a failure that passes if they cannot be."""
-    try:
-        # A worker of a cluster would make a folder of its own, in which nobody looks.
-        if not places.is_remote(task.table) and not os.path.isdir(task.table):
-            raise FileNotFoundError(2, _NOT_SEEN)
-        folder = places.join(posixpath.dirname(task.table), KEPT_FOLDER)
-        for name, text in products.items():
-            places.write(places.join(folder, f'{kept_name(row)}/{name}'), text.encode())
-    except (OSError, ProductError) as error:
-        reason = f'{task.table}: cannot be written: {getattr(error, "strerror", "") or error}'
-        return failed(task, f'{socket.gethostname()}: {reason}', is_passing=True)
-    return row
 
 
 def _recorded(path: Path) -> tuple[Calibration, float]:

@@ -1,9 +1,10 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Files by path or by any URL of fsspec (``s3://``, ``gs://``, ``file://``): listed, read, written.
+Files by path or by any URL of fsspec (``s3://``, ``gs://``, ``file://``): listed and fetched.
 
 A local file is named by its absolute path.  Whatever fails is an `OSError`, of an object store
-too, so callers tell a place that cannot be reached from a file that is bad.
+too, so callers tell a place that cannot be reached from a file that is bad.  The client of a store
+tries again where a connection is dropped; here all its attempts together have a limit of time.
 """
 
 from __future__ import annotations
@@ -12,15 +13,11 @@ from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
 import errno
-import itertools
 import os
 from pathlib import Path
 import posixpath
 import tempfile
 from typing import Any, TYPE_CHECKING
-
-from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.untrusted import read_bytes
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
@@ -29,7 +26,9 @@ _ETAGS = ('ETag', 'etag', 'md5Hash')  # of S3, Google and Azure
 _TIMES = ('LastModified', 'last_modified', 'updated', 'mtime', 'created')
 _LONGEST_REASON = 200
 _TOGETHER = 100_000  # files that are listed at once: 0.2 GB in the clients of stores
-_OBJECT_STORES = {'s3', 'gs', 'abfs'}
+ANSWER_S = 60.0  # for a request and all its repetitions
+LIST_S = 300.0  # for a list: a hundred requests in turn
+_SLOWEST = 64 * 1024  # bytes a second of the largest file
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +63,6 @@ def join(folder: str, name: str) -> str:
     return posixpath.join(folder, name) if name else folder
 
 
-def entries(root: str) -> list[Entry]:
-    """Files below a root, in order of their names; raises OSError."""
-    if not is_remote(root):
-        return sorted(itertools.chain(*listings(root)), key=lambda entry: entry.name)
-    with _remote(root) as (fs, base):
-        fs.invalidate_cache()
-        return _remote_entries(fs, base, fs.find(base, detail=True))
-
-
 def listings(root: str) -> Iterator[list[Entry]]:
     """
     Files below a root in lists, each with all files of a folder or none; raises OSError.
@@ -84,41 +74,27 @@ def listings(root: str) -> Iterator[list[Entry]]:
     if not is_remote(root):
         for folder, folders, files in os.walk(root):
             folders.sort()
-            # A folder in place of a calibration or a table is a file that cannot be read.
-            files += (name for name in folders if name.endswith(('.json', '.parquet')))
+            # A folder in place of a calibration is a file that cannot be read.
+            files += (name for name in folders if name.endswith('.json'))
             yield _local_entries(root, folder, sorted(files))
         return
     with _remote(root) as (fs, base):
         fs.invalidate_cache()
-        top, found = base, fs.ls(base, detail=True)
+        limits = {'detail': True, **_within(fs, LIST_S)}
+        top, infos = base, fs.ls(base, **limits)
         # The marker of an empty folder has the name of the folder.
-        while [i['type'] for i in found] == ['directory'] and len(found[0]['name']) > len(top):
-            top = found[0]['name']
-            found = fs.ls(top, detail=True)
-        below = [info['name'] for info in found if info['type'] == 'directory']
-        if not below or len(below) * len(fs.find(below[0])) < _TOGETHER:
-            yield _remote_entries(fs, base, fs.find(top, detail=True))
+        while [i['type'] for i in infos] == ['directory'] and len(infos[0]['name']) > len(top):
+            top = infos[0]['name']
+            infos = fs.ls(top, **limits)
+        below = [info['name'] for info in infos if info['type'] == 'directory']
+        if not below or len(below) * len(fs.find(below[0], **limits)) < _TOGETHER:
+            yield _remote_entries(fs, base, fs.find(top, **limits))
             return
-        files_here = {info['name']: info for info in found if info['type'] != 'directory'}
+        files_here = {info['name']: info for info in infos if info['type'] != 'directory'}
         yield _remote_entries(fs, base, files_here)
-        for below_one in below:
+        for folder in below:
             fs.invalidate_cache()  # it keeps each listing
-            yield _remote_entries(fs, base, fs.find(below_one, detail=True))
-
-
-def make_folder(folder: str) -> None:
-    """
-    Make a folder where there is none; raises OSError.
-
-    A remote one is written to, so that a wrong bucket or missing rights end a run at its start.
-    """
-    if not is_remote(folder):
-        os.makedirs(folder, exist_ok=True)
-        return
-    probe = join(folder, '_probe')
-    write(probe, b'')
-    with contextlib.suppress(FileNotFoundError):  # another run has removed it
-        remove(probe)
+            yield _remote_entries(fs, base, fs.find(folder, **limits))
 
 
 def exists(place: str) -> bool:
@@ -126,49 +102,11 @@ def exists(place: str) -> bool:
     if not is_remote(place):
         return os.path.exists(place)
     with _remote(place) as (fs, path):
-        return bool(fs.exists(path))
-
-
-def read(url: str, most_bytes: int) -> bytes:
-    """
-    Content of a file.
-
-    Raises OSError when it cannot be read. Raises ValueError in one line, for one that is not
-    regular or is too large.
-    """
-    if not is_remote(url):
-        return read_bytes(Path(url), most_bytes)
-    with _remote(url) as (fs, path):
-        content = fs.cat_file(path) if fs.size(path) <= most_bytes else None
-    if content is None:
-        raise ValueError(f'larger than {most_bytes // 1024} kB')
-    return bytes(content)
-
-
-def write(url: str, content: bytes) -> None:
-    """Write a file whole, with the folders above it; raises OSError or ProductError."""
-    if not is_remote(url):
-        os.makedirs(os.path.dirname(url), exist_ok=True)
-        write_atomically(Path(url), content)
-        return
-    with _remote(url) as (fs, path):
-        # An object store has no folders, and would make the bucket of a mistyped URL.
-        if not _OBJECT_STORES.intersection(_protocols(fs)):
-            fs.makedirs(posixpath.dirname(path), exist_ok=True)
-        fs.pipe_file(path, content)
-
-
-def remove(url: str) -> None:
-    """Remove a file; raises OSError."""
-    if not is_remote(url):
-        os.unlink(url)
-        return
-    with _remote(url) as (fs, path):
-        fs.rm_file(path)
+        return bool(fs.exists(path, **_within(fs, ANSWER_S)))
 
 
 @contextlib.contextmanager
-def fetched(url: str, files: Sequence[str]) -> Iterator[Path]:
+def fetched(url: str, files: Sequence[str], size_bytes: int) -> Iterator[Path]:
     """
     The path of a file or folder of which ``files`` are read, while the block runs.
 
@@ -181,10 +119,11 @@ def fetched(url: str, files: Sequence[str]) -> Iterator[Path]:
     above = posixpath.dirname(url)
     with tempfile.TemporaryDirectory(prefix='starcal-') as folder:
         with _remote(url) as (fs, _):
+            limit = _within(fs, ANSWER_S + size_bytes / _SLOWEST)
             for file in files:
                 here = Path(folder, posixpath.relpath(file, above))
                 here.parent.mkdir(parents=True, exist_ok=True)
-                fs.get_file(fs._strip_protocol(file), str(here))
+                fs.get_file(fs._strip_protocol(file), str(here), **limit)
         yield Path(folder, posixpath.basename(url))
 
 
@@ -223,21 +162,25 @@ def _identity(info: dict[str, Any]) -> str:
 @contextlib.contextmanager
 def _remote(url: str) -> Iterator[tuple[AbstractFileSystem, str]]:
     """The file system of a URL and the path there; failures of its client become OSError."""
-    import fsspec
+    import fsspec.exceptions
 
     try:
         yield fsspec.core.url_to_fs(url)
+    except fsspec.exceptions.FSTimeoutError as error:
+        raise OSError(errno.ETIMEDOUT, 'no answer in time', url) from error
     # Each client of an object store has exceptions of its own, or leaves out the reason.
     except Exception as error:
         if isinstance(error, OSError) and error.strerror:
             raise
+        if isinstance(cause := error.__cause__, ModuleNotFoundError):  # the client
+            raise ModuleNotFoundError(str(cause), name=cause.name) from error
         code = errno.ENOENT if isinstance(error, FileNotFoundError) else errno.EIO
-        raise OSError(code, _reason(error), url) from error
+        words = ' '.join(f'{type(error).__name__}: {error}'.split())
+        raise OSError(code, words[:_LONGEST_REASON], url) from error
 
 
-def _protocols(fs: AbstractFileSystem) -> tuple[str, ...]:
-    return (fs.protocol,) if isinstance(fs.protocol, str) else tuple(fs.protocol)
+def _within(fs: AbstractFileSystem, limit_s: float) -> dict[str, float]:
+    """Argument that limits a request, for the clients that take one: those of object stores."""
+    from fsspec.asyn import AsyncFileSystem
 
-
-def _reason(error: Exception) -> str:
-    return ' '.join(f'{type(error).__name__}: {error}'.split())[:_LONGEST_REASON]
+    return {'timeout': limit_s} if isinstance(fs, AsyncFileSystem) else {}

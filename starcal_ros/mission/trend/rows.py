@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import hashlib
 import math
 import posixpath
 from typing import Annotated
@@ -23,12 +24,9 @@ from starcal_ros.text import printable
 from starcal_ros.untrusted import check_text
 
 RECORDED, COMPUTED, FAILED = 'recorded', 'computed', 'failed'
-PARTITIONS = ('spacecraft', 'camera')
-NO_NAME = '-'  # a value must be there: readers infer the type of a column from it
-START = 16  # characters of a digest that name one of the same size
 _LONGEST = 20_000  # characters of a text: a path has 4096, each of up to four after `printable`
 _LONGEST_ERROR = 2000
-_LONGEST_NAME = 100  # of a bag in the name of a folder
+_LONGEST_NAME, _LONGEST_KEY = 100, 16  # of a bag, and of its key, in the name of a folder
 _MOST, _LEAST = 1e15, 1e-30  # of a number whose square and its inverse must stay finite
 
 
@@ -167,23 +165,24 @@ def row_of(
     )
 
 
-def folder_of(*camera: str) -> str:
-    """Folder of a camera in the form of Hive, which readers of Parquet take columns from."""
-    values = [urllib.parse.quote(value, safe=' ') or NO_NAME for value in camera]
-    return '/'.join(f'{name}={value}' for name, value in zip(PARTITIONS, values, strict=True))
-
-
 def kept_name(row: Row) -> str:
     """Path of the folder of a bag below the folder of kept calibrations."""
-    bag = urllib.parse.quote(posixpath.basename(row.path).removesuffix('.mcap'))
-    return f'{folder_of(row.spacecraft, row.camera)}/{bag[:_LONGEST_NAME]}-{row.key[:START]}'
+    bag = posixpath.basename(row.path).removesuffix('.mcap')
+    spacecraft, camera, bag = (
+        urllib.parse.quote(name, safe=' ') for name in (row.spacecraft, row.camera, bag)
+    )
+    series = f'spacecraft={spacecraft or "-"}/camera={camera or "-"}'
+    return f'{series}/{bag[:_LONGEST_NAME]}-{row.key[:_LONGEST_KEY]}'
 
 
-def failure(key: str, path: str, error: str) -> Row:
-    """Row of a calibration or bag that this version cannot use."""
-    text = printable(' '.join(error.split()) or 'failed')
+def failure(url: str, error: str) -> Row:
+    """Row of a calibration or bag that this version cannot use; a file has one at a time."""
     return Row(
-        key, printable(path), FAILED, text[:_LONGEST_ERROR], f'starcal {software_version()}'
+        key=hashlib.sha256(repr(url).encode()).hexdigest(),
+        path=printable(url),
+        kind=FAILED,
+        error=printable(' '.join(error.split()) or 'failed')[:_LONGEST_ERROR],
+        software=f'starcal {software_version()}',
     )
 
 

@@ -57,11 +57,7 @@ class Task:
     spacecraft, camera : str
         From the table or the pattern of cameras; empty: from the metadata of the bag.
     known : tuple of str
-        Starts of digests in the table of which one may be that of this content.
-    table : str
-        Folder or URL of the table that calibrations of bags are kept beside; empty: not kept.
-    with_report : bool
-        True if the report of a bag is kept as well.
+        Keys in the table of which one may be that of this content.
     """
 
     url: str
@@ -74,8 +70,6 @@ class Task:
     spacecraft: str = ''
     camera: str = ''
     known: tuple[str, ...] = ()
-    table: str = ''
-    with_report: bool = False
 
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.mission.trend import places
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.mission.trend.overview import Overview, overview_of, swapped_with
 from starcal_ros.mission.trend.rows import Row
 from starcal_ros.mission.trend.series import (
@@ -63,7 +63,7 @@ _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axi
 class Page:
     """Path of a page, calibrations on it and their span; failures, and of the first their rows."""
 
-    path: str
+    path: Path
     calibrations: int
     years: float
     failed: int
@@ -81,7 +81,7 @@ class _Judged:
 
 
 def write_page(
-    cameras: Iterable[Sequence[Row]], camera_count: int, folder: str, root: str
+    cameras: Iterable[Sequence[Row]], camera_count: int, folder: Path, root: str
 ) -> Page:
     """
     Write ``trend.html`` from the rows of one camera after the other.
@@ -117,8 +117,8 @@ def write_page(
         count=count,
         max_p_value=f'{max_p_value:.2g}',
     )
-    path = places.join(folder, TREND_FILE)
-    places.write(path, text.encode())
+    path = folder / TREND_FILE
+    write_atomically(path, text)
     span_ns = max(times) - min(times) if times else 0
     years = span_ns / NANOSECONDS_PER_SECOND / SECONDS_PER_YEAR
     return Page(path, count, years, failed, tuple(failures))

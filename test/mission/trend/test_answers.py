@@ -11,13 +11,13 @@ from unittest import mock
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
 
+from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.mission.trend import fleet, tasks
-from starcal_ros.mission.trend.answers import compute
-from starcal_ros.mission.trend.rows import COMPUTED, FAILED, kept_name, Row, row_of
+from starcal_ros.mission.trend.answers import Answer
+from starcal_ros.mission.trend.rows import COMPUTED, FAILED, failure, kept_name, Row, row_of
 from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table
-from starcal_ros.report import page
 
 CAMERAS = Cameras(params=str(TINY / 'params.yaml'))
 
@@ -31,43 +31,45 @@ def task(tmp_path: Path) -> Task:
 
 
 @pytest.mark.slow
-def test_each_computed_row_has_its_calibration_after_any_kill(tmp_path: Path, task: Task) -> None:
-    # The worker ends between the calibration and its row.
-    assert isinstance(compute(dataclasses.replace(task, table=Table(tmp_path).folder)), Row)
+def test_each_computed_row_has_its_calibration_after_any_kill(
+    tmp_path: Path, task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:  # the run ends between the calibration and its row
+        patch.setattr(Table, 'add', mock.Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            fleet.update(Table(tmp_path), [task])
     assert Table(tmp_path).rows() == [] and len(kept(tmp_path)) == 1
     found = list(tasks.find(str(tmp_path), CAMERAS))  # that calibration is no task
     assert [one.url for one in found] == [task.url]
-    with Table(tmp_path) as table:
-        assert fleet.update(table, [task], with_reports=True).computed == 1
+    assert fleet.update(Table(tmp_path), [task]) == fleet.Done(computed=1)
     (row,) = Table(tmp_path).rows()
-    names = [f'{kept_name(row)}/{name}' for name in ('calibration.json', 'report.html')]
-    assert kept(tmp_path) == names
-    text = (tmp_path / KEPT_FOLDER / names[1]).read_text()
-    assert 'Residual' in text and '@sha256' not in text
-    assert kept_name(row).startswith('spacecraft=sat 1/camera=nav/2026-01-')
-    calibration = read_calibration(tmp_path / KEPT_FOLDER / names[0])
+    name = f'{kept_name(row)}/calibration.json'
+    assert kept(tmp_path) == [name]
+    assert name.startswith('spacecraft=sat 1/camera=nav/2026-01-')
+    calibration = read_calibration(tmp_path / KEPT_FOLDER / name)
     again = row_of(calibration, row.key, row.path, COMPUTED, row.temperature_degc)
     assert (again.values, again.sigmas) == (row.values, row.sigmas)
     assert calibration.covariance.shape == (len(row.sigmas),) * 2
 
 
 @pytest.mark.slow
-def test_a_page_that_cannot_be_drawn_fails_its_bag_alone(tmp_path: Path, task: Task) -> None:
-    table = Table(tmp_path)
-    task = dataclasses.replace(task, table=table.folder, with_report=True)
-    with mock.patch.object(page, '_context', side_effect=RuntimeError('no figure')):
-        row = compute(task)
-    assert isinstance(row, Row)
-    assert row.error == f'{task.url}: the products cannot be drawn: RuntimeError: no figure'
-    assert not row.is_passing and row.stamp == task.stamp
+def test_a_copy_of_a_bag_keeps_one_calibration(tmp_path: Path) -> None:
+    for name in ('one', 'copy'):
+        shutil.copytree(TINY, tmp_path / name)
+    found = list(tasks.find(str(tmp_path), CAMERAS))
+    copy = fleet.update(Table(tmp_path), [*found])
+    assert copy == fleet.Done(computed=1, known=1) and len(kept(tmp_path)) == 1
 
 
-@pytest.mark.slow
-def test_a_worker_that_does_not_see_the_table_keeps_nothing(tmp_path: Path, task: Task) -> None:
-    table = tmp_path / 'not mounted/trend.parquet'
-    row = compute(dataclasses.replace(task, table=str(table)))
-    assert isinstance(row, Row) and row.is_passing and not table.parent.exists()
-    assert f'{table}: cannot be written: not seen by this worker; mount it' in row.error
+def test_a_place_for_calibrations_that_cannot_be_written_ends_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / KEPT_FOLDER).touch()
+    bag = Answer('a', failure('/bag', ''), '{}')
+    monkeypatch.setattr(fleet, 'compute', lambda _: bag)
+    with pytest.raises(ProductError, match='cannot be created'):
+        fleet.update(Table(tmp_path), [Task('/bag', '1', ())])
+    assert Table(tmp_path).rows() == []
 
 
 def test_a_name_of_a_bag_is_one_folder() -> None:

@@ -45,7 +45,7 @@ def test_of_200_cameras_those_that_changed_are_named(seed: int, tmp_path: Path) 
     of_month = {name: months(truth) for name, truth in truths.items()}
     of_month[swapped][13:] = of_month[other][13:]
     fleet = [simulated_rows(name, of_month[name], rng) for name in names]
-    write_page(fleet, len(fleet), str(tmp_path), 'fleet')
+    write_page(fleet, len(fleet), tmp_path, 'fleet')
     found = found_in((tmp_path / 'trend.html').read_text())
     expected = dict.fromkeys(drifted, 'drift') | dict.fromkeys((stepped, shaken), 'step')
     assert found == expected | {swapped: f'parameters of {other}, nav'}
@@ -69,7 +69,7 @@ def test_300_cameras_are_searched_and_sorted_on_a_page_of_5_kilobytes_each(tmp_p
     rng = np.random.default_rng(31)
     truths = {f'sat{k:04d}': simulated_truth(rng) for k in range(300)}
     fleet = (simulated_rows(name, months(truth), rng) for name, truth in truths.items())
-    page = write_page(fleet, len(truths), str(tmp_path), 'fleet')
+    page = write_page(fleet, len(truths), tmp_path, 'fleet')
     text = (tmp_path / 'trend.html').read_text()
     assert page.calibrations == 300 * MONTHS and len(text.encode()) < 300 * 5_000
     assert text.count('<tr><td class="text">sat') == 300 and 'id="search"' in text
@@ -96,7 +96,7 @@ def test_a_browser_searches_and_sorts_the_cameras(tmp_path: Path) -> None:
     rng = np.random.default_rng(34)
     counts = {'sat2': 10, 'sat10': 9, 'sat1': 7}
     rows = [simulated_rows(k, months(simulated_truth(rng), n), rng) for k, n in counts.items()]
-    write_page(rows, len(rows), str(tmp_path), 'fleet')
+    write_page(rows, len(rows), tmp_path, 'fleet')
     page = (tmp_path / 'trend.html').read_text()
     used = tmp_path / 'used.html'
     used.write_text(page.replace('</body>', f'{_USE}</body>'))
