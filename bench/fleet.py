@@ -25,10 +25,10 @@ from bench.table import Table, verdict
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend import fleet, tasks
+from starcal_ros.mission.trend import fleet
+from starcal_ros.mission.trend.fleet import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.rows import COMPUTED, kept_name, Row
 from starcal_ros.mission.trend.series import SECONDS_PER_YEAR
-from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table as Rows
 
 LEAST_EFFICIENCY = 0.85
@@ -87,7 +87,7 @@ def of_bags(folder: Path, count: int, alone: int) -> Table:
     """One bag after another alone, then all: a client that is killed, and one that goes on."""
     root, output = folder / 'fleet', folder / 'out'
     copy_bags(root, count)
-    found = list(tasks.find(str(root), Cameras(params=str(_PARAMS))))
+    found = list(fleet.find(str(root), Cameras(params=str(_PARAMS))))
     before_s = one_bag_s(found[:alone], folder / 'before')
     watch = Watch(kill_at=count // 4)
     start_s = time.perf_counter()
@@ -144,7 +144,7 @@ def nothing_new(folder: Path, cameras: int, each: int) -> tuple[float, float]:
         path = folder / f'fleet/{name}/{k:03d}/calibration.json'
         path.parent.mkdir(parents=True)
         path.touch()
-    found = tasks.find(str(folder / 'fleet'), Cameras())
+    found = fleet.find(str(folder / 'fleet'), Cameras())
     (folder / 'out').mkdir()
     table = Rows(folder / 'out')
     with table.transaction():

@@ -27,11 +27,10 @@ import numpy as np
 from bench.fleet import simulated_rows, simulated_truth
 from bench.table import Table
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend import fleet, places, tasks, trend_page
-from starcal_ros.mission.trend.answers import Answer
+from starcal_ros.mission.trend import fleet, places, trend_page
+from starcal_ros.mission.trend.fleet import Answer, Cameras, Task
 from starcal_ros.mission.trend.places import Entry
 from starcal_ros.mission.trend.rows import Row
-from starcal_ros.mission.trend.tasks import Cameras, Task
 from starcal_ros.mission.trend.trend_table import Table as Rows
 
 _PARAMS = Path(__file__).parents[1] / 'bags/tiny/params.yaml'
@@ -56,7 +55,7 @@ def run(cameras: int, days: int, with_page: bool) -> Table:
                 mock.patch.object(places, 'listings', listings),
                 mock.patch.object(fleet, 'compute', functools.partial(answer, rows)),
             ):
-                done = fleet.update(table, tasks.find(_ROOT, _NAMES))
+                done = fleet.update(table, fleet.find(_ROOT, _NAMES))
             if with_page:
                 with step(add, 'page'):
                     trend_page.write_page(table.cameras(), len(names), Path(folder), _ROOT)
@@ -130,7 +129,7 @@ def write_table(folder: Path, names: Sequence[str], rows: Sequence[Row]) -> None
     """Write the table that runs on each of the days leave."""
     table, listings = Rows(folder), functools.partial(listings_of, names, len(rows))
     with table.transaction(), mock.patch.object(places, 'listings', listings):
-        for task in tasks.find(_ROOT, _NAMES):
+        for task in fleet.find(_ROOT, _NAMES):
             row = answer(rows, task).row
             assert row
             table.add(row)

@@ -8,16 +8,15 @@ import os
 from pathlib import Path
 import signal
 
-from starcal_ros.mission.trend import answers
-from starcal_ros.mission.trend.answers import Answer
-from starcal_ros.mission.trend.tasks import Task
+from starcal_ros.mission.trend import fleet
+from starcal_ros.mission.trend.fleet import Answer, Task
 
 
 def kill_on_poison(task: Task) -> Answer:
     """Answer to a task; a poisonous one kills the process that it runs in."""
     if task.url.startswith('poison'):
         os.kill(os.getpid(), signal.SIGKILL)
-    return answers.compute(task)
+    return fleet.compute(task)
 
 
 def kill_once(task: Task) -> Answer:
@@ -26,6 +25,6 @@ def kill_once(task: Task) -> Answer:
     try:
         marker.unlink()
     except FileNotFoundError:
-        return answers.compute(dataclasses.replace(task, params=''))
+        return fleet.compute(dataclasses.replace(task, params=''))
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError

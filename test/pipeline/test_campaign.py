@@ -17,9 +17,9 @@ import yaml
 import starcal_ros
 from starcal_ros.cli.main import main
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.mission.trend import answers, tasks
+from starcal_ros.mission.trend import fleet
+from starcal_ros.mission.trend.fleet import Cameras
 from starcal_ros.mission.trend.rows import Row
-from starcal_ros.mission.trend.tasks import Cameras
 from starcal_ros.records import Calibration
 
 pytestmark = pytest.mark.slow
@@ -68,8 +68,8 @@ def by_python(bag: Path) -> Mapping[str, Any]:
 
 def by_trend(bag: Path) -> Mapping[str, Any]:
     """Numbers of the row of `starcal trend`."""
-    (task,) = tasks.find(str(bag), Cameras(params=str(bag / 'params.yaml')))
-    row = answers.compute(task)
+    (task,) = fleet.find(str(bag), Cameras(params=str(bag / 'params.yaml')))
+    row = fleet.compute(task).row
     assert isinstance(row, Row) and not row.error, row
     sigmas = dict(zip(row.names, row.sigmas, strict=False))
     return {'images': row.images, 'values': row.values, 'sigma of fx': sigmas['fx']}

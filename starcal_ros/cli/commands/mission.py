@@ -169,7 +169,7 @@ def _catalog(args: argparse.Namespace) -> int:
 def _trend(args: argparse.Namespace) -> int:
     """Follow calibrations over years."""
     from starcal_ros.mission.trend import fleet, places, trend_page
-    from starcal_ros.mission.trend.tasks import find, read_cameras, Task
+    from starcal_ros.mission.trend.fleet import find, read_cameras, Task
     from starcal_ros.mission.trend.trend_table import Table
 
     root, cameras = places.absolute(args.root), read_cameras(args.cameras, args.params)

@@ -16,9 +16,8 @@ import pytest
 from trend_missions import make_mission, trend, write  # type: ignore[import-not-found]
 
 from starcal_ros.cli.main import main
-from starcal_ros.mission.trend import answers, fleet, places, tasks
-from starcal_ros.mission.trend.answers import Answer
-from starcal_ros.mission.trend.tasks import Cameras, Task
+from starcal_ros.mission.trend import fleet, places
+from starcal_ros.mission.trend.fleet import Answer, Cameras, Task
 from starcal_ros.mission.trend.trend_table import Table
 
 
@@ -36,8 +35,7 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
     def unread(*_: object) -> None:
         raise AssertionError('a file is read')
 
-    monkeypatch.setattr(tasks, 'digest', unread)
-    monkeypatch.setattr(answers, 'digest', unread)
+    monkeypatch.setattr(fleet, 'digest', unread)
     monkeypatch.setattr(fleet, 'compute', unread)
     assert trend(mission) == 0
     assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
@@ -47,10 +45,10 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
 def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypatch) -> None:
     shutil.copytree(TINY, tmp_path / 'fleet/one')
     cameras = Cameras(params=str(TINY / 'params.yaml'))
-    fleet.update(Table(tmp_path), tasks.find(str(tmp_path / 'fleet'), cameras))
+    fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
     os.utime(tmp_path / 'fleet/one/tiny_0.mcap', (5, 5))
-    monkeypatch.setattr(answers, '_calibrated', lambda *_: pytest.fail('calibrated again'))
-    done = fleet.update(Table(tmp_path), tasks.find(str(tmp_path / 'fleet'), cameras))
+    monkeypatch.setattr(fleet, '_calibrated', lambda *_: pytest.fail('calibrated again'))
+    done = fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
     assert done == fleet.Done(known=1)
 
 
@@ -62,9 +60,9 @@ def test_three_thousand_known_files_are_passed_over_in_6_s(tmp_path: Path) -> No
     for k in range(3_000):
         (tmp_path / f'fleet/{k:05d}').mkdir(parents=True)
         (tmp_path / f'fleet/{k:05d}/calibration.json').write_bytes(content)
-    found = list(tasks.find(str(tmp_path / 'fleet'), Cameras()))
-    (task,) = tasks.find(str(tmp_path / 'one'), Cameras())
-    first = answers.compute(task).row
+    found = list(fleet.find(str(tmp_path / 'fleet'), Cameras()))
+    (task,) = fleet.find(str(tmp_path / 'one'), Cameras())
+    first = fleet.compute(task).row
     assert first
     (tmp_path / 'out').mkdir()
     table = Table(tmp_path / 'out')
@@ -72,7 +70,7 @@ def test_three_thousand_known_files_are_passed_over_in_6_s(tmp_path: Path) -> No
         for k, task in enumerate(found):
             table.add(dataclasses.replace(first, key=f'{k:064d}'[::-1], stamp=task.stamp))
     start_s = time.process_time()
-    again = list(tasks.find(str(tmp_path / 'fleet'), Cameras()))
+    again = list(fleet.find(str(tmp_path / 'fleet'), Cameras()))
     done = fleet.update(Table(tmp_path / 'out'), again)
     assert done == fleet.Done(known=3_000)
     assert time.process_time() - start_s < 6.0
@@ -81,7 +79,7 @@ def test_three_thousand_known_files_are_passed_over_in_6_s(tmp_path: Path) -> No
 def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(
     mission: Path, monkeypatch
 ) -> None:
-    found = list(tasks.find(str(mission), Cameras()))
+    found = list(fleet.find(str(mission), Cameras()))
     away = mission.rename(mission.parent / 'unmounted')
     assert fleet.update(Table(mission.parent), found) == fleet.Done(failed=8)
     row = Table(mission.parent).rows()[0]
@@ -90,10 +88,11 @@ def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(
     # After the files that were not tried before: those that never answer hold up no others.
     new = dataclasses.replace(found.pop(), stamp='new')
     computed: list[Task] = []
+    compute = fleet.compute
 
     def noted(task: Task) -> Answer:
         computed.append(task)
-        return answers.compute(task)
+        return compute(task)
 
     monkeypatch.setattr(fleet, 'compute', noted)
     assert fleet.update(Table(mission.parent), [*found, new]) == fleet.Done(computed=8)
@@ -149,8 +148,8 @@ def test_an_unknown_protocol_is_one_line(tmp_path: Path, capsys) -> None:
 
 
 def test_content_that_the_table_has_is_no_new_row(mission: Path) -> None:
-    first, *_ = tasks.find(str(mission), Cameras())
-    answer = answers.compute(first)
+    first, *_ = fleet.find(str(mission), Cameras())
+    answer = fleet.compute(first)
     assert answer.row and answer.row.stamp == first.stamp and answer.row.key == answer.key
     known = dataclasses.replace(first, known=(answer.key,))
-    assert answers.compute(known) == Answer(answer.key)
+    assert fleet.compute(known) == Answer(answer.key)

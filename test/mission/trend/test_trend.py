@@ -18,10 +18,9 @@ from trend_missions import make_mission, trend, write  # type: ignore[import-not
 
 from starcal_ros.cli.main import main
 from starcal_ros.formats.products.calibration_json import write_calibration
-from starcal_ros.mission.trend import answers, fleet, tasks
-from starcal_ros.mission.trend.answers import Answer
+from starcal_ros.mission.trend import fleet
+from starcal_ros.mission.trend.fleet import Answer, Cameras, Task
 from starcal_ros.mission.trend.rows import COMPUTED
-from starcal_ros.mission.trend.tasks import Cameras, Task
 from starcal_ros.mission.trend.trend_table import Table
 
 
@@ -44,7 +43,7 @@ def test_only_what_is_new_is_computed(mission: Path, capsys, monkeypatch) -> Non
     assert '8 new, 0 known, 0 failed' in capsys.readouterr().out
     write(mission / 'later/deep', 100)
     called: list[Task] = []
-    compute = answers.compute
+    compute = fleet.compute
 
     def counted(task: Task) -> Answer:
         called.append(task)
@@ -210,7 +209,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys, line: str, words: str) ->
 @pytest.mark.slow
 def test_a_bag_that_kills_its_worker_costs_itself(mission: Path, monkeypatch) -> None:
     poison = [Task(f'poison {k}', f'poison {k}', (), size=-1) for k in range(2)]
-    found = [poison[0], *tasks.find(str(mission), Cameras()), poison[1]]
+    found = [poison[0], *fleet.find(str(mission), Cameras()), poison[1]]
     monkeypatch.setattr(fleet, 'compute', kill_on_poison)
     table = Table(mission.parent)
     assert fleet.update(table, found, workers=2) == fleet.Done(computed=8, failed=2)
@@ -223,7 +222,7 @@ def test_a_worker_killed_in_the_run_loses_and_doubles_nothing(mission, monkeypat
     marker = mission.parent / 'marker'
     marker.touch()
     found = [
-        dataclasses.replace(t, params=str(marker)) for t in tasks.find(str(mission), Cameras())
+        dataclasses.replace(t, params=str(marker)) for t in fleet.find(str(mission), Cameras())
     ]
     monkeypatch.setattr(fleet, 'compute', kill_once)
     done = fleet.update(Table(mission.parent), found, workers=2)

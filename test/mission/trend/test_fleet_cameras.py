@@ -13,8 +13,8 @@ from trend_missions import write  # type: ignore[import-not-found]
 
 from starcal_ros.cli.main import main
 from starcal_ros.errors import StarcalError
+from starcal_ros.mission.trend.fleet import Cameras, read_cameras
 from starcal_ros.mission.trend.series import groups
-from starcal_ros.mission.trend.tasks import Cameras, read_cameras
 from starcal_ros.mission.trend.trend_table import Table
 
 

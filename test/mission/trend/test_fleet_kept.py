@@ -13,10 +13,9 @@ import pytest
 
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.calibration_json import read_calibration
-from starcal_ros.mission.trend import fleet, tasks
-from starcal_ros.mission.trend.answers import Answer
+from starcal_ros.mission.trend import fleet
+from starcal_ros.mission.trend.fleet import Answer, Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.rows import COMPUTED, FAILED, failure, kept_name, Row, row_of
-from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table
 
 CAMERAS = Cameras(params=str(TINY / 'params.yaml'))
@@ -26,7 +25,7 @@ CAMERAS = Cameras(params=str(TINY / 'params.yaml'))
 def task(tmp_path: Path) -> Task:
     """The one bag of a fleet whose folder is that of the output as well."""
     shutil.copytree(TINY, tmp_path / 'sat 1/2026-01')
-    (found,) = tasks.find(str(tmp_path), CAMERAS)
+    (found,) = fleet.find(str(tmp_path), CAMERAS)
     return dataclasses.replace(found, spacecraft='sat 1', camera='nav')
 
 
@@ -39,7 +38,7 @@ def test_each_computed_row_has_its_calibration_after_any_kill(
         with pytest.raises(KeyboardInterrupt):
             fleet.update(Table(tmp_path), [task])
     assert Table(tmp_path).rows() == [] and len(kept(tmp_path)) == 1
-    found = list(tasks.find(str(tmp_path), CAMERAS))  # that calibration is no task
+    found = list(fleet.find(str(tmp_path), CAMERAS))  # that calibration is no task
     assert [one.url for one in found] == [task.url]
     assert fleet.update(Table(tmp_path), [task]) == fleet.Done(computed=1)
     (row,) = Table(tmp_path).rows()
@@ -56,7 +55,7 @@ def test_each_computed_row_has_its_calibration_after_any_kill(
 def test_a_copy_of_a_bag_keeps_one_calibration(tmp_path: Path) -> None:
     for name in ('one', 'copy'):
         shutil.copytree(TINY, tmp_path / name)
-    found = list(tasks.find(str(tmp_path), CAMERAS))
+    found = list(fleet.find(str(tmp_path), CAMERAS))
     copy = fleet.update(Table(tmp_path), [*found])
     assert copy == fleet.Done(computed=1, known=1) and len(kept(tmp_path)) == 1
 
