@@ -30,7 +30,7 @@ from starcal_ros.formats.messages.message_fields import Message, nearest_stamp_n
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
-from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
+from starcal_ros.untrusted import METADATA_BYTES, read_text, regular_file, yaml_value
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
 _MAGIC_BYTES = 16
@@ -82,14 +82,12 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
-        elif path.exists():  # opening a pipe would wait for its writer
-            if not path.is_file():
-                raise BagError(f'{path}: not a regular file')
+        elif path.exists():
             files.append(path)
         else:
             raise BagError(f'{path}: no such bag')
     for file in files:
-        with errors_as(BagError, file), file.open('rb') as stream:
+        with errors_as(BagError, file), regular_file(file) as stream:
             magic = stream.read(_MAGIC_BYTES)
         if not magic.startswith(MAGIC):
             other = _how_to_convert(file, magic) or _HOW_TO_IMPORT
