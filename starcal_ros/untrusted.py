@@ -1,11 +1,12 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The door for text from outside: bounded regular files, strict YAML and JSON, plain values only.
+The door for files from outside: bounded regular files, strict YAML and JSON, plain values only.
 
-Parameter files, camera files, ``metadata.yaml`` and ``calibration.json`` are read here, before
-any code looks at their values.  Values are None, bool, int, float, str, list, and dict with str
-keys.  Refused are duplicate keys, keys that are no text, numbers of over 400 digits, deep nesting,
-NUL characters, lone surrogates, YAML aliases, and the YAML tags that construct objects.
+Every file of a user is opened here.  Parameter files, camera files, ``metadata.yaml`` and
+``calibration.json`` are read here, before any code looks at their values.  Values are None, bool,
+int, float, str, list, and dict with str keys.  Refused are duplicate keys, keys that are no text,
+numbers of over 400 digits, deep nesting, NUL characters, lone surrogates, YAML aliases, and the
+YAML tags that construct objects.
 
 YAML differs from PyYAML in two points, as the parser of rcl does: ``1e-6`` is a number, and dates
 stay texts.
@@ -14,7 +15,7 @@ stay texts.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import contextlib
 import json
 import os
@@ -22,12 +23,14 @@ from pathlib import Path
 import re
 import stat
 from typing import Any, IO
+import zipfile
 
 import yaml
 
 PARAMETER_BYTES = 256 * 1024  # of a parameter or camera file: thirty times the longest in use
 METADATA_BYTES = 4 * 1024 * 1024  # 5000 topics
 PRODUCT_BYTES = 8 * 1024 * 1024  # a calibration.json with the covariance of a field has 1 MB
+ARCHIVE_BYTES = 1 << 30  # of a catalog or of residuals, also inflated: 30 million stars
 
 _DEPTH = 32
 _VALUES = 100_000  # of a YAML document; containers of a JSON document
@@ -78,6 +81,34 @@ def read_bytes(path: Path, most_bytes: int, follow_links: bool = True) -> bytes:
     if len(content) > most_bytes:
         raise ValueError(f'larger than {most_bytes // 1024} kB')
     return content
+
+
+def read_archive(
+    path: Path, names: Iterable[str], most_bytes: int = ARCHIVE_BYTES
+) -> dict[str, Any]:
+    """
+    Arrays of a NumPy archive by name, of those asked for that it has; others are not inflated.
+
+    Raises OSError when the file cannot be read. Raises ValueError in one line, for a file that is
+    not regular, is too large, also inflated, or is no archive.
+    """
+    import numpy as np  # most commands that read text need no numerics to begin
+
+    with regular_file(path) as file:
+        if os.fstat(file.fileno()).st_size > most_bytes:  # so large its directory may be
+            raise ValueError(f'larger than {most_bytes // 1024} kB')
+        # The exceptions of a damaged archive have no common base class.
+        try:
+            archive = zipfile.ZipFile(file)
+            there = archive.NameToInfo
+            members = {name: there[f'{name}.npy'] for name in names if f'{name}.npy' in there}
+            if sum(member.file_size for member in members.values()) > most_bytes:
+                raise ValueError(f'inflates to more than {most_bytes // 1024} kB')
+            read: Any = np.lib.format.read_array
+            return {name: read(archive.open(member)) for name, member in members.items()}
+        except Exception as error:
+            words = ' '.join(f'{error}'.split())
+            raise ValueError(f'not a NumPy archive: {words}') from error
 
 
 @contextlib.contextmanager

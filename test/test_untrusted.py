@@ -8,13 +8,15 @@ import math
 import os
 from pathlib import Path
 import re
+import zipfile
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.untrusted import json_value, read_text, shown, yaml_value
+from starcal_ros.untrusted import json_value, read_archive, read_text, shown, yaml_value
 
 
 @pytest.mark.parametrize(
@@ -142,6 +144,23 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path: Path) -> None:
             read_text(tmp_path / name, 4)
     with pytest.raises(IsADirectoryError):
         read_text(tmp_path, 4)
+
+
+def test_an_archive_is_inflated_as_far_as_it_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / 'a.npz'
+    np.savez_compressed(path, a=np.arange(3), b=np.zeros(10**6))
+    with zipfile.ZipFile(path, 'a') as archive:
+        archive.writestr('c.npy', 'no array')
+    assert read_archive(path, ('a', 'none'), 10**5)['a'].tolist() == [0, 1, 2]
+    for names, says in ((['b'], 'inflates to more than 97 kB'), (['c'], 'not a NumPy archive')):
+        with pytest.raises(ValueError, match=says):
+            read_archive(path, names, 10**5)
+    os.truncate(path, 10**9)
+    with pytest.raises(ValueError, match='larger than 97 kB'):
+        read_archive(path, ['a'], 10**5)
+    path.write_bytes(b'PK\x05\x06')
+    with pytest.raises(ValueError, match='not a NumPy archive: '):
+        read_archive(path, ['a'])
 
 
 @pytest.mark.parametrize(

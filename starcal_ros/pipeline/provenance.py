@@ -13,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ros.errors import errors_as, OptionError
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
+from starcal_ros.untrusted import regular_file
 
 
 def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:
@@ -47,7 +49,7 @@ def inputs_of(
     digests = {}
     for path in files:
         digest = hashlib.sha256()
-        with path.open('rb') as file:
+        with errors_as(OptionError, path), regular_file(path) as file:
             while not is_stopped() and (block := file.read(1 << 20)):
                 digest.update(block)
         # The bytes of a name that is not UTF-8 are written as Python writes them, \\xff.

@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property, lru_cache
 import hashlib
-import io
 import math
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError
+from starcal_ros.untrusted import read_archive
 
 CATALOG_PATH = Path(__file__).parent / 'data' / 'star_catalog.npz'
 CATALOG_FORMAT = 1
@@ -150,14 +150,10 @@ def column_digest(columns: Mapping[str, NDArray[np.generic]]) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, NDArray[np.generic]], str]:
     try:
-        content = path.read_bytes()
+        entries = read_archive(path, ('format', 'digest', *COLUMN_TYPES))
     except OSError as error:
         raise CatalogError(f'{path}: star catalog cannot be read: {error.strerror}') from error
-    # The exceptions of a damaged archive have no common base class.
-    try:
-        with np.load(io.BytesIO(content)) as file:
-            entries = {name: file[name] for name in file.files}
-    except Exception as error:
+    except ValueError as error:
         raise CatalogError(f'{path}: not a star catalog, or a damaged one ({error})') from error
     missing = [name for name in ('format', 'digest', *COLUMN_TYPES) if name not in entries]
     if missing:

@@ -13,7 +13,7 @@ import sys
 from starcal_ros.cli.arguments import EXIT_ACCEPTED
 from starcal_ros.cli.output import check_file
 from starcal_ros.cli.terminal import print_table, print_text
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import errors_as, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.campaign import calibrate_bags
@@ -22,6 +22,7 @@ from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.record_codec import json_object
 from starcal_ros.text import significant
+from starcal_ros.untrusted import PRODUCT_BYTES, read_text
 
 _COLUMNS = ('ra_deg', 'dec_deg', 'roll_deg')
 
@@ -62,15 +63,15 @@ def plan(args: argparse.Namespace, asked: Topics) -> int:
 
 def _pointings(path: Path) -> tuple[Pointing, ...]:
     """Return the rows of a file of pointings."""
-    with path.open(newline='', encoding='utf-8', errors='replace') as file:
-        rows = csv.DictReader(file)
+    with errors_as(OptionError, path):
+        rows = csv.DictReader(io.StringIO(read_text(path, PRODUCT_BYTES)))
+    try:
         lacking = [name for name in _COLUMNS[:2] if name not in (rows.fieldnames or ())]
         if lacking:
             raise OptionError(f'{path}: no column {" and ".join(lacking)}')
-        try:
-            found = [Pointing(*(float(row.get(name) or 0.0) for name in _COLUMNS)) for row in rows]
-        except (TypeError, ValueError) as error:
-            raise OptionError(f'{path}: line {rows.line_num}: {error}') from error
+        found = [Pointing(*(float(row.get(name) or 0.0) for name in _COLUMNS)) for row in rows]
+    except (TypeError, ValueError, csv.Error) as error:
+        raise OptionError(f'{path}: line {rows.line_num}: {error}') from error
     if not found:
         raise OptionError(f'{path}: no pointings')
     return tuple(found)

@@ -29,6 +29,8 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, MessageIn
 from mcap.stream_reader import get_chunk_data_stream, StreamReader
 from mcap.summary import Summary
 
+from starcal_ros.untrusted import regular_file
+
 Damage = Callable[[str], None]
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -57,7 +59,7 @@ class RawMessage:
 
 def read_summary(file: Path) -> Summary | None:
     """Summary at the end of a file, empty if none was written; None if missing or damaged."""
-    with file.open('rb') as stream:
+    with regular_file(file) as stream:
         # The exceptions of a damaged summary have no common base class.
         try:
             stream.seek(-(_FOOTER.size + len(MAGIC)), os.SEEK_END)
@@ -152,7 +154,7 @@ class _Pieces:
         self._on_damage(f'{self._file}: {text}')
 
     def __iter__(self) -> Iterator[McapRecord]:
-        with self._file.open('rb') as stream:
+        with regular_file(self._file) as stream:
             start: int | None = 0
             while start is not None:
                 stream.seek(start)

@@ -63,8 +63,8 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
             raise ProductError(f'{path}: is a folder, where a file is written; give another name')
         if os.path.lexists(path) and not _is_own(path):
             raise ProductError(
-                f'{path}: was not written by starcal, or was changed or copied since: give another'
-                ' name or remove it'
+                f'{path}: was not written by starcal, or was changed or copied since (or its file'
+                ' system keeps no extended attributes): give another name or remove it'
             )
 
 

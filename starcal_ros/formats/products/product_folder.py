@@ -8,11 +8,10 @@ It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_cal
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 import io
 import json
 from pathlib import Path
-import zipfile
 
 import numpy as np
 
@@ -32,6 +31,7 @@ from starcal_ros.formats.products.product_files import (
 )
 from starcal_ros.record_codec import json_object, plain_record, read_record
 from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.untrusted import read_archive
 
 OBSERVATIONS_TOPIC = '/observations'
 STATE_CALIBRATIONS, STATE_ENSEMBLE = 'calibrations', 'ensemble'  # in a state folder
@@ -97,12 +97,8 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
 def read_residuals(path: Path) -> Residuals:
     """The residuals in an archive, equal to those written; raises ProductError."""
     with errors_as(ProductError, path):
-        content = path.read_bytes()  # whole: numpy leaves a damaged archive open
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            columns = dict(archive)
-    except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise ProductError(f'{path}: not a NumPy archive: {error}') from error
+        names = ('format', *(field.name for field in fields(Residuals)))
+        columns = read_archive(path, names)
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
     with errors_as(ProductError, path):

@@ -22,11 +22,14 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError, needing
 from starcal_ros.mission.ingest import mission_records
 from starcal_ros.mission.ingest.mission_records import Attitudes, naming, Velocities
+from starcal_ros.untrusted import read_bytes
 
-_MAGIC = (b'DAF/', b'NAIF/DAF', b'KPL/')
+_TEXT = b'KPL/'
+_MAGIC = (_TEXT, b'DAF/', b'NAIF/DAF', b'DAS/', b'NAIF/DAS')
 # A CK is sampled beside each image too: a stamp offset of the camera may be applied later.
 _BESIDE_NS = (-NANOSECONDS_PER_SECOND, 0, NANOSECONDS_PER_SECOND)
 _KM = 1000.0
+_TEXT_BYTES = 1 << 26  # of a text kernel: the largest have 1 MB
 
 
 def is_kernel(path: Path) -> bool:
@@ -104,6 +107,9 @@ def loaded(paths: Sequence[Path]) -> Iterator[Any]:
     try:
         for path in paths:
             try:
+                # SPICE waits for the writer of a pipe, and reads a text without end.
+                for named in _named(spiceypy, path):
+                    _text_of(named)
                 spiceypy.furnsh(str(path))
             except spiceypy.SpiceyError as error:
                 raise IngestError(f'{path}: not loaded by SPICE: {_short(error)}') from error
@@ -116,6 +122,38 @@ def loaded(paths: Sequence[Path]) -> Iterator[Any]:
         spiceypy.kclear()
         for name in before:
             spiceypy.furnsh(name)
+
+
+def _named(spice: Any, path: Path) -> list[Path]:
+    """Files that a kernel names: those of a meta-kernel, none of another one."""
+    if b'KERNELS_TO_LOAD' not in _text_of(path):
+        return []
+    spice.ldpool(str(path))
+    names, symbols, values = (
+        _texts(spice, name) for name in ('KERNELS_TO_LOAD', 'PATH_SYMBOLS', 'PATH_VALUES')
+    )
+    spice.dvpool('KERNELS_TO_LOAD')
+    for symbol, value in zip(symbols, values, strict=False):
+        names = [name.replace(f'${symbol}', value) for name in names]
+    return [Path(name) for name in names]
+
+
+def _text_of(path: Path) -> bytes:
+    """Content of a text kernel, nothing of a binary one; IngestError for another file."""
+    start = mission_records.start_of(path)
+    if not start.startswith(_MAGIC):
+        raise IngestError(f'{path}: not a SPICE kernel: it begins with none of KPL/, DAF/, DAS/')
+    with naming(path):
+        return read_bytes(path, _TEXT_BYTES) if start.startswith(_TEXT) else b''
+
+
+def _texts(spice: Any, name: str) -> list[str]:
+    """Texts of a variable of SPICE; one that ends in + continues in the next."""
+    texts: list[str] = []
+    with contextlib.suppress(spice.NotFoundError):
+        while True:
+            texts.append(spice.stpool(name, len(texts), '+', 1024)[0])
+    return texts
 
 
 def _icrf_from_frame(spice: Any, frame: str, time_ns: int) -> Floats | None:

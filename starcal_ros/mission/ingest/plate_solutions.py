@@ -24,6 +24,7 @@ from starcal_ros.errors import IngestError, needing
 from starcal_ros.formats.images.image_files import ImageFile, is_fits
 from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE
 from starcal_ros.pipeline.from_stars import pinhole
+from starcal_ros.untrusted import regular_file
 
 _GRID = 5  # points per side; the attitude fits them all, which averages the distortion
 
@@ -101,7 +102,7 @@ def _celestial(path: Path) -> Any:
         from astropy.io import fits
         from astropy.wcs import WCS
     try:
-        with warnings.catch_warnings(), path.open('rb') as file:
+        with warnings.catch_warnings(), regular_file(path) as file:
             warnings.simplefilter('ignore')  # warnings about keywords that astropy repairs
             with fits.open(file, memmap=False) as units:
                 found = [WCS(unit.header) for unit in units if 'CTYPE1' in unit.header]
