@@ -133,8 +133,7 @@ Publishes the messages of a bag with their own stamps, for the nodes to calibrat
 show running nodes in the terminal
 
 Shows images and refusals by reason, coverage, for each parameter the forecast sigma and that of
-the active calibration, the gate and the health of the nodes. Keys request a calibration, a dry
-run, a roll-back or a reset.
+the active calibration, the gate and the health of the nodes.
 
   # live, until Ctrl-C
   starcal monitor

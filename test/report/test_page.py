@@ -89,7 +89,7 @@ def test_of_a_state_folder_the_last_calibration_and_its_images(
     page = (tmp_path / REPORT_FILE).read_text()
     assert 'by the gate: calibration 2' in page
     assert len(report._read_folder(tmp_path).observations or ()) == len(images)
-    assert '<svg' in page and 'no residuals (residuals.npz)' in page
+    assert '<svg' in page and 'no residuals of single stars (residuals.npz)' in page
 
 
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:

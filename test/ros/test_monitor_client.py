@@ -3,15 +3,10 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 from pathlib import Path
-import pty
-import select
-import struct
+import signal
 import subprocess
 import sys
-import termios
 import time
 from typing import Any, TYPE_CHECKING
 
@@ -19,14 +14,13 @@ import pytest
 from sample_records import calibration, observations, status  # type: ignore[import-not-found]
 
 if TYPE_CHECKING:
-    from conftest import Client, StartNode
+    from conftest import Client
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.formats.messages.calibration_messages import (
@@ -88,38 +82,55 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         monitor.destroy_node()
 
 
-def test_keys_call_the_calibrator_and_what_changes_it_is_confirmed(
-    client: Client, start_node: StartNode, tiny_bag: Path
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('after', ['start', 'view', 'both'])
+def test_a_signal_ends_it_without_a_traceback(
+    client: Client, number: signal.Signals, after: str
 ) -> None:
-    """Typed into a terminal of the monitor, beside a calibrator without images."""
-    start_node('calibrator', ros=('--params-file', str(tiny_bag / 'params.yaml')))
-    client.until(lambda: client.node.count_services('calibrator/rollback'))
-    main, end = pty.openpty()
-    fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack('4H', 100, 120, 0, 0))
-    command = [sys.executable, '-m', 'starcal_ros.ros.monitor_client']
-    shown = b''
-
-    def type_until(keys: str, expected: str) -> None:
-        nonlocal shown
-        shown = b''
-        os.write(main, keys.encode())
-        deadline_s = time.monotonic() + 60.0
-        while expected.encode() not in shown:
-            assert time.monotonic() < deadline_s, shown.partition(b'images')[0][-300:]
-            if select.select([main], [], [], 0.2)[0]:
-                shown += os.read(main, 65536)
-
-    with subprocess.Popen(command, stdin=end, stdout=end, stderr=end) as monitor:
+    """At its start, while it draws, and a second time while it ends."""
+    name = f'monitor_{number}_{after}'
+    command = [sys.executable, '-m', 'starcal_ros.entry_points', 'monitor_client']
+    remap = ('--ros-args', '-r', f'__node:={name}')
+    end = subprocess.PIPE
+    with subprocess.Popen([*command, *remap], stdout=end, stderr=end, text=True) as monitor:
         try:
-            type_until('', 'b roll back')
-            type_until('b', 'rollback: press y to confirm')
-            type_until('n', 'c calibrate')
-            assert b'rollback: ' not in shown
-            type_until('by', client.call(Trigger, 'calibrator/rollback').message)
-            type_until('s', 'solve: ')
-            os.write(main, b'q')
-            assert monitor.wait(20.0) == 0
+            # A signal during the imports has the default action of the system.
+            until_ros(monitor.pid)
+            if after != 'start':
+                client.until(lambda: name in client.node.get_node_names())
+            for _ in range(2 if after == 'both' else 1):
+                monitor.send_signal(number)
+            said = monitor.communicate(timeout=60.0)[1]
         finally:
             monitor.kill()
-            os.close(main)
-            os.close(end)
+    assert monitor.returncode == 0 and 'Traceback' not in said, said
+
+
+def until_ros(pid: int) -> None:
+    """Wait until a process handles SIGTERM, which Python does not by itself: `main` is reached."""
+    deadline_s = time.monotonic() + 60.0
+    while time.monotonic() < deadline_s:
+        fields = dict(
+            line.split(':', 1) for line in Path(f'/proc/{pid}/status').read_text().splitlines()
+        )
+        if int(fields['SigCgt'], 16) & 1 << (signal.SIGTERM - 1):
+            return
+        time.sleep(0.01)
+    raise AssertionError('the process does not handle SIGTERM')
+
+
+@pytest.mark.parametrize('client_name', ['monitor_client', 'calibrate_client'])
+@pytest.mark.parametrize('remap', ['__ns:=bad name', '__node:=3', ':='])
+def test_a_bad_remap_is_answered_without_a_traceback(client_name: str, remap: str) -> None:
+    """The last line is ours, after those that rcl logs."""
+    command = [sys.executable, '-m', 'starcal_ros.entry_points', client_name]
+    done = subprocess.run(
+        [*command, '--ros-args', '-r', remap],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+    )
+    assert done.returncode == 2 and 'Traceback' not in done.stderr, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f'{client_name.removesuffix("_client")}') and remap in last

@@ -73,10 +73,9 @@ def _lines(lines: Iterable[Text]) -> Text:
     return Text('\n').join(lines)
 
 
-def view(seen: Seen, keys: str = '') -> Group:
-    """All panels in one column of 80 characters, the keys on top if there are any."""
+def view(seen: Seen) -> Group:
+    """All panels in one column of 80 characters."""
     return Group(
-        *(Line(line, 'dim') for line in keys.splitlines()),
         Panel(_images(seen), title='images', title_align='left'),
         Panel(_ensemble(seen), title='ensemble', title_align='left'),
         Panel(_calibration(seen), title='calibration', title_align='left'),
