@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
-from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
+from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation import scenario as synthetic
@@ -154,6 +154,7 @@ class World:
     stamp_s: float = 0.0  # stamp less time of the exposure
     breathing: float = 0.0  # relative change of the focal length, rms
     memory: float = 0.0  # correlation of that change from image to image
+    flexing: float = 0.0  # p1 of the second half of the images less that of the first
     wander_arcsec: float = 0.0  # star tracker error correlated in time, each axis
     smooth_arcsec: float = 0.0  # star tracker error that depends on the attitude, each axis
     star_arcsec: float = 0.0  # error of the place of each star, each axis
@@ -161,6 +162,11 @@ class World:
     outlier_fraction: float = 0.0
     principal_point_px: tuple[float, float] = (0.0, 0.0)  # truth less prior
     lens: Lens = no_departure
+
+    @property
+    def sags(self) -> tuple[float, ...]:
+        """Changes of p1, of the first half of the images and of the second."""
+        return (-0.5 * self.flexing, 0.5 * self.flexing) if self.flexing else (0.0,)
 
 
 @dataclass(frozen=True)
@@ -188,11 +194,16 @@ class Campaign:
     ensemble: Ensemble = field(default_factory=Ensemble)
 
     @property
-    def true_directions(self) -> Floats:
-        """Lines of sight (GRID * GRID, 3) of the pixels of a grid in the camera frame."""
+    def true_directions(self) -> list[Floats]:
+        """
+        Lines of sight (GRID * GRID, 3) of the pixels of a grid in the camera frame.
+
+        Of the camera, or before and after its lens sags.
+        """
         camera = self.scenario.truth.camera
         grid = pixel_grid(camera, GRID, GRID)
-        return line_of_sight(camera, grid - self.displacement_px(grid))
+        ideal = grid - self.displacement_px(grid)
+        return [line_of_sight(sagged(camera, p1), ideal) for p1 in self.world.sags]
 
     def displacement_px(self, pixels: Floats) -> Floats:
         """Displacement of stars at pixels (n, 2) by the departure of the lens."""
@@ -218,7 +229,7 @@ def simulate(world: World, seed: int, images: int | None = None) -> Campaign:
     made = Campaign(world, scenario, camera_from_icrf, rate_rad_s, velocity_m_s)
     ensemble = Ensemble(
         tuple(
-            _image(made, k, reported_xyzw[k], 1.0 + world.breathing * change[k], offset_rad)
+            _image(made, k, reported_xyzw[k], _camera_of(made, k, change[k]), offset_rad)
             for k in range(world.images)
         )
     )
@@ -336,8 +347,22 @@ def _star_offsets_rad(world: World, scenario: Scenario, camera_from_icrf: Rotati
     return np.asarray(offsets)
 
 
+def _camera_of(made: Campaign, k: int, change: float) -> CameraModel:
+    """Camera of an image: its focal length breathes, its lens sags."""
+    world, camera = made.world, made.scenario.truth.camera
+    fx, _, fy = (1.0 + world.breathing * change) * camera.intrinsics[:3]
+    sag = world.sags[0 if 2 * k < world.images else -1]
+    return sagged(camera.replace(fx=float(fx), fy=float(fy)), sag)
+
+
+def sagged(camera: CameraModel, sag: float) -> CameraModel:
+    """Return a camera whose p1 is larger by ``sag``."""
+    p1 = camera.parameters[camera.parameter_names.index('p1')]
+    return camera.replace(p1=float(p1) + sag)
+
+
 def _image(
-    made: Campaign, k: int, reported_xyzw: Floats, focal_scale: float, offset_rad: Floats
+    made: Campaign, k: int, reported_xyzw: Floats, own: CameraModel, offset_rad: Floats
 ) -> StarObservations:
     """Observations of an image; the catalog stars are off by ``offset_rad`` (n, 3)."""
     world, scenario, seed = made.world, made.scenario, made.scenario.seed
@@ -348,7 +373,7 @@ def _image(
     stars = catalog.select(near)
     directions = apparent_directions(stars, time_ns)
     seen = aberrated(directions, made.velocity_m_s) + offset_rad[near]
-    pixels = _pixels(made, made.rate_rad_s[k], focal_scale, seen @ R.T)
+    pixels = _pixels(made, made.rate_rad_s[k], own, seen @ R.T)
     pixels += _outliers_px(world, len(pixels), _stream(seed, _OUTLIERS, k))
     electrons = scenario.detector.zero_point_electrons * 10 ** (-0.4 * stars.magnitude)
     sigma_px = _PSF_SIGMA_PX * np.sqrt(electrons + _NOISE_ELECTRONS**2) / electrons
@@ -374,11 +399,8 @@ def aberrated(directions: Floats, velocity_m_s: Floats) -> Floats:
     return np.asarray(directions + beta - directions * (directions @ beta)[:, None])
 
 
-def _pixels(made: Campaign, rate_rad_s: Floats, focal_scale: float, in_camera: Floats) -> Floats:
+def _pixels(made: Campaign, rate_rad_s: Floats, camera: CameraModel, in_camera: Floats) -> Floats:
     """True pixels (n, 2): a row that is read later sees the camera turned; lens displacements."""
-    camera = made.scenario.truth.camera
-    fx, _, fy = focal_scale * camera.intrinsics[:3]
-    camera = camera.replace(fx=float(fx), fy=float(fy))
     pixels = project(camera, in_camera)
     moved_per_s = np.cross(in_camera, rate_rad_s)
     for _ in range(_PIXEL_STEPS):
@@ -414,6 +436,9 @@ WORLDS = {
     'rolling_fast': World(rate_deg_s=_FAST_DEG_S, row_s=20e-6),
     'stamp_50ms': World(rate_deg_s=0.1, stamp_s=0.05),
     **{f'breath{n}': World(images=n, breathing=_BREATH) for n in (3, 6, 18)},
+    'flex6': World(images=6, flexing=5e-4),
+    'flex18': World(flexing=5e-4),
+    'flex24': World(24, flexing=2e-3),
     'breath_walk6': World(images=6, breathing=_BREATH, memory=MEMORY),
     'n6_walk': World(images=6, wander_arcsec=60.0),
     'walk24': World(images=24, wander_arcsec=60.0),

@@ -35,8 +35,9 @@ CAMERA = CameraModel(
     WIDTH, HEIGHT, np.r_[5000.0, 1.5, 5010.0, 603.0, 396.0, -0.3, 0.5, 0.0, 4e-4, -3e-4]
 )
 HELD = ('skew', 'k3')
-SHAPE = np.array([0.2, 0.3, 0.4])
-# 1-sigma of one image's scale, stretch and shear, px
+OWN = 8  # unknowns of an image
+SHAPE = np.array([0.2, 0.3, 0.4, 0.5, 0.6])
+# 1-sigma of one image's scale, stretch, shear and decentring, px
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Small:
     @property
     def predicted_px(self) -> Floats:
         """Pixels (n, 2) by the camera and the rotations of the state."""
-        zero = np.zeros((IMAGES, 6))
+        zero = np.zeros((IMAGES, OWN))
         return self.pixels(np.zeros(self.layout.count), zero, with_field=False)
 
     def measurements(self) -> Measurements:
@@ -76,7 +77,7 @@ class Small:
         return {entry.name: x[self.layout.places[entry.name]] for entry in self.layout.shared}
 
     def pixels(self, x: Floats, y: Floats, with_field: bool = True) -> Floats:
-        """Predicted pixels (n, 2) at shared unknowns (P,) and those of the images (m, 6)."""
+        """Predicted pixels (n, 2) at shared unknowns (P,) and those of the images (m, 8)."""
         value, state = self.named(x), self.state
         result = np.empty((len(self.table), 2))
         parameters = state.parameters + value['camera']
@@ -86,10 +87,13 @@ class Small:
             above_k = self.problem.above_reference_k[k]
             own = parameters.copy()
             own[:3] *= 1.0 + sum(a * above_k ** (i + 1) for i, a in enumerate(focal))
-            scale, stretch, shear = y[k, 3:]
+            scale, stretch, shear, *decentring_px = y[k, 3:]
             own[0] += scale + stretch
             own[1] += shear
             own[2] += scale - stretch
+            # p1 and p2 of a px where the radius is half of the diagonal.
+            half_px = 0.5 * np.hypot(WIDTH, HEIGHT)
+            own[8:] += np.array(decentring_px) * state.parameters[0] / half_px**2
             e = self.table.direction_icrf[here]
             if 'velocity' in value:
                 beta = value['velocity'] / LIGHT_M_S
@@ -226,7 +230,7 @@ def small(
     made = Small(problem, state, table, rates, layout, keep)
     if shapes_px is None and not field_px:
         return made
-    own = np.zeros((IMAGES, 6))
+    own = np.zeros((IMAGES, OWN))
     own[:, 3:] = 0.0 if shapes_px is None else shapes_px
     moved = made.pixels(np.zeros(layout.count), own, with_field=False) - made.predicted_px
     moved += made.field_px(field_px * rng.normal(size=len(layout['field'])) / octave_size(made))
@@ -247,7 +251,7 @@ _STEPS = {
 }
 _CAMERA_STEPS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-2, 1e-1, 1.0, 1e-3, 1e-3])
 _FOCAL_STEPS = np.array([1e-5, 1e-6])
-IMAGE_STEPS = np.array([1e-4, 1e-4, 1e-4, 1.0, 1.0, 1.0])
+IMAGE_STEPS = np.array([1e-4, 1e-4, 1e-4, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 
 def shared_steps(given: Small) -> Floats:
@@ -273,7 +277,7 @@ class Dense:
     """
     The whole problem without any elimination.
 
-    ``stars`` (2 n, P + 6 m) and ``trackers`` (3 m, P + 6 m) are whitened derivatives of the
+    ``stars`` (2 n, P + 8 m) and ``trackers`` (3 m, P + 8 m) are whitened derivatives of the
     predicted pixels, zero for stars that are not used, and of the star-tracker errors;
     ``residual`` (2 n,), ``error`` (3 m,).
     """
@@ -296,7 +300,7 @@ def dense(given: Small) -> Dense:
         def unknowns(size: float, k: int = k) -> tuple[Floats, Floats]:
             z = np.zeros(len(steps))
             z[k] = size
-            return z[:P], z[P:].reshape(IMAGES, 6)
+            return z[:P], z[P:].reshape(IMAGES, OWN)
 
         def pixels(size: float) -> Floats:
             return given.pixels(*unknowns(size)).ravel()
@@ -308,7 +312,7 @@ def dense(given: Small) -> Dense:
         trackers.append(difference(errors, step))
     residual = (given.table.measured_px - given.predicted_px).ravel()
     sigma = given.problem.star_tracker_sigma_rad.ravel()
-    zero = np.zeros(P), np.zeros((IMAGES, 6))
+    zero = np.zeros(P), np.zeros((IMAGES, OWN))
     return Dense(
         white @ np.array(stars).T,
         white @ residual,
@@ -332,7 +336,7 @@ def whitener(covariance_px2: Floats) -> Floats:
 
 def prior_precision(given: Small, shape_px: Floats, field_px: Floats | None) -> Floats:
     """
-    Return the prior's precision (P + 6 m,) of all unknowns; infinite: held.
+    Return the prior's precision (P + 8 m,) of all unknowns; infinite: held.
 
     ``field_px`` (3,) are the amplitudes of the octaves; None: no field.
     """
@@ -374,21 +378,21 @@ def octave_size(given: Small) -> Floats:
 
 
 def prior_offset(given: Small) -> Floats:
-    """Values (P + 6 m,) at the state less the prior means; used where there is a prior."""
+    """Values (P + 8 m,) at the state less the prior means; used where there is a prior."""
     offset = {
         'camera': given.state.parameters - given.problem.prior_parameters,
         'mountings': given.state.mountings,
         'readout': np.array([-0.004]),
     }
     shared = [offset.get(e.name, np.zeros(len(e))) for e in given.layout.shared]
-    return np.concatenate([*shared, np.zeros(6 * IMAGES)])
+    return np.concatenate([*shared, np.zeros(OWN * IMAGES)])
 
 
 def lens_term(given: Small, amplitude_px: float) -> Floats:
-    """Return the next term of the lens as values (P + 6 m,) of the unknowns."""
+    """Return the next term of the lens as values (P + 8 m,) of the unknowns."""
     term = given.layout['field'].term
     assert term is not None
-    values = np.zeros(given.layout.count + 6 * IMAGES)
+    values = np.zeros(given.layout.count + OWN * IMAGES)
     values[given.layout.of(['field'])] = amplitude_px * term
     return values
 
@@ -399,7 +403,7 @@ def solution(
     """
     Mean, covariance and log evidence of all unknowns; held ones are zero.
 
-    The evidence is that of the priors that are proper, up to a constant.  ``term`` (P + 6 m,): its
+    The evidence is that of the priors that are proper, up to a constant.  ``term`` (P + 8 m,): its
     outer product is in the prior covariance besides.
     """
     free = np.isfinite(precision)

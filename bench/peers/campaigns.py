@@ -86,7 +86,7 @@ def all_campaigns(seeds: int, images: int) -> Iterator[Campaign]:
         else:
             made = simulate(_SIMULATED[kind], seed, images)
             scenario = synthetic.scenario('small', seed)
-            truth, setup = made.true_directions, load_set_up(scenario)
+            truth, setup = made.true_directions[0], load_set_up(scenario)
             yield Campaign(kind, scenario, setup, made.ensemble, pixels, truth)
 
 

@@ -77,8 +77,10 @@ def _image_variation_px(estimate: Estimate) -> float:
     """1-sigma change of the camera from image to image in a corner, px."""
     camera = estimate.geometry.camera
     corner_px = 0.5 * math.hypot(camera.width, camera.height)
-    sigma_px = float(np.linalg.norm(np.exp(estimate.posterior.shape.log_px)))
-    return sigma_px * corner_px / float(camera.parameters[0])
+    sigma_px = np.exp(estimate.posterior.shape.log_px)
+    # Those of the focal length grow to the corner; the decentring is that of the corner.
+    sigma_px[:3] *= corner_px / float(camera.parameters[0])
+    return float(np.linalg.norm(sigma_px))
 
 
 def _field_px(camera: CameraModel) -> tuple[float, float]:

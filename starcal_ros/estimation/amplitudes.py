@@ -2,10 +2,10 @@
 """
 Amplitudes of the priors of the field and of the shapes of the images, by restricted likelihood.
 
-An amplitude is the 1-sigma of a group of unknowns: of an octave of the field, of the scale, the
-stretch or the shear of the images.  With all other unknowns eliminated, the information S and the
-gradient h of a group have the restricted log likelihood (Patterson & Thompson 1971; Harville
-1977; for fields Rasmussen & Williams 2006, ch. 5)::
+An amplitude is the 1-sigma of a group of unknowns: of an octave of the field, or of the scale, the
+stretch, the shear or the decentring of the images.  With all other unknowns eliminated, the
+information S and the gradient h of a group have the restricted log likelihood (Patterson &
+Thompson 1971; Harville 1977; for fields Rasmussen & Williams 2006, ch. 5)::
 
     log L = -1/2 log |1 + s S s| + 1/2 (s h)' (1 + s S s)^-1 (s h)
 
@@ -227,7 +227,7 @@ class ShapeSums:
     """
     Sums of each image for its shape, its rotation eliminated.
 
-    ``information`` (m, 3, 3), ``gradient`` (m, 3), ``cross`` (m, 3, P) with the shared unknowns;
+    ``information`` (m, s, s), ``gradient`` (m, s), ``cross`` (m, s, P) with the shared unknowns;
     ``shared_information`` (P, P) with their priors and ``shared_gradient`` (P,).
     """
 
@@ -261,8 +261,8 @@ class Shapes:
     """
     Amplitudes of the shapes of the images.
 
-    ``sigma_px`` (3,): those that stand for the posterior (`interval_factor`); ``amplitudes`` has
-    its maximum; ``common_px2`` (3,) is the variance that all images share if the shapes are
+    ``sigma_px`` (s,): those that stand for the posterior (`interval_factor`); ``amplitudes`` has
+    its maximum; ``common_px2`` (s,) is the variance that all images share if the shapes are
     correlated in time.
     """
 
@@ -272,10 +272,10 @@ class Shapes:
 
 
 def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
-    """Return the amplitudes of scale, stretch and shear; ``near``: those of the round before."""
+    """Return the amplitudes of the shapes; ``near``: those of the round before."""
     likelihood = _shape_likelihood(sums)
-    best, value = _climb(likelihood, near)
-    none = np.full(3, NO_AMPLITUDE)
+    best, value = _climb(likelihood, sums.gradient.shape[1], near)
+    none = np.full(len(best), NO_AMPLITUDE)
     prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
     ratio = 2.0 * (value - float(likelihood(none[None])[0])) + float(prior)
     shift = _SHAPE_SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHAPE_SHIFTS]
@@ -307,11 +307,11 @@ def interval_factor(sigma: Floats, weight: Floats) -> float:
 
 
 def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
-    """Return the restricted log likelihoods (k,) as a function of log amplitudes (k, 3)."""
-    m, _, P = sums.cross.shape
+    """Return the restricted log likelihoods (k,) as a function of log amplitudes (k, s)."""
+    m, n, P = sums.cross.shape
     # Shared unknowns and gradient side by side: the same products eliminate both.
     right = np.concatenate([sums.cross, sums.gradient[:, :, None]], axis=2)
-    flat = right.reshape(3 * m, P + 1).T.copy()
+    flat = right.reshape(n * m, P + 1).T.copy()
     whole = np.zeros((P + 1, P + 1))
     whole[:P, :P], whole[:P, P] = sums.shared_information, sums.shared_gradient
 
@@ -321,9 +321,9 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
             return np.concatenate([likelihood(log_px[: k // 2]), likelihood(log_px[k // 2 :])])
         s = np.exp(log_px)
         size2 = (s[:, :, None] * s[:, None, :])[:, None]
-        covariance, log_det = _inverse(np.eye(3) + sums.information * size2)
+        covariance, log_det = _inverse(np.eye(n) + sums.information * size2)
         covariance *= size2
-        left = whole - flat @ (covariance @ right).reshape(k, 3 * m, P + 1)
+        left = whole - flat @ (covariance @ right).reshape(k, n * m, P + 1)
         try:
             lower = np.linalg.cholesky(left[:, :P, :P])
         except np.linalg.LinAlgError:
@@ -340,45 +340,48 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
 
 def _inverse(matrices: Floats) -> tuple[Floats, Floats]:
     """
-    Return the inverses of symmetric matrices (..., m, 3, 3), and the sums (...) of m log |M|.
+    Return the inverses of matrices (..., m, n, n), and the sums (...) of m log |M|.
 
-    By cofactors: for thousands of images a tenth of the time of `numpy.linalg.inv`.
+    The matrices are symmetric and positive definite.  By sweeps over their elements (Goodnight
+    1979), all matrices at once: a tenth of the time of `numpy.linalg.inv`.
     """
-    rows, columns = np.triu_indices(3)
-    a, b, c, d, e, f = np.moveaxis(matrices[..., rows, columns], -1, 0)
-    upper = [
-        d * f - e * e,
-        c * e - b * f,
-        b * e - c * d,
-        a * f - c * c,
-        b * c - a * e,
-        a * d - b * b,
-    ]
-    size = a * upper[0] + b * upper[1] + c * upper[2]
+    n = matrices.shape[-1]
+    part = {(i, j): matrices[..., i, j].copy() for i in range(n) for j in range(i, n)}
+    determinant: Floats = np.ones(matrices.shape[:-2])
+    for k in range(n):
+        determinant *= part[k, k]
+        pivot = 1.0 / part[k, k]
+        row = [part[min(i, k), max(i, k)] for i in range(n)]
+        scaled = [one * pivot for one in row]
+        for (i, j), one in part.items():
+            if k not in (i, j):
+                one -= scaled[i] * row[j]
+        part |= {(min(i, k), max(i, k)): scaled[i] for i in range(n)} | {(k, k): -pivot}
     found = np.empty_like(matrices)
-    for i, j, one in zip(rows, columns, upper, strict=True):
-        found[..., i, j] = found[..., j, i] = one / size
-    return found, np.log(size).sum(axis=-1)
+    for (i, j), one in part.items():
+        np.negative(one, out=found[..., i, j])
+        found[..., j, i] = found[..., i, j]
+    return found, np.log(determinant).sum(axis=-1)
 
 
 def _climb(
-    likelihood: Callable[[Floats], Floats], near: Amplitudes | None
+    likelihood: Callable[[Floats], Floats], count: int, near: Amplitudes | None
 ) -> tuple[Floats, float]:
     """
-    Return the log amplitudes (3,) of the largest posterior, and its logarithm.
+    Return the log amplitudes (count,) of the largest posterior, and its logarithm.
 
     One amplitude at a time: to each of several values, then by shrinking steps.  The posterior is
     flat where an amplitude has no effect, so that steps alone do not leave zero.
     """
     coarse = np.log(_SHAPE_STARTS_PX if near is None else _SHAPE_STARTS_PX[1:-1:2])
-    starts = np.tile(coarse[:, None], (1, 3)) if near is None else near.log_px[None]
+    starts = np.tile(coarse[:, None], (1, count)) if near is None else near.log_px[None]
     values = likelihood(starts)
     best, value = starts[np.argmax(values)], float(values.max())
     for step in (0.0, 1.0, 0.3, 0.1):
         improved = True
         while improved:
             improved = False
-            for k in range(3):
+            for k in range(count):
                 there = best[k] + step * np.array([-1.0, 1.0]) if step else coarse
                 there = there[(there > NO_AMPLITUDE) & (there < math.log(LARGEST_SHAPE_PX))]
                 trials = np.tile(best, (len(there), 1))
@@ -391,7 +394,7 @@ def _climb(
 
 
 def _shared_mean(sums: ShapeSums, sigma_px: Floats) -> Floats:
-    """Return the shared unknowns (P,) at amplitudes (3,) of the shapes."""
+    """Return the shared unknowns (P,) at amplitudes (s,) of the shapes."""
     P = len(sums.shared_gradient)
     right = np.concatenate([sums.cross, sums.gradient[:, :, None]], axis=2)
     flat = right.reshape(-1, P + 1)
@@ -404,7 +407,7 @@ def _shared_mean(sums: ShapeSums, sigma_px: Floats) -> Floats:
 
 def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
     """
-    Return the variance (3,) that all images share: that of the camera, which shows in no image.
+    Return the variance (s,) that all images share: that of the camera, which shows in no image.
 
     With a correlation, images of a campaign share the part c of the variance, the mean
     correlation, and differ by 1 - c.  Correlations are averaged over by their evidence, the
@@ -413,18 +416,18 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
     information = np.einsum('mii->mi', sums.information)
     used = np.flatnonzero((information > 0).all(axis=1))[:_MOST_CORRELATED]
     if len(used) < 2:
-        return np.zeros(3)
+        return np.zeros(len(sigma_px))
     left = sums.gradient[used] - sums.cross[used] @ _shared_mean(sums, sigma_px)
     root = np.sqrt(information[used])
     steps = np.abs(np.subtract.outer(used, used))
     variance = np.exp(2.0 * _LOG_SHAPE)
     prior = -0.5 * ((_LOG_SHAPE - LOG_CENTRE) / LOG_SIGMA) ** 2
-    evidence = np.empty((3, len(_CORRELATIONS)))
+    evidence = np.empty((len(sigma_px), len(_CORRELATIONS)))
     ratio = np.empty(len(_CORRELATIONS))
     for j, (odds, kernel) in enumerate(_CORRELATIONS):
         K = kernel(steps)
         ratio[j] = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
-        for k in range(3):  # the shapes in units of their noise
+        for k in range(len(sigma_px)):  # the shapes in units of their noise
             values, vectors = eigh(K * np.outer(root[:, k], root[:, k]), check_finite=False)
             ones, along = root[:, k] @ vectors, (left[:, k] / root[:, k]) @ vectors
             inverse = 1.0 / (1.0 + variance[:, None] * np.maximum(values, 0.0))

@@ -59,11 +59,9 @@ from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import (
     Assumptions,
     FIELD_OCTAVES,
-    FOCAL_PARAMETERS,
     IMAGE_ROTATION,
     Layout,
     moved,
-    SHAPE_MODES,
     unknowns_of,
 )
 from starcal_ros.estimation.working_weights import (
@@ -257,7 +255,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     residual_px = _residuals_px(problem, state, table, None, None, camera)
     from_sky = sky_rotations(state, table, camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats = np.full(3, _FIRST_SHAPE_PX)
+    shape_px: Floats | float = _FIRST_SHAPE_PX
     near: Posterior | None = None
     termination = 'iteration_limit'
     share, before_sigma = 1.0, math.inf
@@ -309,7 +307,7 @@ def _round(
     state: State,
     judged: Judged,
     residual_px: Floats,
-    shape_px: Floats,
+    shape_px: Floats | float,
     near: Posterior | None,
     share: float,
 ) -> _Round:
@@ -397,7 +395,9 @@ def _residuals_px(
     if layout is not None and found is not None:
         own = np.broadcast_to(own, (table.image_count, problem.camera_count)).copy()
         shapes_px = found.of_images[:, layout.places['shape']]
-        own[:, FOCAL_PARAMETERS] += shapes_px @ SHAPE_MODES.T
+        modes = layout['shape'].camera
+        assert modes is not None
+        own += np.einsum('mps,ms->mp', modes, shapes_px)
         size = camera.width, camera.height
         measured = measured - field_of(layout, found, size).displacement_px(measured)
         turned = np.zeros((3, len(table)))

@@ -239,14 +239,16 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
     return NormalEquations(cost, A, a, B, C, c)
 
 
-def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats) -> Equations:
+def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats | float) -> Equations:
     """Return the normal equations of `arrow` with the images eliminated."""
     normal = arrow(sums, linear.problem, linear.state, linear.layout)
     return eliminated(normal, linear.layout, shape_sigma_px)
 
 
-def eliminated(normal: NormalEquations, layout: Layout, shape_sigma_px: Floats) -> Equations:
-    """Return the same; ``shape_sigma_px`` (3,) is the prior of the shapes of the images."""
+def eliminated(
+    normal: NormalEquations, layout: Layout, shape_sigma_px: Floats | float
+) -> Equations:
+    """Return the same; ``shape_sigma_px`` (s,) is the prior of the shapes of the images."""
     m, b, P = normal.B.shape
     C = normal.C
     if 'shape' in layout:

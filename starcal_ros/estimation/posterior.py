@@ -33,7 +33,7 @@ from starcal_ros.estimation.equations import (
     StarSums,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.unknowns import FOCAL_PARAMETERS, Layout, SHAPE_MODES, Unknown
+from starcal_ros.estimation.unknowns import Layout, Unknown
 
 _WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
 _SMALL_SHAPE_PX = 1e-4  # to begin with
@@ -81,12 +81,12 @@ class Posterior:
         Of the octaves of the field, of the next term of the lens, of the shapes of the images.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
-    shape_sigma_px : (3,)
-        Amplitudes of scale, stretch and shear of an image that stand for their posterior.
+    shape_sigma_px : (s,)
+        Amplitudes of the shapes of an image that stand for their posterior.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
-    common_shape_px2 : (3,)
-        Part of ``covariance``: of scale, stretch and shear that all images share.
+    common_shape_px2 : (s,)
+        Part of ``covariance``: of the shapes that all images share.
     information, gradient : (P, P), (P,)
         From the stars and the star trackers, without priors, the images eliminated.
     errors : ErrorParts or None
@@ -125,7 +125,7 @@ class Posterior:
 def posterior(
     sums: StarSums,
     linear: Linearisation,
-    before: Floats,
+    before: Floats | float,
     near: Posterior | None = None,
 ) -> Posterior:
     """
@@ -133,18 +133,19 @@ def posterior(
 
     Parameters
     ----------
-    before : (3,)
+    before : (s,) or float
         Amplitudes px of the shapes of the images to begin with.
     near : Posterior, optional
         At a state near this one: the search of amplitudes begins with its own.
     """
     layout = linear.layout
+    before = np.broadcast_to(before, len(layout['shape']))
     normal = arrow(sums, linear.problem, linear.state, layout)
     start = eliminated(normal, layout, before)
     solver = _Solver(layout)
     base = solver.amplitudes(start, near.field if near else None)
-    none = Amplitudes(np.full(3, NO_AMPLITUDE), 0.0)
-    found, last = Shapes(before, none, np.zeros(3)), start
+    none = Amplitudes(np.full(len(before), NO_AMPLITUDE), 0.0)
+    found, last = Shapes(before, none, np.zeros(len(before))), start
     if len(sums.blocks) > 1:
         field_px = solver.solve(start, base)[0][layout.places['field']]
         by_image = _shape_sums(sums, layout, solver, field_px)
@@ -188,7 +189,7 @@ def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Flo
     linear = dataclasses.replace(linear, layout=wide)
     at = wide.of([name])
     try:
-        found = posterior(sums, linear, np.full(3, _SMALL_SHAPE_PX))
+        found = posterior(sums, linear, _SMALL_SHAPE_PX)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
         return np.zeros(len(at)), np.full(len(at), np.inf)
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
@@ -310,10 +311,11 @@ def _without_rotation(
 
 
 def common_shape(layout: Layout, common_px2: Floats) -> Floats:
-    """Return the covariance (P, P) of the shapes that all images share, by fx, skew and fy."""
-    camera = layout.of(['camera'])[FOCAL_PARAMETERS]
+    """Return the covariance (P, P) of the shapes that all images share, by the camera."""
+    camera, shapes = layout.places['camera'], layout['shape'].camera
+    assert shapes is not None
     free = np.isfinite(layout.prior_precision[camera])
-    added = (SHAPE_MODES * common_px2) @ SHAPE_MODES.T
+    modes = shapes[0] * free[:, None]
     covariance = np.zeros((layout.count, layout.count))
-    covariance[np.ix_(camera, camera)] = added * np.outer(free, free)
+    covariance[camera, camera] = (modes * common_px2) @ modes.T
     return covariance

@@ -50,10 +50,13 @@ Scalars = Callable[[Floats], Floats]
 
 IMAGE_ROTATION = slice(0, 3)
 """Place of the rotation among the unknowns of an image; it moves as `moved` says."""
-FOCAL_PARAMETERS = slice(0, 3)
-"""Place of fx, skew and fy among the camera parameters."""
-SHAPE_MODES = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).T
-"""Scale, stretch and shear of an image as changes of fx, skew and fy: (3, 3)."""
+_FOCAL_MODES = {
+    'scale_px': (1.0, 0.0, 1.0),
+    'stretch_px': (1.0, 0.0, -1.0),
+    'shear_px': (0.0, 1.0, 0.0),
+}
+"""Changes of fx, skew and fy."""
+_DECENTRING = ('p1', 'p2')  # of the lens models that have them
 _UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit
 _FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
 FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
@@ -318,9 +321,7 @@ def unknowns_of(
     size : (width, height)
         Of the detector, px.
     """
-    m = len(state.camera_from_icrf)
     width, height = size
-    p = problem.camera_count
     entries = list(unknowns_in_state(problem, state).entries)
     if assumed.velocity_m_s > 0:
         entries.append(
@@ -337,20 +338,27 @@ def unknowns_of(
         entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
     entries += _of_timing(rates_rad_s, height, assumed)
     entries.append(_field(width, height))
-    modes = np.zeros((p, 3))
-    modes[FOCAL_PARAMETERS] = SHAPE_MODES
-    shape = ('scale_px', 'stretch_px', 'shear_px')
-    entries.append(
-        Unknown(
-            'shape',
-            shape,
-            np.ones(3),
-            np.zeros(3),
-            of_image=True,
-            camera=np.broadcast_to(modes, (m, p, 3)),
-        )
-    )
+    entries.append(_shape(problem, state, size))
     return Layout(tuple(entry for entry in entries if len(entry)))
+
+
+def _shape(problem: Problem, state: State, size: tuple[int, int]) -> Unknown:
+    """
+    Return the entry of the changes of the camera from image to image.
+
+    A lens that warms changes its scale, one that sags or is turned its decentring, by p1 and p2
+    where the lens model has them: 1 px displaces stars as far out as the corners by 1 to 3 px.
+    """
+    names = problem.parameter_names
+    decentring = [name for name in _DECENTRING if name in names]
+    labels = (*_FOCAL_MODES, *(f'{name}_px' for name in decentring))
+    modes = np.zeros((problem.camera_count, len(labels)))
+    modes[:3, :3] = np.array(list(_FOCAL_MODES.values())).T
+    for k, name in enumerate(decentring, 3):
+        modes[names.index(name), k] = 4.0 * abs(state.parameters[0]) / math.hypot(*size) ** 2
+    count, m = len(labels), len(state.camera_from_icrf)
+    camera = np.broadcast_to(modes, (m, *modes.shape))
+    return Unknown('shape', labels, np.ones(count), np.zeros(count), of_image=True, camera=camera)
 
 
 def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:

@@ -15,6 +15,7 @@ from four_images import (  # type: ignore[import-not-found]
     IMAGES,
     octave_size,
     octaves,
+    OWN,
     shared_steps,
     Small,
     small,
@@ -49,12 +50,12 @@ def truth() -> Dense:
 
 def star_matrix(given: Small) -> tuple[Floats, Floats]:
     """
-    Unwhitened derivatives (2 n, P + 6 m) of all pixels by the entries of the list; residuals.
+    Unwhitened derivatives (2 n, P + 8 m) of all pixels by the entries of the list; residuals.
 
     Each entry by its own form: camera, turn or functions.
     """
     count, n = given.layout.count, len(given.table)
-    X = np.zeros((n, 2, count + 6 * IMAGES))
+    X = np.zeros((n, 2, count + OWN * IMAGES))
     r = np.zeros((n, 2))
     table, p = given.table, given.problem.camera_count
     image = table.image
@@ -74,12 +75,12 @@ def star_matrix(given: Small) -> tuple[Floats, Floats]:
             by = J @ entry.camera[image[rows]]
             if entry.of_image:
                 for row, value in zip(rows, by, strict=True):
-                    first = count + 6 * image[row]
+                    first = count + OWN * image[row]
                     X[row, :, first + at.start : first + at.stop] = value
             else:
                 X[rows, :, at] = by
         for row, value in zip(rows, plain[:, :, -4:-1], strict=True):
-            X[row, :, count + 6 * image[row] : count + 6 * image[row] + 3] = value
+            X[row, :, count + OWN * image[row] : count + OWN * image[row] + 3] = value
         r[rows] = plain[:, :, -1]
     # The turns again, with the documented rotation jacobian of the camera.
     for entry in given.layout.shared:
@@ -108,7 +109,7 @@ def places(given: Small, name: str) -> np.ndarray:
     at = given.layout.places[name]
     if name == 'shape':
         return np.concatenate(
-            [given.layout.count + 6 * k + np.arange(at.start, at.stop) for k in range(IMAGES)]
+            [given.layout.count + OWN * k + np.arange(at.start, at.stop) for k in range(IMAGES)]
         )
     return np.arange(at.start, at.stop)
 
@@ -135,7 +136,7 @@ def test_a_turn_against_the_star_tracker_is_that_of_the_attitudes(
     turns = turns[:, :, np.isin(at, np.arange(given.layout.count)[places(given, name)])]
     for k in range(IMAGES):
         rows = slice(3 * k, 3 * k + 3)
-        rotation = given.layout.count + 6 * k + np.arange(3)
+        rotation = given.layout.count + OWN * k + np.arange(3)
         expected = truth.trackers[rows][:, places(given, name)]
         found = -truth.trackers[rows][:, rotation] @ turns[k]
         size = max(float(np.abs(truth.trackers[:, places(given, name)]).max()), 1e-300)
@@ -160,7 +161,7 @@ def test_labels_have_a_name_and_a_unit_for_each_unknown(given: Small) -> None:
     )
     assert layout.labels[layout.places['stamps']] == ('stamp_offset_s',)
     assert [e.name for e in layout.of_image] == ['shape']
-    assert layout.places['shape'] == slice(3, 6)
+    assert layout.places['shape'] == slice(3, 3 + len(layout['shape'])) == slice(3, OWN)
     assert layout.places['field'].stop == layout.count
     for entry in layout.entries:
         assert len(entry.sigma) == len(entry.offset) == len(entry) > 0
@@ -298,13 +299,13 @@ def test_the_search_moves_the_unknowns_of_camera_and_attitudes(given: Small) -> 
 def test_a_step_moves_pixels_and_attitudes_as_the_unknowns_do(given: Small) -> None:
     rng = np.random.default_rng(1)
     layout = unknowns_in_state(given.problem, given.state)
-    x, y = np.zeros(given.layout.count), np.zeros((IMAGES, 6))
+    x, y = np.zeros(given.layout.count), np.zeros((IMAGES, OWN))
     at = given.layout.of([e.name for e in layout.entries])
     x[at] = 1e-2 * shared_steps(given)[at] * rng.normal(size=len(at))
     y[:, :3] = 1e-6 * rng.normal(size=(IMAGES, 3))
     state = moved(given.problem, given.state, layout, x[at], y[:, :3])
     after = dataclasses.replace(given, state=state)
-    zero = np.zeros(given.layout.count), np.zeros((IMAGES, 6))
+    zero = np.zeros(given.layout.count), np.zeros((IMAGES, OWN))
     change = given.pixels(x, y) - given.predicted_px
     # Products of two small rotations remain: 1e-12 of a radian.
     assert after.predicted_px - given.predicted_px == pytest.approx(change, abs=1e-7)

@@ -250,6 +250,22 @@ def test_an_image_with_a_wrong_attitude_is_a_misfit_and_moves_nothing() -> None:
     assert found.kept[found.table.image == 2].all()
 
 
+@pytest.mark.parametrize('flexing', [5e-4, 2e-3])
+@pytest.mark.parametrize('images', [6, 18])
+def test_the_sigma_of_a_lens_that_sags_covers_each_of_its_shapes(
+    images: int, flexing: float
+) -> None:
+    made = simulate(World(images=images, flexing=flexing), 1)
+    found = estimated(made)
+    assert found.termination == 'converged' and found.kept.mean() > 0.99
+    # p1 of the second half of the images is larger than that of the first.
+    p1 = made.scenario.truth.camera.parameter_names.index('p1')
+    off = errors(found, made.scenario.truth)[p1] + flexing * np.array([-0.5, 0.5])
+    assert np.abs(off).max() < 2.0 * np.sqrt(found.covariance[p1, p1])
+    shown = found.posterior.of_images[:, found.linear.layout.places['shape']]
+    assert np.ptp(shown, axis=0).argmax() == 3
+
+
 @pytest.mark.parametrize('stated_arcsec', [0.1, 2.0])
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_a_stated_sigma_that_is_far_too_small_bends_nothing(

@@ -65,7 +65,7 @@ def test_true_directions_have_the_displacement_of_the_stars(name: str) -> None:
     made = worlds.campaign(name, 1)
     camera = made.scenario.truth.camera
     grid = pixel_grid(camera, GRID, GRID)
-    moved_px = grid - project(camera, made.true_directions)
+    moved_px = grid - project(camera, made.true_directions[0])
     shown, left = [], []
     for index, image in enumerate(made.ensemble.images):
         residual_px, sigma_px = residuals(made, index)
