@@ -57,7 +57,7 @@ FEWEST_SOURCES = 6
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
 # Of noise: exposures have 0, or 0.3 by what their sensor adds to each.
-_NOISE_SIDE_PX, _SAME_NOISE = 256, 0.5
+_NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
@@ -221,7 +221,7 @@ def _noise(pixels: Pixels) -> Floats:
     noise = binned - uniform_filter(binned, 5)
     sigma = 1.4826 * float(np.median(np.abs(noise)))
     noise[np.abs(noise) > 3.0 * sigma] = 0.0
-    length = float(np.linalg.norm(noise))
+    length = float(np.linalg.norm(noise)) if noise.size > _FEWEST_OF_NOISE else 0.0
     return np.asarray(noise.ravel() / length if length > 0 else np.zeros(noise.size))
 
 
