@@ -12,7 +12,7 @@ from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.options import holds_options, names_of, REMOVED
+from starcal_ros.options import holds_options, names_of
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, read_setup, Setup
 
@@ -84,28 +84,6 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
     load_setup(both, NODE_OPTION_CLASSES)
     with pytest.raises(OptionError, match='autostart: no such parameter'):
         load_setup(both)
-
-
-def test_an_option_that_was_removed_is_named_with_what_replaces_it(camera_yaml: Path) -> None:
-    """As in a parameter file of an older version."""
-    assert not REMOVED.keys() & names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
-    text = 'residual_field: not an option any more: .* always estimated, .*; take it out'
-    with pytest.raises(OptionError, match=text):
-        load_setup(values(camera_yaml, residual_field=True))
-    words = ' '.join(REMOVED.values()).replace(',', ' ').replace(';', ' ').split()
-    kinds = ('max_', 'min_', 'prior_', 'velocity_sigma')
-    named = {word for word in words if word.startswith(kinds)}
-    assert len(named) > 8 and named <= names_of(*OPTION_CLASSES)
-
-
-@pytest.mark.parametrize('name', REMOVED)
-def test_each_removed_option_is_refused_in_one_line(camera_yaml: Path, name: str) -> None:
-    """With every kind of value that it may have had."""
-    with pytest.raises(OptionError) as refused:
-        load_setup(values(camera_yaml, **{name: 1.0}), NODE_OPTION_CLASSES)
-    text = str(refused.value)
-    assert text == f'{name}: not an option any more: {REMOVED[name]}; take it out'
-    assert len(text) < 200 and '\n' not in text
 
 
 def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
