@@ -119,11 +119,6 @@ def option_fields(*kinds: type[Any]) -> list[dataclasses.Field[Any]]:
     return [f for kind in kinds for f in dataclasses.fields(kind) if 'description' in f.metadata]
 
 
-def holds_options(kind: object) -> bool:
-    """Return True for a dataclass with a field that was made with `option`."""
-    return isinstance(kind, type) and dataclasses.is_dataclass(kind) and bool(option_fields(kind))
-
-
 def names_of(*option_classes: type[Any]) -> set[str]:
     """Option names of the given dataclasses."""
     return {field.name for field in option_fields(*option_classes)}
