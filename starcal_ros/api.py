@@ -34,7 +34,7 @@ from starcal_ros.pipeline.setup import load_setup, read_setup, read_values
 from starcal_ros.pipeline.topics import Topics, without_attitudes
 from starcal_ros.record_codec import check_shape, plain_record, read_record, read_value
 from starcal_ros.record_fields import fields_of
-from starcal_ros.records import Calibration, CameraGeometry, refused_image, StarObservations
+from starcal_ros.records import Calibration, CameraGeometry, StarObservations
 
 __all__ = [
     'Calibration',
@@ -122,7 +122,7 @@ def observations_of(
     stars = read_record(
         StarObservations,
         {
-            **plain_record(refused_image(time_ns, camera.width, camera.height, '', '')),
+            **plain_record(StarObservations.of_image(time_ns, (camera.width, camera.height))),
             'icrf_from_star_tracker_xyzw': np.asarray(icrf_from_star_tracker_xyzw),
             'catalog_id': identifiers,
             'direction_icrf': np.asarray(direction_icrf),

@@ -108,72 +108,15 @@ def is_of_ros(name: str) -> bool:
     )
 
 
-_FIELD = 'the field over the detector is always estimated, as large as the stars show it'
-_SIGMAS = 'max_map_sigma_px and max_line_of_sight_sigma_arcsec limit all that is not determined'
-_CONSTANT = 'it is a constant of the method'
-_SEARCH = 'leave out prior_alignment if it may be off by more than 1.5 degrees, or 5 in roll'
-_PREDICTED = 'max_cross_validated_residual limits how far images are off what the others predict'
-REMOVED: Mapping[str, str] = {
-    'residual_field': _FIELD,
-    'max_field_p_value': _FIELD,
-    'max_field_px': 'max_change_px limits the change of the map, the field included',
-    'max_parameter_sigma': _SIGMAS,
-    'min_singular_value': _SIGMAS,
-    'min_independent_images': _SIGMAS,
-    'max_star_tracker_excess': 'max_line_of_sight_sigma_arcsec limits what a bad one leads to',
-    'max_halves_px': _PREDICTED,
-    'max_halves_rotation_arcsec': _PREDICTED,
-    'min_halves_p_value': _PREDICTED,
-    'min_model_p_value': 'errors outside of the model are estimated, whether significant or not',
-    'max_velocity_error_km_s': 'the velocity is estimated with the prior velocity_sigma_m_s, and'
-    ' max_held_term_sigma limits how far it is off',
-    'max_zero_skew_cost_px': 'zero_skew_cost_px is reported with the calibration',
-    'max_step_sigma': 'max_step_px and max_step_rotation_deg limit changes of the lines of sight',
-    'max_saturated_fraction': _CONSTANT,
-    'max_gradient': _CONSTANT,
-    'hot_pixel_sigma': f'{_CONSTANT}; bad_pixel_map adds pixels',
-    'detection_sigma': 'min_snr limits the stars used',
-    'mask_radius_px': _CONSTANT,
-    'mask_threshold_sigma': _CONSTANT,
-    'min_pixels': _CONSTANT,
-    'max_shape_change': _CONSTANT,
-    'acquisition_radius_deg': _SEARCH,
-    'acquisition_roll_deg': _SEARCH,
-    'search_radius_px': _SEARCH,
-    'min_stars_per_image': 'every image needs 8 measured stars',
-    'max_blend_sigma': _CONSTANT,
-    'relative_humidity': _CONSTANT,
-    'wavelength_um': _CONSTANT,
-    'min_elevation_deg': _CONSTANT,
-    'outlier_sigma': f'{_CONSTANT}; max_rejected_fraction limits the outliers',
-    'principal_point_prior': 'prior_sigma states the 1-sigma of cx and cy',
-    'variance_components': 'the sigmas are always scaled by the residuals',
-    'image_reliability': 'auto is the default; the ROS parameter'
-    ' qos_overrides.<topic>.subscription.reliability sets another',
-    'attitude_history_s': _CONSTANT,
-    'camera_info_per_image': 'image_camera_info is always published',
-    'calibration_history': 'the last 20 calibrations are kept',
-    'set_camera_info_timeout_s': _CONSTANT,
-}
-"""Options of earlier versions, and what replaces them."""
-
-
 def unknown_option(name: str, known: Iterable[str]) -> str:
-    """Return one line for an unknown name: its replacement, or a similar name."""
+    """Return one line for an unknown name, with a similar name if there is one."""
     said = name if name.isidentifier() and len(name) < _LONGEST_NAME else shown(name)
-    if name in REMOVED:
-        return f'{said}: not an option any more: {REMOVED[name]}; take it out'
     return f'{said}: no such parameter{nearest(name, known)}'
 
 
 def option_fields(*kinds: type[Any]) -> list[dataclasses.Field[Any]]:
     """Fields made with `option`; the others are constants in flight, which studies vary."""
     return [f for kind in kinds for f in dataclasses.fields(kind) if 'description' in f.metadata]
-
-
-def holds_options(kind: object) -> bool:
-    """Return True for a dataclass with a field that was made with `option`."""
-    return isinstance(kind, type) and dataclasses.is_dataclass(kind) and bool(option_fields(kind))
 
 
 def names_of(*option_classes: type[Any]) -> set[str]:

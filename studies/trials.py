@@ -24,7 +24,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
-from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
 from starcal_ros.simulation.centroids import scaled_inverse
 from starcal_ros.simulation.scenario import Scenario, scenario
 
@@ -117,12 +117,9 @@ def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0)
     n = measured.shape[1]
     ones = np.ones(n, np.float32)
     images = [
-        refused_image(
+        StarObservations.of_image(
             k,
-            camera.width,
-            camera.height,
-            refusal='',
-            detail='',
+            (camera.width, camera.height),
             icrf_from_star_tracker_xyzw=quaternion,
             catalog_id=np.arange(k * n, (k + 1) * n),
             direction_icrf=field.direction_icrf[k],

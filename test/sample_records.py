@@ -21,7 +21,6 @@ from starcal_ros.records import (
     GateCheck,
     HeldTerm,
     ModelChecks,
-    refused_image,
     ResidualBin,
     ResidualField,
     SigmaPart,
@@ -38,7 +37,7 @@ def observations(n: int = 5) -> StarObservations:
     random = np.random.default_rng(3)
     directions = random.normal(size=(n, 3))
     return dataclasses.replace(
-        refused_image(TIME_NS, 1296, 1024, '', ''),
+        StarObservations.of_image(TIME_NS, (1296, 1024)),
         icrf_from_star_tracker_xyzw=np.array([0.1, 0.7, -0.1, 0.7]),
         attitude_gap_s=0.5,
         catalog_id=np.array([2**62 + k for k in range(n - 1)] + [-71683], np.int64),

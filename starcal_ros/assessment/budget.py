@@ -3,13 +3,14 @@
 Budget of the sigma of lines of sight by cause.
 
 The part of a cause is the root of the variance that would be gone if it were known exactly, or
-absent.  With L the root of the covariance under the working weights, all errors have the
-covariance ``L (1 + A) L'`` (`posterior.ErrorParts`).  An estimator that is given some unknowns has
-the root ``L T``: the columns of T are orthonormal and orthogonal to the rows of L of these
-unknowns, which is their Schur complement; that of an estimator that is given the shapes of the
-images has ``T = (1 + L' D L)^-1/2``, where D is the information that the shapes hide.  Both have
-the covariance ``L T (1 + T' A T) T' L'``.  An error that observations share is absent without its
-own term of A, the weights as they are.
+absent.  The covariance is ``C = L (1 + A) L'`` with L the root of the covariance under the working
+weights (`posterior.ErrorParts`).
+
+If some unknowns are known exactly, the covariance is that of the others conditioned on them:
+``L T (1 + T' A T) T' L'`` with T an orthonormal basis of the null space of the rows of L of the
+known unknowns.  If the shapes of the images are known, ``T = (1 + L' D L)^-1/2`` in the same
+formula, where D is the information that unknown shapes take away.  If an error that observations
+share is absent, A has no term of it and the weights stay.
 """
 
 from __future__ import annotations

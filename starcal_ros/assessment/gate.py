@@ -242,8 +242,8 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
             term.significance,
             'sigma',
         )
-        asked, assumed = significant(term.asked, 6), significant(term.assumed, 6)
-        note = f'the stars put {term.name} at {asked}, assumed is {assumed}'
+        estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
+        note = f'the stars put {term.name} at {estimated}, assumed is {assumed}'
         if not check.passed:
             note += '; ' + REMEDIES.get(
                 f'assumed {term.name.replace(" ", "_").partition("_")[0]}',

@@ -36,7 +36,7 @@ from starcal_ros.identification.blind.search import (
     ROUNDS,
     SkyMatch,
 )
-from starcal_ros.records import CameraGeometry, Ensemble, Image, refused_image, StarObservations
+from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.catalog import StarCatalog
 
 ADVICE = 'take 20 frames over the whole sky, stars to the corners, 1 to 10 s each'
@@ -372,12 +372,9 @@ def _observations(
 ) -> StarObservations:
     """Identified sources as observations of stars; their attitude is that of the camera."""
     rows, n = sky.catalog_index, len(sky.catalog_index)
-    return refused_image(
+    return StarObservations.of_image(
         time_ns,
-        camera.width,
-        camera.height,
-        refusal='',
-        detail='',
+        (camera.width, camera.height),
         icrf_from_star_tracker_xyzw=sky.camera_from_icrf.inv().as_quat(),
         catalog_id=catalog.id[rows],
         direction_icrf=catalog.direction_icrs[rows],

@@ -261,7 +261,7 @@ def placed(
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
             continue
         latest_ns = image.time_ns
-        yield refused_image(image.time_ns, width, height, '', '', attitude_gap_s=gap_s)
+        yield StarObservations.of_image(image.time_ns, (width, height), attitude_gap_s=gap_s)
 
 
 def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:

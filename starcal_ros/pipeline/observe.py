@@ -55,8 +55,9 @@ class Track:
     image used.  ``tracked_camera`` measures the next image without a search; None before the first
     image.  ``behind`` counts images in a row with stamps before the last one used, ``behind_ns``
     is the stamp of the latest of them.  ``seen`` is the previous frame, used or not, which a stuck
-    camera repeats; ``hot`` are the hot pixels detected so far.  ``held`` is the first image used
-    with the attitude of the last one.  ``taken`` counts the images of each star tracker;
+    camera repeats; ``hot`` are the hot pixels detected so far.
+    ``first_with_same_attitude`` is the first image of the current run of bit-identical attitudes
+    of images used.  ``taken`` counts the images of each star tracker;
     ``others`` holds a state for each additional one, because mountings are not exact.  ``unfit``
     lists star trackers whose attitude was refused while another one was accepted.
     """
@@ -68,7 +69,7 @@ class Track:
     behind_ns: int = 0
     seen: Fingerprint | None = None
     hot: HotPixels | None = None
-    held: StarObservations | None = None
+    first_with_same_attitude: StarObservations | None = None
     taken: Mapping[str, int] = dataclasses.field(default_factory=dict)
     unfit: Mapping[str, Unfit] = dataclasses.field(default_factory=dict)
     others: Mapping[str, Track] = dataclasses.field(default_factory=dict)
@@ -197,7 +198,10 @@ def _with_one(
     # The error of the mounting exceeds the uncertainty of a tracked camera.
     own = track.others.get(name, Track(track.geometry)) if name else track
     before = dataclasses.replace(
-        track, geometry=own.geometry, tracked_camera=own.tracked_camera, held=own.held
+        track,
+        geometry=own.geometry,
+        tracked_camera=own.tracked_camera,
+        first_with_same_attitude=own.first_with_same_attitude,
     )
     exposure = dataclasses.replace(
         exposure,
@@ -208,7 +212,8 @@ def _with_one(
     observations = dataclasses.replace(observations, **_known_of(attitude))
     if observations.refusal:
         return observations, track
-    after = dataclasses.replace(after, held=_first_at_attitude(observations, before.held, setup))
+    first = _first_with_same_attitude(observations, before.first_with_same_attitude, setup)
+    after = dataclasses.replace(after, first_with_same_attitude=first)
     taken = {**track.taken, name: track.taken.get(name, 0) + 1}
     if not name:
         return observations, dataclasses.replace(after, taken=taken)
@@ -288,23 +293,26 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
     return observations, _after_image(after, exposure, observations, setup)
 
 
-def _first_at_attitude(
-    observations: StarObservations, held: StarObservations | None, setup: Setup
+def _first_with_same_attitude(
+    observations: StarObservations, first: StarObservations | None, setup: Setup
 ) -> StarObservations:
     """
-    First image with the attitude of this image; ``held`` is that of the previous image.
+    First image with the attitude of this image; ``first`` is that of the previous image.
 
-    Raises ImageRefused ``frozen_attitude`` if the attitude equals that of ``held`` to the last
+    Raises ImageRefused ``frozen_attitude`` if the attitude equals that of ``first`` to the last
     digit, which a working star tracker's noise rules out, and the stars have turned by more than
     its sigma.
     """
     attitude = observations.icrf_from_star_tracker_xyzw
-    if held is None or np.abs(attitude - held.icrf_from_star_tracker_xyzw).max() > _SAME_ATTITUDE:
+    if first is None:
+        return observations
+    difference = attitude - first.icrf_from_star_tracker_xyzw
+    if np.abs(difference).max() > _SAME_ATTITUDE:
         return observations
     # Comparable, since both use the prior camera.
     before, now = (
         Rotation.from_quat(realigned(setup.prior, image).star_tracker_from_camera_xyzw)
-        for image in (held, observations)
+        for image in (first, observations)
     )
     turn = np.abs((before.inv() * now).as_rotvec())
     across_rad, around_rad = float(np.hypot(turn[0], turn[1])), float(turn[2])
@@ -321,7 +329,7 @@ def _first_at_attitude(
             'frozen_attitude',
             f'one attitude, but the stars have turned {turned_arcsec:.0f} arcsec',
         )
-    return held
+    return first
 
 
 def _after_image(

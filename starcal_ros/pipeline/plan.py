@@ -30,7 +30,7 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
-from starcal_ros.records import Ensemble, refused_image, StarObservations
+from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.text import significant
 
 _CANDIDATES = 150  # in a cone: on the whole sky 16 degrees apart
@@ -230,12 +230,9 @@ def _expected(
     variance = expected_noise_px2(estimate, magnitude)
     zero = np.zeros(len(magnitude))
     unknown = np.full(len(magnitude), np.nan, np.float32)
-    return refused_image(
+    return StarObservations.of_image(
         last.time_ns,
-        camera.width,
-        camera.height,
-        refusal='',
-        detail='',
+        (camera.width, camera.height),
         icrf_from_star_tracker_xyzw=star_tracker.as_quat(),
         catalog_id=setup.catalog.id[stars.catalog_index],
         direction_icrf=stars.direction_icrf,

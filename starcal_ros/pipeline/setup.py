@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import math
 from pathlib import Path
 import re
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,7 +33,6 @@ from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.options import (
     from_mapping,
-    holds_options,
     is_of_ros,
     names_of,
     option,
@@ -214,15 +213,22 @@ class Setup:
         """Every option of every stage, by name."""
         return {
             field.name: getattr(getattr(self, group), field.name)
-            for group, kind in _OPTION_GROUPS.items()
+            for group, kind in _OPTION_GROUPS
             for field in option_fields(kind)
         }
 
 
-_OPTION_GROUPS: dict[str, type[Any]] = {
-    name: kind for name, kind in get_type_hints(Setup).items() if holds_options(kind)
-}
-OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
+_OPTION_GROUPS: tuple[tuple[str, type[Any]], ...] = (
+    ('frames', SetupOptions),
+    ('attitude', AttitudeOptions),
+    ('site', SiteOptions),
+    ('screening', ScreeningOptions),
+    ('centroid', CentroidOptions),
+    ('identification', IdentificationOptions),
+    ('calibration', CalibrationOptions),
+    ('gate', GateOptions),
+)
+OPTION_CLASSES = tuple(kind for _, kind in _OPTION_GROUPS)
 
 
 def read_setup(params: Path) -> Setup:
@@ -292,7 +298,7 @@ def load_setup(
     for name in values:
         if name not in known and not is_of_ros(name):
             raise OptionError(unknown_option(name, known))
-    groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
+    groups: dict[str, Any] = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS}
     frames: SetupOptions = groups['frames']
     _check_relative(files_of(frames))
     is_aligned = prior is not None or any(frames.prior_alignment)

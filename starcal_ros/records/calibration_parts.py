@@ -30,19 +30,19 @@ class HeldTerm:
     """
     An unknown that is held or has a stated prior, with its estimate from the stars.
 
-    ``assumed`` is the held or prior value, ``asked`` the estimate from the stars, ``sigma`` the
+    ``assumed`` is the held or prior value, ``estimated`` that from the stars; ``sigma`` is the
     1-sigma of their difference if the assumption is true.
     """
 
     name: str
     assumed: float
-    asked: float
+    estimated: float
     sigma: float
 
     @property
     def significance(self) -> float:
         """The difference in sigmas."""
-        return abs(self.asked - self.assumed) / self.sigma
+        return abs(self.estimated - self.assumed) / self.sigma
 
 
 @dataclass(frozen=True)

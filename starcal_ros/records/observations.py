@@ -239,6 +239,32 @@ class StarObservations:
         default_factory=lambda: np.zeros(2)
     )
 
+    @classmethod
+    def of_image(cls, time_ns: int, size: tuple[int, int], **known: object) -> StarObservations:
+        """Return observations of an image of (width, height) px; unstated fields are unknown."""
+        empty = cls(
+            time_ns=time_ns,
+            width=size[0],
+            height=size[1],
+            refusal='',
+            detail='',
+            icrf_from_star_tracker_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+            attitude_gap_s=math.nan,
+            catalog_id=np.empty(0, np.int64),
+            direction_icrf=np.empty((0, 3)),
+            magnitude=np.empty(0, np.float32),
+            measured_px=np.empty((0, 2)),
+            covariance_px2=np.empty((0, 3)),
+            flux_dn=np.empty(0, np.float32),
+            snr=np.empty(0, np.float32),
+            refused_stars={},
+            background_dn=0.0,
+            noise_dn=0.0,
+            psf_sigma_px=0.0,
+            catalog_digest='',
+        )
+        return dataclasses.replace(empty, **known)  # type: ignore[arg-type]
+
     def __len__(self) -> int:
         """Return the number of stars."""
         return len(self.catalog_id)
@@ -272,29 +298,10 @@ STAR_COLUMNS = (
 def refused_image(
     time_ns: int, width: int, height: int, refusal: str, detail: str, **known: object
 ) -> StarObservations:
-    """Observations without stars: the record of an image that cannot be used."""
-    empty = StarObservations(
-        time_ns=time_ns,
-        width=width,
-        height=height,
-        refusal=refusal,
-        detail=detail,
-        icrf_from_star_tracker_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        attitude_gap_s=math.nan,
-        catalog_id=np.empty(0, np.int64),
-        direction_icrf=np.empty((0, 3)),
-        magnitude=np.empty(0, np.float32),
-        measured_px=np.empty((0, 2)),
-        covariance_px2=np.empty((0, 3)),
-        flux_dn=np.empty(0, np.float32),
-        snr=np.empty(0, np.float32),
-        refused_stars={},
-        background_dn=0.0,
-        noise_dn=0.0,
-        psf_sigma_px=0.0,
-        catalog_digest='',
+    """Observations without stars: the record of an image that cannot be used, and why."""
+    return StarObservations.of_image(
+        time_ns, (width, height), refusal=refusal, detail=detail, **known
     )
-    return dataclasses.replace(empty, **known)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

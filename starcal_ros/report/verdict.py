@@ -169,7 +169,7 @@ def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
         if term.significance >= INFORMATIVE_SIGMAS:
             yield ModelRow(
                 f'{term.name} is {significant(term.assumed, 6)}',
-                f'the stars put it at {significant(term.asked, 6)}: '
+                f'the stars put it at {significant(term.estimated, 6)}: '
                 f'{term.significance:.1f} sigma of the difference',
                 _p(math.erfc(term.significance / math.sqrt(2))),
                 f'estimate {term.name} (estimate) or widen its prior (prior_sigma)',

@@ -253,25 +253,25 @@ class Calibrator(StarcalNode):
                 self._status.publish(message)
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
-        return self._told(self._judged(self._state.solve()), response)
+        return self._publish_and_answer(self._note_gate(self._state.solve()), response)
 
     def _on_solve(self, request: Any, response: Any) -> Any:
-        answer = self._judged(
+        answer = self._note_gate(
             self._state.solve(
                 request.method, tuple(request.estimate), request.dry_run, request.force
             )
         )
         if answer.calibration is not None:
             response.calibration = calibration_to_message(answer.calibration, make_message)
-        return self._told(answer, response)
+        return self._publish_and_answer(answer, response)
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
         answer = self._state.reset()
         self._status_is_due.set()
-        return self._told(answer, response)
+        return self._publish_and_answer(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
-        return self._told(self._state.rollback(), response)
+        return self._publish_and_answer(self._state.rollback(), response)
 
     def _on_lookup(self, request: Any, response: Any) -> Any:
         active = self._state.active
@@ -307,14 +307,14 @@ class Calibrator(StarcalNode):
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
-    def _judged(self, answer: Answer) -> Answer:
+    def _note_gate(self, answer: Answer) -> Answer:
         """Store the result of the gate for the diagnostics."""
         if answer.calibration is not None:
             reasons = '; '.join(answer.calibration.reasons)
             self._last_gate = 'accepted' if answer.calibration.accepted else f'refused: {reasons}'
         return answer
 
-    def _told(self, answer: Answer, response: Any) -> Any:
+    def _publish_and_answer(self, answer: Answer, response: Any) -> Any:
         """Publish the active or the refused calibration; return the filled response."""
         if not self.is_active:
             pass  # deactivated meanwhile: activation publishes the active calibration

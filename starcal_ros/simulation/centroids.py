@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project_jacobians
-from starcal_ros.records import Ensemble, refused_image, StarObservations
+from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation.rendering import pixel_stamps
 from starcal_ros.simulation.scenario import (
     attitude_samples,
@@ -90,12 +90,9 @@ def observations(
     """Observations of all stars of a scene by their centroids (n, 2) and covariances (n, 2, 2)."""
     camera, detector = scenario.truth.camera, scenario.detector
     signal_dn = detector.background_electrons / detector.electrons_per_dn
-    return refused_image(
+    return StarObservations.of_image(
         shown.time_ns,
-        camera.width,
-        camera.height,
-        refusal='',
-        detail='',
+        (camera.width, camera.height),
         icrf_from_star_tracker_xyzw=shown.icrf_from_star_tracker_xyzw,
         attitude_gap_s=0.5,
         catalog_id=shown.catalog_id,

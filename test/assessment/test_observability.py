@@ -24,7 +24,7 @@ from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
-from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
 from starcal_ros.simulation.centroids import cramer_rao_covariance, true_observations
 from starcal_ros.simulation.scenario import scenario
 
@@ -173,7 +173,7 @@ def test_every_corner_of_the_detector_has_its_cell() -> None:
     u, v = camera.width - 0.51, camera.height - 0.51
     corners = np.array([[-0.49, -0.49], [u, -0.49], [-0.49, v], [u, v]])
     image = dataclasses.replace(
-        refused_image(0, camera.width, camera.height, '', ''),
+        StarObservations.of_image(0, (camera.width, camera.height)),
         catalog_id=np.arange(4),
         measured_px=corners,
     )

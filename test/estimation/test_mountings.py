@@ -203,7 +203,7 @@ def test_a_wrong_mounting_costs_no_image_and_is_named(
         assert np.linalg.norm(error) < 5 * np.sqrt(np.trace(C)) + pull
     off = [term for term in model_checks(found).held if term.name.startswith('mounting of head_1')]
     assert len(off) == 3
-    turn_deg = np.linalg.norm([term.asked for term in off])
+    turn_deg = np.linalg.norm([term.estimated for term in off])
     # The other mountings are wrong by 270 arcsec too, and the pull is as above.
     assert turn_deg == pytest.approx(degrees, rel=0.04, abs=0.2)
     assert max(term.significance for term in off) > 5.0

@@ -22,7 +22,7 @@ from starcal_ros.estimation.star_equations import (
     StarTable,
     whitening,
 )
-from starcal_ros.records import refused_image, StarObservations
+from starcal_ros.records import StarObservations
 
 CAMERA_MODEL = CameraModel(
     1296, 1024, np.array([3640, 0.7, 3630, 640, 515, -0.05, 0.1, 0.2, 4e-4, -3e-4])
@@ -43,7 +43,7 @@ def made(sizes: tuple[int, ...] = SIZES, seed: int = 1) -> tuple[StarTable, np.n
         C = L @ L.transpose(0, 2, 1)
         images.append(
             dataclasses.replace(
-                refused_image(0, 1296, 1024, '', ''),
+                StarObservations.of_image(0, (1296, 1024)),
                 catalog_id=np.arange(n),
                 direction_icrf=rotation.inv().apply(e).reshape(n, 3),
                 measured_px=project(CAMERA_MODEL, e) + rng.normal(0, 1, (n, 2)),

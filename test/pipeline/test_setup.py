@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.options import holds_options, names_of, REMOVED
+from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, read_setup, Setup
 
@@ -49,7 +50,11 @@ def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
 
 def test_a_setup_holds_the_options_of_every_stage(setup: Setup) -> None:
     """None that one of its fields has is missing where parameters are declared and told."""
-    held = [value for value in vars(setup).values() if holds_options(type(value))]
+    held = [
+        value
+        for value in vars(setup).values()
+        if dataclasses.is_dataclass(value) and option_fields(type(value))
+    ]
     assert tuple(map(type, held)) == OPTION_CLASSES and len(held) == 8
     for group in held:
         assert names_of(type(group)) <= setup.options().keys()
@@ -84,28 +89,6 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
     load_setup(both, NODE_OPTION_CLASSES)
     with pytest.raises(OptionError, match='autostart: no such parameter'):
         load_setup(both)
-
-
-def test_an_option_that_was_removed_is_named_with_what_replaces_it(camera_yaml: Path) -> None:
-    """As in a parameter file of an older version."""
-    assert not REMOVED.keys() & names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
-    text = 'residual_field: not an option any more: .* always estimated, .*; take it out'
-    with pytest.raises(OptionError, match=text):
-        load_setup(values(camera_yaml, residual_field=True))
-    words = ' '.join(REMOVED.values()).replace(',', ' ').replace(';', ' ').split()
-    kinds = ('max_', 'min_', 'prior_', 'velocity_sigma')
-    named = {word for word in words if word.startswith(kinds)}
-    assert len(named) > 8 and named <= names_of(*OPTION_CLASSES)
-
-
-@pytest.mark.parametrize('name', REMOVED)
-def test_each_removed_option_is_refused_in_one_line(camera_yaml: Path, name: str) -> None:
-    """With every kind of value that it may have had."""
-    with pytest.raises(OptionError) as refused:
-        load_setup(values(camera_yaml, **{name: 1.0}), NODE_OPTION_CLASSES)
-    text = str(refused.value)
-    assert text == f'{name}: not an option any more: {REMOVED[name]}; take it out'
-    assert len(text) < 200 and '\n' not in text
 
 
 def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(

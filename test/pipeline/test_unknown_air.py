@@ -19,7 +19,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.pipeline.from_stars import options_of, pinhole
 from starcal_ros.pipeline.unknown_air import with_air
-from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
+from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.scenario import scenario
 from starcal_ros.sky.astrometry import (
     apparent_directions,
@@ -58,7 +58,7 @@ def seen_from(site: SiteOptions, seed: int, wrong_clock: bool = False) -> list[S
         stamp_ns = START_NS + int(rng.integers(10**15)) if wrong_clock else time_ns
         found.append(
             dataclasses.replace(
-                refused_image(stamp_ns, 1200, 900, '', ''),
+                StarObservations.of_image(stamp_ns, (1200, 900)),
                 icrf_from_star_tracker_xyzw=attitude.inv().as_quat(),
                 catalog_id=stars.id[inside],
                 direction_icrf=apparent[inside],

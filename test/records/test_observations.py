@@ -5,7 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_ros.records import STAR_REFUSALS, StarRefusal
+from starcal_ros.records import (
+    Ensemble,
+    refused_image,
+    STAR_REFUSALS,
+    StarObservations,
+    StarRefusal,
+)
 
 
 def test_codes_fit_their_arrays() -> None:
@@ -32,3 +38,12 @@ def test_names_are_those_of_0_1() -> None:
         'faint',
         'ambiguous',
     }
+
+
+def test_an_image_is_used_until_it_is_refused() -> None:
+    used = StarObservations.of_image(5, (640, 512), noise_dn=2.0)
+    assert (used.time_ns, used.width, used.height, used.noise_dn) == (5, 640, 512, 2.0)
+    assert used.refusal == used.detail == '' and len(used) == 0
+    refused = refused_image(5, 640, 512, 'no_match', 'three stars')
+    assert (refused.refusal, refused.detail) == ('no_match', 'three stars')
+    assert Ensemble().add(used).images and not Ensemble().add(refused).images

@@ -10,7 +10,7 @@ import pytest
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.detector_field import DetectorField
-from starcal_ros.records import CameraGeometry, refused_image
+from starcal_ros.records import CameraGeometry, refused_image, StarObservations
 from starcal_ros.report import detector_figures as figures
 from starcal_ros.report import svg
 
@@ -89,7 +89,7 @@ def test_pointings_count_images_with_an_attitude() -> None:
     geometry = CameraGeometry(CAMERA, np.array([0.0, 0, 0, 1]))
     turned = np.array([0.0, np.sin(0.3), 0.0, np.cos(0.3)])
     seen = [
-        refused_image(1, 640, 512, '', '', icrf_from_star_tracker_xyzw=turned),
+        StarObservations.of_image(1, (640, 512), icrf_from_star_tracker_xyzw=turned),
         refused_image(
             2, 640, 512, 'no_match', '', icrf_from_star_tracker_xyzw=turned, attitude_gap_s=0.5
         ),

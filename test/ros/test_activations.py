@@ -64,14 +64,14 @@ def test_what_is_latched_is_what_is_active(client: Client, calibrator: Calibrato
 
     def tell(answer: Answer) -> None:
         for _ in range(20):
-            calibrator._told(answer, Trigger.Response())
+            calibrator._publish_and_answer(answer, Trigger.Response())
 
     threads = [threading.Thread(target=tell, args=(answer,)) for answer in (earlier, later)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    calibrator._told(earlier, Trigger.Response())
+    calibrator._publish_and_answer(earlier, Trigger.Response())
     infos = client.latched(CameraInfo, 'camera_info')
     alignments = client.latched(TransformStamped, 'alignment')
     calibrations = client.latched(Calibration, 'calibration')

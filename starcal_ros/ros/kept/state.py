@@ -73,12 +73,13 @@ class CalibratorState:
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibration
-        # Of the records below, never held during a solve; the activations change under both locks.
+        # Guards the fields below; never held during a solve.  Activations change only with both
+        # locks held, `_disk` first.
         self._records = threading.Lock()
         self._ensemble = Ensemble()
         self._history: tuple[Activation, ...] = ()
         self._active: Activation | None = None  # of the history
-        self._disk = threading.Lock()  # of the archive; taken before the other
+        self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
 

@@ -34,8 +34,8 @@ def observed(k: int) -> StarObservations:
     measured[7] += 5.0
     unknown = np.full(STARS, np.nan, np.float32)
     covariance = np.tile([NOISE_PX**2, 0.0, NOISE_PX**2], (STARS, 1))
-    return refused_image(
-        FIRST_NS + k * 10**10, 1296, 1024, refusal='', detail='',
+    return StarObservations.of_image(
+        FIRST_NS + k * 10**10, (1296, 1024),
         catalog_id=np.arange(STARS), direction_icrf=direction, magnitude=unknown,
         measured_px=measured, covariance_px2=covariance, flux_dn=unknown, snr=unknown,
     )  # fmt: skip

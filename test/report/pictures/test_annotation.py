@@ -31,7 +31,7 @@ def two_stars() -> StarObservations:
     in_camera = line_of_sight(GEOMETRY.camera, PIXELS)
     turn = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
     return dataclasses.replace(
-        refused_image(0, 200, 120, '', ''),
+        StarObservations.of_image(0, (200, 120)),
         catalog_id=np.array([1, 2]),
         direction_icrf=in_camera @ turn.T,
         magnitude=np.zeros(2, np.float32),
@@ -50,7 +50,7 @@ def test_predictions_meet_measurements() -> None:
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_marks_stand_at_the_stars(dtype: Any) -> None:
     plain = Image(0, np.full((120, 200), 7, dtype))
-    empty = annotate(plain, refused_image(0, 200, 120, '', ''), GEOMETRY)
+    empty = annotate(plain, StarObservations.of_image(0, (200, 120)), GEOMETRY)
     picture = annotate(plain, two_stars(), GEOMETRY)
     assert picture.shape == (120, 200, 3) and picture.dtype == np.uint8
     changed = (picture != empty).any(axis=2)
@@ -96,7 +96,7 @@ def test_every_reason_has_a_mark_of_its_own() -> None:
 def test_refused_stars_are_marked_by_reason() -> None:
     """Each stands at its place in the colour of its reason, which the legend shows again."""
     shown = dataclasses.replace(
-        refused_image(0, 1000, 600, '', ''),
+        StarObservations.of_image(0, (1000, 600)),
         refused_stars={'blend': 1, 'of another version': 1, 'saturated': 0},
         refused_catalog_id=np.array([5, 6]),
         refused_px=np.array([[700.0, 400.0], [800.0, 500.0]], np.float32),

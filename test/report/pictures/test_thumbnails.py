@@ -13,7 +13,7 @@ import pytest
 
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.errors import ProductError
-from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures.thumbnails import (
     Album,
     read_thumbnails,
@@ -32,12 +32,10 @@ CUT_OUTS = (('blend', 0), ('blend', 1), ('blend', 2), ('saturated', 5), ('faint'
 
 def observed(time_ns: int, refusal: str = '') -> StarObservations:
     """An image without stars used and with one left out."""
-    return refused_image(
+    return StarObservations.of_image(
         time_ns,
-        640,
-        512,
-        refusal,
-        '',
+        (640, 512),
+        refusal=refusal,
         refused_stars={'saturated': 1},
         refused_catalog_id=np.array([7]),
         refused_px=np.array([[200.0, 100.0]], np.float32),
@@ -118,7 +116,7 @@ def test_a_large_image_is_reduced_before_it_is_drawn() -> None:
     geometry = CameraGeometry(camera, np.array([0.0, 0, 0, 1]))
     place = np.array([[1944.0, 512.0]])
     record = dataclasses.replace(
-        refused_image(1, 2592, 2048, '', ''),
+        StarObservations.of_image(1, (2592, 2048)),
         catalog_id=np.array([1]),
         direction_icrf=line_of_sight(camera, place),
         magnitude=np.zeros(1, np.float32),

@@ -68,12 +68,3 @@ def test_a_misspelt_parameter_stops_a_node(start_node: StartNode, tiny_bag: Path
     node = start_node('star_observer', ros=ros)
     assert node.wait() == 2
     assert 'magnitude_limt: no such parameter (did you mean magnitude_limit?)' in node.said()
-
-
-def test_a_parameter_of_an_older_version_is_named_with_what_replaces_it(
-    start_node: StartNode, tiny_bag: Path
-) -> None:
-    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'residual_field:=true')
-    node = start_node('calibrator', ros=ros)
-    assert node.wait() == 2
-    assert 'residual_field: not an option any more: the field over the detector' in node.said()
