@@ -113,7 +113,7 @@ def _numbers(calibration: Calibration) -> GateCheck:
 def _fit(
     calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
 ) -> Iterator[GateCheck]:
-    """Residuals, outliers, and the number of images and stars that fit."""
+    """Residuals, outliers, and the number of images that fit."""
     stars = max(calibration.stars_used + calibration.stars_rejected, 1)
     yield limit_check(
         options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
@@ -132,7 +132,6 @@ def _fit(
         misfits / max(images, 1),
     )
     yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
-    yield limit_check(estimation, 'min_stars', 'number of stars that fit', calibration.stars_used)
 
 
 def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:

@@ -28,7 +28,6 @@ REMEDIES: Mapping[str, str] = {
     'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals)',
     'max_misfit_fraction': 'check the attitudes and stamps of the misfit images (Alignment)',
     'min_images': 'take more images',
-    'min_stars': 'take more images',
     'min_coverage': 'take images with stars in the empty cells (Coverage)',
     'max_rotation_deg': 'check the prior alignment (prior_alignment)',
     'max_step_px': 'find out if the camera has changed',

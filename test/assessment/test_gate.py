@@ -285,15 +285,14 @@ def test_each_limit_of_a_change_trips_alone(
     assert ('active calibration' in reason) == (active is not None)
 
 
-def test_the_remaining_images_and_stars_must_be_enough() -> None:
-    """The limits on images and stars hold for those that fit, not for those collected."""
+def test_the_remaining_images_must_be_enough() -> None:
+    """The limit on images holds for those that fit, not for those collected."""
     options = GateOptions(max_misfit_fraction=1.0)
     found = dataclasses.replace(
         GOOD, misfit_images_ns=tuple(range(18)), stars_used=50, stars_rejected=0
     )
     assert reasons(found, options) == (
         'number of images that fit is 2, under the limit of 3 (min_images)',
-        'number of stars that fit is 50, under the limit of 60 (min_stars)',
     )
 
 
@@ -335,7 +334,7 @@ def test_every_limit_has_its_check() -> None:
     found = checks(dataclasses.replace(GOOD, star_trackers=(tracker,)), GateOptions())
     assert all(check.passed for check in found.values())
     limited = {name for name in found if found[name].option}
-    assert limited == names_of(GateOptions) | {'min_images', 'min_stars'}
+    assert limited == names_of(GateOptions) | {'min_images'}
     for name in names_of(GateOptions):
         assert found[name].limit == getattr(GateOptions(), name)
     assert 'p-value 0.7' in found['max_detector_step_px'].note
@@ -389,8 +388,8 @@ def test_a_calibration_of_an_older_file_has_no_checks_of_the_model() -> None:
 
 
 def test_large_counts_are_written_out() -> None:
-    found = checks(dataclasses.replace(GOOD, stars_used=123456), GateOptions())['min_stars']
-    assert (found.found_text, found.limit_text) == ('123456', '60')
+    found = checks(dataclasses.replace(GOOD, images_used=123457), GateOptions())['min_images']
+    assert (found.found_text, found.limit_text) == ('123456', '3')
 
 
 def test_a_search_that_did_not_converge_is_refused() -> None:
