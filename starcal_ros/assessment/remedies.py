@@ -29,9 +29,9 @@ REMEDIES: Mapping[str, str] = {
     'max_misfit_fraction': 'check the attitudes and stamps of the misfit images (Alignment)',
     'min_images': 'take more images',
     'min_coverage': 'take images with stars in the empty cells (Coverage)',
-    'max_rotation_deg': 'check the prior alignment (prior_alignment)',
-    'max_step_px': 'find out if the camera has changed',
-    'max_step_rotation_deg': 'find out if the mounting has changed',
+    'max_rotation_deg': 'check the alignment assumed (prior_alignment) and the mounting',
+    'change of the camera': 'find out if the camera has changed',
+    'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
     'assumed velocity': 'the velocity or the clock is wrong, or air bends the light: check the '
     'velocity topic, the stamps and the site',
