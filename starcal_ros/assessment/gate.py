@@ -120,18 +120,12 @@ def _fit(
         options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
     )
     images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
-    yield limit_check(
-        options,
-        'max_rejected_fraction',
-        'fraction of stars left out as outliers',
-        calibration.stars_rejected / stars,
+    rejected = (
+        (calibration.stars_rejected / stars, 'fraction of stars left out as outliers'),
+        (misfits / max(images, 1), 'fraction of images whose attitude does not fit'),
     )
-    yield limit_check(
-        options,
-        'max_misfit_fraction',
-        'fraction of images whose attitude does not fit',
-        misfits / max(images, 1),
-    )
+    fraction, name = max(rejected)
+    yield limit_check(options, 'max_rejected_fraction', name, fraction)
     yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
 
 

@@ -18,7 +18,11 @@ class GateOptions:
         1.0, 'largest RMS residual per axis of the stars used, px', low=0.0, high=100.0
     )
     max_rejected_fraction: float = option(
-        0.25, 'largest fraction of stars rejected as outliers', low=0.0, high=1.0
+        0.25,
+        'largest fraction of stars rejected as outliers, and of images with an attitude that'
+        ' contradicts the other images',
+        low=0.0,
+        high=1.0,
     )
     min_coverage: float = option(
         0.3, 'smallest fraction of detector cells with a star used', low=0.0, high=1.0
@@ -42,12 +46,6 @@ class GateOptions:
         ' frame, degrees; without one five times as much from the prior',
         low=0.0,
         high=180.0,
-    )
-    max_misfit_fraction: float = option(
-        0.3,
-        'largest fraction of images with an attitude that contradicts the other images',
-        low=0.0,
-        high=1.0,
     )
     max_line_of_sight_sigma_arcsec: float = option(
         120.0,

@@ -151,12 +151,12 @@ def test_a_good_calibration_passes() -> None:
         ),
         (
             {'misfit_images_ns': (1, 2, 3, 4, 5, 6)},
-            'max_misfit_fraction',
+            'max_rejected_fraction',
             0.3,
             0.29,
             (
                 'fraction of images whose attitude does not fit is 0.3, over the limit of 0.29 '
-                '(max_misfit_fraction)'
+                '(max_rejected_fraction)'
             ),
         ),
         (
@@ -294,7 +294,7 @@ def test_each_limit_of_a_change_trips_alone(
 
 def test_the_remaining_images_must_be_enough() -> None:
     """The limit on images holds for those that fit, not for those collected."""
-    options = GateOptions(max_misfit_fraction=1.0)
+    options = GateOptions(max_rejected_fraction=1.0)
     found = dataclasses.replace(
         GOOD, misfit_images_ns=tuple(range(18)), stars_used=50, stars_rejected=0
     )
