@@ -24,6 +24,7 @@ from starcal_ros.records import (
 )
 from starcal_ros.text import p_value_text, significant
 
+_PRIOR_FACTOR = 5.0  # of the limits on changes: a prior is not as good as a calibration
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
 _PART_TOLERANCE = 0.05  # largest accepted deviation of a normalised residual from 1
@@ -113,26 +114,19 @@ def _numbers(calibration: Calibration) -> GateCheck:
 def _fit(
     calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
 ) -> Iterator[GateCheck]:
-    """Residuals, outliers, and the number of images and stars that fit."""
+    """Residuals, outliers, and the number of images that fit."""
     stars = max(calibration.stars_used + calibration.stars_rejected, 1)
     yield limit_check(
         options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
     )
     images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
-    yield limit_check(
-        options,
-        'max_rejected_fraction',
-        'fraction of stars left out as outliers',
-        calibration.stars_rejected / stars,
+    rejected = (
+        (calibration.stars_rejected / stars, 'fraction of stars left out as outliers'),
+        (misfits / max(images, 1), 'fraction of images whose attitude does not fit'),
     )
-    yield limit_check(
-        options,
-        'max_misfit_fraction',
-        'fraction of images whose attitude does not fit',
-        misfits / max(images, 1),
-    )
+    fraction, name = max(rejected)
+    yield limit_check(options, 'max_rejected_fraction', name, fraction)
     yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
-    yield limit_check(estimation, 'min_stars', 'number of stars that fit', calibration.stars_used)
 
 
 def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
@@ -178,37 +172,30 @@ def _changes(
     active: Calibration | None,
     options: GateOptions,
 ) -> Iterator[GateCheck]:
-    """Changes against the prior and against the active calibration."""
-    rotation_rad, left_px = movement(prior, calibration.geometry)
-    step_px, step_deg = _step(active, calibration)
-    of_map, of_sight = 'change of the distortion map', 'rotation of the lines of sight'
+    """Change from the active calibration, or from the prior if none is active."""
+    before, name, factor = prior, 'the prior', _PRIOR_FACTOR
+    if active is not None:
+        before, name, factor = active.geometry, 'the active calibration', 1.0
+    rotation_rad, left_px = movement(before, calibration.geometry)
+    lens = 'the prior camera or its lens model does not match this lens (lens_model)'
     yield limit_check(
         options,
         'max_change_px',
-        f'largest {of_map} from the prior',
+        f'largest change of the distortion map from {name}',
         float(left_px.max()),
         'px',
-        'the prior camera or its lens model does not match this lens (lens_model)',
+        REMEDIES['change of the camera'] if active else lens,
+        factor,
     )
-    for parameter, name, found, unit in (
-        ('max_rotation_deg', f'{of_sight} from the prior', math.degrees(rotation_rad), 'deg'),
-        ('max_step_px', f'largest {of_map} from the active calibration', step_px, 'px'),
-        ('max_step_rotation_deg', f'{of_sight} from the active calibration', step_deg, 'deg'),
-    ):
-        yield limit_check(options, parameter, name, found, unit)
-
-
-def _step(
-    active: Calibration | None, calibration: Calibration
-) -> tuple[float, float] | tuple[str, str]:
-    """Map change (px) and rotation (deg) from the active calibration, or the reason for none."""
-    if active is None:
-        return ('no calibration was active',) * 2
-    model = active.geometry.camera.model
-    if model != calibration.geometry.camera.model:
-        return (f'the active calibration has the lens model {model}',) * 2
-    rotation_rad, left_px = movement(active.geometry, calibration.geometry)
-    return float(left_px.max()), math.degrees(rotation_rad)
+    yield limit_check(
+        options,
+        'max_rotation_deg',
+        f'rotation of the lines of sight from {name}',
+        math.degrees(rotation_rad),
+        'deg',
+        REMEDIES['change of the mounting'] if active else '',
+        factor,
+    )
 
 
 def star_tracker_gate(

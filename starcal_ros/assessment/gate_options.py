@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.options import option
@@ -19,7 +18,11 @@ class GateOptions:
         1.0, 'largest RMS residual per axis of the stars used, px', low=0.0, high=100.0
     )
     max_rejected_fraction: float = option(
-        0.25, 'largest fraction of stars rejected as outliers', low=0.0, high=1.0
+        0.25,
+        'largest fraction of stars rejected as outliers, and of images with an attitude that'
+        ' contradicts the other images',
+        low=0.0,
+        high=1.0,
     )
     min_coverage: float = option(
         0.3, 'smallest fraction of detector cells with a star used', low=0.0, high=1.0
@@ -31,22 +34,18 @@ class GateOptions:
         high=100.0,
     )
     max_change_px: float = option(
-        50.0,
-        'largest change of the distortion map from the prior, common rotation removed, px',
+        10.0,
+        'largest change of the distortion map from the active calibration, common rotation'
+        ' removed, px; without one five times as much from the prior',
         low=0.0,
         high=1e5,
     )
     max_rotation_deg: float = option(
-        2.0,
-        'largest rotation of the lines of sight from the prior in the star tracker frame, degrees',
+        0.4,
+        'largest rotation of the lines of sight from the active calibration in the star tracker'
+        ' frame, degrees; without one five times as much from the prior',
         low=0.0,
         high=180.0,
-    )
-    max_misfit_fraction: float = option(
-        0.3,
-        'largest fraction of images with an attitude that contradicts the other images',
-        low=0.0,
-        high=1.0,
     )
     max_line_of_sight_sigma_arcsec: float = option(
         120.0,
@@ -84,37 +83,23 @@ class GateOptions:
         low=0.0,
         high=648000.0,
     )
-    max_step_px: float = option(
-        10.0,
-        'largest change of the distortion map from the active calibration, common rotation'
-        ' removed, px',
-        low=0.0,
-        high=1e5,
-    )
-    max_step_rotation_deg: float = option(
-        0.5,
-        'largest rotation of the lines of sight from the active calibration, degrees',
-        low=0.0,
-        high=180.0,
-    )
 
 
 def limit_check(
     options: GateOptions | CalibrationOptions,
     option: str,
     name: str,
-    found: float | str,
+    found: float,
     unit: str = '',
     remedy: str = '',
+    factor: float = 1.0,
 ) -> GateCheck:
     """
-    A value, or the reason why there is none, against the limit of an option.
+    A value against a multiple of the limit of an option.
 
     The remedy is the note of a check that failed.
     """
-    limit = float(getattr(options, option))
-    if isinstance(found, str):
-        return GateCheck(name, option, math.nan, limit, unit, None, found)
+    limit = factor * float(getattr(options, option))
     # The condition is the one that must hold, so that NaN fails: a comparison with it is false.
     passed = found >= limit if option.startswith('min_') else found <= limit
     note = '' if passed else remedy

@@ -25,14 +25,13 @@ REMEDIES: Mapping[str, str] = {
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
     # Checks of the gate, by option, with the section of the report.
     'max_residual_rms_px': 'look for smeared images and a wrong lens model (Residuals)',
-    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals)',
-    'max_misfit_fraction': 'check the attitudes and stamps of the misfit images (Alignment)',
+    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'
+    ' attitudes and stamps of misfit images (Alignment)',
     'min_images': 'take more images',
-    'min_stars': 'take more images',
     'min_coverage': 'take images with stars in the empty cells (Coverage)',
-    'max_rotation_deg': 'check the prior alignment (prior_alignment)',
-    'max_step_px': 'find out if the camera has changed',
-    'max_step_rotation_deg': 'find out if the mounting has changed',
+    'max_rotation_deg': 'check the alignment assumed (prior_alignment) and the mounting',
+    'change of the camera': 'find out if the camera has changed',
+    'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
     'assumed velocity': 'the velocity or the clock is wrong, or air bends the light: check the '
     'velocity topic, the stamps and the site',

@@ -24,7 +24,7 @@ class CalibrationOptions:
     """
     Unknowns of the calibration and their prior uncertainties.
 
-    The last three fields are constants in flight: no data sheet states them.
+    The last four fields are constants in flight: no data sheet states them.
     """
 
     method: str = option(
@@ -50,9 +50,6 @@ class CalibrationOptions:
         basic=True,
     )
     min_images: int = option(3, 'smallest number of images in a calibration', low=1, high=100000)
-    min_stars: int = option(
-        60, 'smallest number of star observations in a calibration', low=10, high=1000000
-    )
     max_images: int = option(
         400,
         'largest number of images kept; beyond it the least informative images are dropped',
@@ -120,6 +117,7 @@ class CalibrationOptions:
         low=-273.15,
         high=1000.0,
     )
+    min_stars: int = 60  # observations in a calibration: about five for each unknown of a camera
     # Of 2000 stars without an outlier it rejects one in 12 calibrations.
     outlier_sigma: float = 4.5
     # 1-sigma of cx and cy, as a fraction of the longer side: how far mounts decentre detectors.

@@ -77,7 +77,7 @@ MIN_ELEVATION_DEG = 10.0  # nearer to the horizon the refraction model is off by
 
 @dataclass(frozen=True)
 class SiteOptions:
-    """Site of the camera, in space or on the ground, and the atmosphere above it."""
+    """Site of the camera, in space or on the ground."""
 
     observer: str = option(
         'space',
@@ -94,16 +94,6 @@ class SiteOptions:
     height_m: float = option(
         0.0, 'height of the site above the ellipsoid, m', low=-500.0, high=100000.0
     )
-    air_pressure_hpa: float = option(
-        0.0,
-        'air pressure at the site, not reduced to sea level, hPa; 0: standard pressure at the'
-        ' height of the site',
-        low=0.0,
-        high=1200.0,
-    )
-    air_temperature_degc: float = option(
-        10.0, 'air temperature at the site, degC', low=-100.0, high=60.0
-    )
     observer_velocity_m_s: tuple[float, ...] = option(
         (0.0, 0.0, 0.0),
         'barycentric velocity of the observer along the ICRF axes, m/s, used without a velocity'
@@ -112,6 +102,10 @@ class SiteOptions:
         high=1e6,
         length=3,
     )
+    # Of the air at the site, constants in flight: ten degrees change a refraction of 60 arcsec by
+    # 2 arcsec, nearly the same for all stars of an image.  Zero is the pressure at the height.
+    air_pressure_hpa: float = 0.0
+    air_temperature_degc: float = 10.0
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,6 @@ def test_a_refusal_states_the_measures_against_its_failed_checks(tiny_products: 
 
     options = {check.option for check in calibration.gate}
     assert options >= verdict._SIGMA_LIMITS
-    assert 'failed checks: take more images. Then' in step('min_images', 'min_stars')
+    assert 'failed checks: take more images. Then' in step('min_images')
     assert 'To reduce the sigma' in step('max_map_sigma_px')
     assert step('max_change_px').endswith('failed checks and calibrate again.')

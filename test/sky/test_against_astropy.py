@@ -96,9 +96,9 @@ def test_agrees_with_astropy_gcrs(time_s):
 
 
 SITES = [
-    SiteOptions('ground', 37.18, -3.6, 700.0, 930.0, 12.0),
-    SiteOptions('ground', -33.0, 151.0, 10.0, 1013.0, 25.0),
-    SiteOptions('ground', 78.0, 15.0, 3000.0, 700.0, -30.0),
+    SiteOptions('ground', 37.18, -3.6, 700.0, air_pressure_hpa=930.0, air_temperature_degc=12.0),
+    SiteOptions('ground', -33.0, 151.0, 10.0, air_pressure_hpa=1013.0, air_temperature_degc=25.0),
+    SiteOptions('ground', 78.0, 15.0, 3000.0, air_pressure_hpa=700.0, air_temperature_degc=-30.0),
 ]
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import math
 
@@ -217,7 +218,9 @@ def zenith(site):
 
 @pytest.mark.parametrize('apparent_deg', [30.0, 45.0, 70.0])
 def test_refraction_is_that_of_the_almanac(apparent_deg):
-    site = SiteOptions('ground', 51.5, 0.0, 0.0, 1010.0, 10.0)
+    site = SiteOptions(
+        'ground', 51.5, 0.0, 0.0, air_pressure_hpa=1010.0, air_temperature_degc=10.0
+    )
     _, directions, elevation_rad = zenith(site)
     near = np.abs(np.degrees(elevation_rad) - apparent_deg) < 0.5
     seen, seen_rad = through_the_air(directions[near], TIME_NS, site)
@@ -229,7 +232,9 @@ def test_refraction_is_that_of_the_almanac(apparent_deg):
 
 
 def test_refraction_is_towards_the_zenith_and_nothing_there():
-    site = SiteOptions('ground', -20.0, 70.0, 2600.0, 740.0, 10.0)
+    site = SiteOptions(
+        'ground', -20.0, 70.0, 2600.0, air_pressure_hpa=740.0, air_temperature_degc=10.0
+    )
     up, directions, elevation_rad = zenith(site)
     high = elevation_rad > 0.2
     seen, _ = through_the_air(directions[high], TIME_NS, site)
@@ -243,7 +248,7 @@ def test_refraction_is_towards_the_zenith_and_nothing_there():
 def test_the_turning_earth_moves_stars_east():
     # Air of no pressure: 465.1 m/s at the equator is 0.3199 arcsec (Explanatory Supplement 3rd
     # ed., section 7.2.3).
-    site = SiteOptions('ground', 0.0, 0.0, 0.0, 1e-9)
+    site = SiteOptions('ground', 0.0, 0.0, 0.0, air_pressure_hpa=1e-9)
     up, _, _ = zenith(site)
     moved = through_the_air(up[None], TIME_NS, site)[0][0] - up
     assert np.linalg.norm(moved) == pytest.approx(0.3199 * ARCSECOND_RAD, rel=0.003)
@@ -258,8 +263,8 @@ def test_air_pressure_follows_from_height():
     standard = ((0.0, 15.0, 1013.25), (1500.0, 5.25, 845.6), (3000.0, -4.5, 701.1))
     for height_m, degc, hpa in standard:
         assert standard_pressure_hpa(height_m, degc) == pytest.approx(hpa, rel=0.015)
-    high = SiteOptions('ground', 51.5, 0.0, 1500.0, 0.0, 5.25)
-    said = SiteOptions('ground', 51.5, 0.0, 1500.0, standard_pressure_hpa(1500.0, 5.25), 5.25)
+    high = SiteOptions('ground', 51.5, 0.0, 1500.0, air_temperature_degc=5.25)
+    said = dataclasses.replace(high, air_pressure_hpa=standard_pressure_hpa(1500.0, 5.25))
     directions = np.eye(3)
     for ours, same in zip(
         through_the_air(directions, TIME_NS, high),

@@ -39,8 +39,8 @@ from starcal_ros.records import (
     EnsembleStatus,
 )
 
-# No software on board reads them: they are in calibration.json alone.
-_NOT_SENT = ('model_checks', 'removals')
+# No software on board reads it: it is in calibration.json alone.
+_NOT_SENT = 'model_checks'
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,9 @@ class Alignment:
 
 
 def calibration_to_message(calibration: Calibration, make: Make) -> Message:
-    """Return a starcal/Calibration: the record without ``model_checks`` and ``removals``."""
+    """Return a starcal/Calibration: the record without ``model_checks``."""
     values = plain_record(calibration)
-    for name in _NOT_SENT:
-        del values[name]
+    del values[_NOT_SENT]
     geometry = values.pop('geometry')
     frames = values.pop('parent_frame'), values.pop('child_frame')
     camera = calibration.geometry.camera
