@@ -12,7 +12,6 @@ from pathlib import Path
 import pkgutil
 import re
 import shlex
-import subprocess
 
 import pytest
 
@@ -63,31 +62,24 @@ def spans(document: Path) -> list[str]:
 
 
 @functools.cache
+def files() -> tuple[str, ...]:
+    """Files of the tree, which may be a source archive; those that tools leave in it are none."""
+    folders = (*FOLDERS.split('|'), '.ci', 'bags/tiny', 'debian', 'msg', 'srv')
+    paths = [*ROOT.iterdir(), *(path for name in folders for path in (ROOT / name).rglob('*'))]
+    names = (path.relative_to(ROOT) for path in paths if path.is_file())
+    return tuple(str(name) for name in names if not {'__pycache__', '_build'} & {*name.parts})
+
+
+@functools.cache
 def source() -> str:
-    """Text of all files of the repository that are no documents."""
-    listed = ['git', 'ls-files', '--cached', '--others', '--exclude-standard']
-    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True)
-    paths = [ROOT / name for name in names.stdout.splitlines()]
-    kinds = {
-        '.py',
-        '.msg',
-        '.srv',
-        '.yaml',
-        '.cfg',
-        '.toml',
-        '.xml',
-        '.txt',
-        '.json',
-        '.html',
-        '.c',
-        '.h',
-        '',
-    }
+    """Text of all files of the tree that are no documents, and their names."""
+    kinds = ('.py', '.msg', '.srv', '.yaml', '.cfg', '.toml', '.xml', '.txt', '.json', '.html')
     texts = [
-        path.read_text() for path in paths if path.suffix in kinds and path != Path(__file__)
-        and path.is_file()
-    ]  # fmt: skip
-    return '\n'.join([*texts, *(f'/{name}' for name in names.stdout.splitlines())])
+        (ROOT / name).read_text()
+        for name in files()
+        if Path(name).suffix in (*kinds, '.c', '.h', '') and ROOT / name != Path(__file__)
+    ]
+    return '\n'.join([*texts, *(f'/{name}' for name in files())])
 
 
 @functools.cache
