@@ -28,8 +28,6 @@ from starcal_ros.options import names_of, read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
 
-pytestmark = pytest.mark.slow
-
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
 OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
@@ -223,6 +221,7 @@ def test_the_tool_takes_the_line(line: Line) -> None:
 RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('document', RUNNING, ids=lambda path: path.name)
 def test_the_commands_of_a_document_run(
     document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
