@@ -17,6 +17,7 @@ import pytest
 
 from bench import LONG, NAMES
 import starcal_ros
+import studies as studies_package
 from studies import __main__ as studies
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,7 +29,10 @@ DOCUMENTS = sorted(
         ROOT / 'bench' / 'README.md',
     ]
 )
-MODULES = [module.name for module in pkgutil.walk_packages(starcal_ros.__path__, 'starcal_ros.')]
+MODULES = [
+    *(module.name for module in pkgutil.walk_packages(starcal_ros.__path__, 'starcal_ros.')),
+    *(module.name for module in pkgutil.walk_packages(studies_package.__path__, 'studies.')),
+]
 # Composed by the code, of other packages of ROS, or of the tools whose users read coming_from.md.
 ELSEWHERE = {
     *(
