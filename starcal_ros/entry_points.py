@@ -39,7 +39,8 @@ def _run(name: str) -> int:
         if (error.name or '').startswith('starcal_ros'):
             raise
         if error.name in ('mcap', 'rosbags'):  # rosdep has no key for them
-            why = f'{error.name} is not installed: pip install mcap rosbags'
+            install = f'{sys.executable} -m pip install mcap rosbags'
+            why = f'{error.name} is not installed: {install}'
         else:
             words = ' '.join(str(error).split())
             why = f'ROS 2 is not complete for {sys.executable}: {words}. {_REMEDY}'

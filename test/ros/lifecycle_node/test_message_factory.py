@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from typing import Any
 
@@ -43,7 +44,8 @@ def test_records_survive_the_wire() -> None:
     record = observations()
     message = through_wire(observations_to_message(record, 'cam', make_message))
     assert_same(record, observations_from_message(message))
-    result = calibration()
+    # The checks of the model stay in calibration.json.
+    result = dataclasses.replace(calibration(), model_checks=None)
     message = through_wire(calibration_to_message(result, make_message))
     assert_same(result, calibration_from_message(message))
     message = status_to_message(status(), 'cam', make_message)
