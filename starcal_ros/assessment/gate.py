@@ -62,13 +62,15 @@ def judge(
     checks = (_solver(calibration), _numbers(calibration))
     if not checks[-1].passed:
         return checks
+    # Causes come before their effects: the first reason of a refusal is what to mend.
     return (
         *checks,
-        *_fit(calibration, options, estimation),
         *model_gate(calibration.model_checks, options),
         *star_tracker_gate(calibration.star_trackers, options),
+        *_fit(calibration, options, estimation),
         *_precision(calibration, options),
         *_changes(calibration, prior, active, options),
+        *_predicted(calibration.model_checks, options),
     )
 
 
@@ -221,6 +223,25 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     """Contradictions between the stars and the model with its priors, each with the remedy."""
     if found is None:
         return
+    yield limit_check(
+        options,
+        'max_image_variation_px',
+        'change of the camera from image to image in a corner',
+        found.image_variation_px,
+        'px',
+        f'focal length or lens changes between images: {REMEDIES["change from image to image"]}',
+    )
+    step = found.step
+    yield _significant(
+        options,
+        'max_detector_step_px',
+        f'step of the detector in {step.moved} at {step.across} = {step.place_px:.0f}',
+        abs(step.size_px),
+        'px',
+        step.p_value,
+        REMEDIES['detector step'],
+        _STEP_P_VALUE,
+    )
     for term in found.held:
         check = limit_check(
             options,
@@ -237,26 +258,6 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
                 f'estimate {term.name}, or widen its prior (estimate, prior_sigma)',
             )
         yield dataclasses.replace(check, note=note)
-    step = found.step
-    yield _significant(
-        options,
-        'max_detector_step_px',
-        f'step of the detector in {step.moved} at {step.across} = {step.place_px:.0f}',
-        abs(step.size_px),
-        'px',
-        step.p_value,
-        REMEDIES['detector step'],
-        _STEP_P_VALUE,
-    )
-    yield limit_check(
-        options,
-        'max_image_variation_px',
-        'change of the camera from image to image in a corner',
-        found.image_variation_px,
-        'px',
-        f'focal length or lens changes between images: {REMEDIES["change from image to image"]}',
-    )
-    yield from _predicted(found.predictions, options)
 
 
 def _group(part: ResidualBin) -> str:
@@ -264,8 +265,9 @@ def _group(part: ResidualBin) -> str:
     return f'{part.by} {part.low + first:.4g} to {part.high + first:.4g}'
 
 
-def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[GateCheck]:
+def _predicted(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
     """The part of the data with the largest ratio of residuals to their predicted sigma."""
+    bins = found.predictions if found else ()
     if not bins:
         return
 
@@ -288,7 +290,7 @@ def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[
     passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual
     note = f'not within {_PART_TOLERANCE:.0%} of 1: {", ".join(doubtful)}' if doubtful else ''
     if not passed:
-        note += '; the sigma is wrong there: check the PSF, the lens model or those images'
+        note = 'the sigma is wrong there: check the PSF, the lens model or those images'
     yield dataclasses.replace(check, passed=passed, note=note)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 from pathlib import Path
 import re
 import shutil
@@ -158,8 +159,11 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
     assert len(calibration.gate) > 15
-    failed = dataclasses.replace(calibration.gate[2], found=8.125, passed=False)
-    not_checked = next(check for check in calibration.gate if check.passed is None)
+    checks = {check.option: check for check in calibration.gate}
+    failed = dataclasses.replace(checks['max_residual_rms_px'], found=8.125, passed=False)
+    not_checked = dataclasses.replace(
+        checks['max_change_px'], found=math.nan, passed=None, note='nothing to compare with'
+    )
     shown = dataclasses.replace(calibration, gate=(failed, not_checked))
     write_calibration(shown, tmp_path / CALIBRATION_FILE)
     table = re.findall(
