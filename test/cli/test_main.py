@@ -410,7 +410,7 @@ def test_a_temperature_topic_must_be_there(
         for topic in ('/lens', '/box'):
             writer.write_temperature(topic, 5, 20.0, 'camera')
     # Two thermometers: which one, is asked only where it matters.
-    assert_refused(run('calibrate', two, *files), 'no image of 1 can be used', 'as blank')
+    assert_refused(run('calibrate', two, *files), 'No image of 1 can be used', 'as blank')
     asks = params(focal_temperature_order=1)
     result = run('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
     assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')

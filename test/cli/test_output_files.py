@@ -173,9 +173,6 @@ WRITING: dict[str, str] = {
     ): 'o_0.mcap metadata.yaml import.json params.yaml camera.yaml',
     'catalog HERE/gaia.csv -o HERE/o/deep.npz': 'deep.npz',
     'trend HERE/out -o HERE/o': 'trend.html',
-    'campaign table1 --trials 1 --images 4 --tracker 20 --workers 0 -o HERE/o': (
-        'table1.json table1.svg'
-    ),
     'export HERE/out --to c -o HERE/o': 'starcal_camera.c starcal_camera.h',
     'export HERE/out --to c --table -o HERE/o': 'starcal_camera.bin',
     'export HERE/out --to csv -o HERE/o': 'lines_of_sight.csv',
@@ -191,7 +188,6 @@ WRITING: dict[str, str] = {
 """Commands that write, and the files that they write in ``o/``."""
 WITH_NODES = {
     'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json',
-    'request lookup -o HERE/o/a.csv': 'a.csv',
 }
 
 

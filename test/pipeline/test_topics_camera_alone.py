@@ -99,7 +99,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
     given = ['--params', str(params(tmp_path, **{stated: STATED[stated]}))]
     for command, status in (
         (['calibrate', str(bag), *given, '-o', str(tmp_path / 'out')], 2),
-        (['inspect', str(bag), *given], 3 if stated == 'prior_alignment' else 2),
+        (['inspect', str(bag), *given], 3),
         (['diagnose', str(bag), *given], 2),
     ):
         assert main(command) == status

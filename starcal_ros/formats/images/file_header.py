@@ -20,6 +20,7 @@ _TIFF_ENTRY_BYTES = 12
 _WIDTH, _HEIGHT, _CHANNELS = 256, 257, 277  # tags of TIFF 6.0
 _TIFF_TYPES = {3: 'H', 4: 'I'}
 _TIFF_MOST_ENTRIES = 1000
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b'\xff\xd8', b'\xff\xda', b'\xff\xd9'
 
 
 @dataclass(frozen=True)
@@ -84,3 +85,18 @@ def tiff_header(content: bytes) -> Header | None:
         return Header(tags[_WIDTH], tags[_HEIGHT], tags[_CHANNELS])
     except (struct.error, KeyError):
         return None
+
+
+def is_cut_jpeg(content: bytes) -> bool:
+    """
+    True for a JPEG without an end (ISO 10918-1, annex B).
+
+    Some versions of OpenCV fill what is missing with grey.
+    """
+    if not content.startswith(_JPEG_START):
+        return False
+    at = len(_JPEG_START)
+    # A thumbnail in a segment before the scan has an end of its own.
+    while content[at : at + 1] == b'\xff' and content[at : at + 2] != _JPEG_SCAN:
+        at += 2 + int.from_bytes(content[at + 2 : at + 4], 'big')
+    return content.find(_JPEG_END, at) < 0

@@ -25,7 +25,12 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.file_kinds import FITS, kind_of
-from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
+from starcal_ros.formats.images.file_header import (
+    has_surplus,
+    is_cut_jpeg,
+    png_header,
+    tiff_header,
+)
 from starcal_ros.formats.images.time_systems import Card, middle_of_exposure, TimeError
 from starcal_ros.formats.messages.image_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import regular_file
@@ -282,8 +287,9 @@ def decoded(path: Path, content: bytes) -> NDArray[Any]:
     if header and png_header(content) and has_surplus(content, header):
         raise IngestError(f'{path}: inflates to far more than its pixels')
     values = None
-    with contextlib.suppress(cv2.error):
-        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if not is_cut_jpeg(content):
+        with contextlib.suppress(cv2.error):
+            values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise IngestError(f'{path}: damaged, or in a format that OpenCV cannot read')
     return np.asarray(values)

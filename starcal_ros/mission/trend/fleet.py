@@ -68,10 +68,9 @@ MOST_SILENT = 5  # files that a store does not answer for, in a run; the others 
 _CONNECT_S = 10.0
 _AHEAD = 8  # tasks submitted ahead for each thread of a cluster: cancelling 100,000 is slow
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
-# A task whose worker ends is tried again here, alone; nothing in the current folder is imported.
+# A task whose worker ends is tried again here, alone.
 _SETTINGS = {
     'distributed.scheduler.allowed-failures': 0,
-    'distributed.nanny.pre-spawn-environ.PYTHONSAFEPATH': 1,
     'logging': {'distributed': 'critical'},
 }
 
@@ -595,6 +594,11 @@ def _as_completed(
                 futures.add(submit(task))  # type: ignore[no-untyped-call]
 
 
+def _set_environment(variables: dict[str, str]) -> None:
+    os.environ.clear()
+    os.environ.update(variables)
+
+
 @contextlib.contextmanager
 def _cluster(workers: int, address: str) -> Iterator[tuple[Any, int]]:
     """Client of a Dask cluster, here or at an address, and how many tasks to submit ahead."""
@@ -607,6 +611,10 @@ def _cluster(workers: int, address: str) -> Iterator[tuple[Any, int]]:
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
+        # Dask sets the variables of its workers in this process, for good.
+        stack.callback(_set_environment, dict(os.environ))
+        # Neither workers nor the resource tracker that Python starts import from this folder.
+        os.environ['PYTHONSAFEPATH'] = '1'
         cluster: Any = address
         if not address:
             import cryptography  # noqa: F401

@@ -47,7 +47,7 @@ def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypat
     cameras = Cameras(params=str(TINY / 'params.yaml'))
     fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
     os.utime(tmp_path / 'fleet/one/tiny_0.mcap', (5, 5))
-    monkeypatch.setattr(fleet, '_calibrated', lambda *_: pytest.fail('calibrated again'))
+    monkeypatch.setattr(fleet, 'calibrate_bags', lambda *_: pytest.fail('calibrated again'))
     done = fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
     assert done == fleet.Done(known=1)
 
