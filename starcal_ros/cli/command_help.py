@@ -14,7 +14,7 @@ and prints the result and the truth.
   # write to the folder starcal_demo
   starcal demo
   # write to another folder
-  starcal demo -o /tmp/first_look""",
+  starcal demo -o first_look""",
     'init': """\
 write the first parameter file of a bag or of photographs
 
