@@ -414,14 +414,6 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
     mistakes.add_argument('--gamma', type=gamma, default=1.0, metavar='G', help=what)
 
 
-def _workers(command: argparse.ArgumentParser, what: str, default: int | None) -> None:
-    where = command.add_mutually_exclusive_group()
-    count = _number(int, 0, 1024)
-    where.add_argument('--workers', type=count, default=default, metavar='N', help=what)
-    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
-    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
-
-
 def _export(command: argparse.ArgumentParser) -> None:
     what = 'calibration.json or its folder'
     command.add_argument('calibration', type=Path, metavar='DIR', help=what)
@@ -519,7 +511,11 @@ def _trend(command: argparse.ArgumentParser) -> None:
     command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
     what = 'write the table as trend.parquet too, for other tools'
     command.add_argument('--parquet', action='store_true', help=what)
-    _workers(command, 'worker processes (default: 0, in-process)', 0)
+    where = command.add_mutually_exclusive_group()
+    what = 'worker processes (default: 0, in-process)'
+    where.add_argument('--workers', type=_number(int, 0, 1024), default=0, metavar='N', help=what)
+    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
+    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
 
 
 _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {

@@ -7,11 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 import os
 import sys
-from typing import TextIO, TypeVar
+from typing import TextIO
 
 from starcal_ros.text import printable
-
-T = TypeVar('T')
 
 
 def open_missing_streams() -> None:
@@ -71,14 +69,6 @@ def progress_bar(total: int | None, label: str) -> Iterator[Callable[[], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(label, total=total)
         yield lambda: progress.advance(task)
-
-
-def with_progress(items: Iterable[T], total: int, label: str) -> Iterator[T]:
-    """Yield the items and show how many of them have been processed."""
-    with progress_bar(total, label) as advance:
-        for item in items:
-            yield item
-            advance()
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:

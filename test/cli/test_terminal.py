@@ -11,12 +11,13 @@ import sys
 
 import pytest
 
-from starcal_ros.cli.terminal import print_table, print_verdict, table_lines, with_progress
+from starcal_ros.cli.terminal import print_table, print_verdict, progress_bar, table_lines
 
 SHOW = """
-from starcal_ros.cli.terminal import print_table, print_verdict, with_progress
-for _ in with_progress(range(3), 3, 'images'):
-    pass
+from starcal_ros.cli.terminal import print_table, print_verdict, progress_bar
+with progress_bar(3, 'images') as advance:
+    for _ in range(3):
+        advance()
 print_table(('name', 'value'), [('fx [px]', '1801.03')])
 print_verdict(False, 'refused')
 """
@@ -63,7 +64,9 @@ def test_no_color_is_obeyed() -> None:
 
 
 def test_a_pipe_shows_plain_lines_and_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(with_progress([1, 2], 2, 'images')) == [1, 2]
+    with progress_bar(2, 'images') as advance:
+        advance()
+        advance()
     print_table(('name', 'value'), [('fx', '1801.03'), ('skew', '0')])
     print_verdict(True, 'accepted')
     out, err = capsys.readouterr()
