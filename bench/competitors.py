@@ -24,10 +24,10 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.levenberg_marquardt import covariance
-from starcal_ros.estimation.minimise import minimise
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import Problem, State
+from starcal_ros.estimation.search import minimise
 from starcal_ros.estimation.star_equations import arrange, Measurements, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations

@@ -22,7 +22,7 @@ from starcal_ros.assessment.observability import (
     keep_most_informative,
     predicted_sigma,
 )
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario

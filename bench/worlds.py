@@ -25,7 +25,7 @@ from bench.trials import rms, Score
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import MapCovariance
 from starcal_ros.simulation.centroids import camera_information, scaled_inverse
 from studies.worlds import Campaign, campaign, WORLDS

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate_options import GateOptions
+from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_folder import calibration_file
@@ -32,8 +32,7 @@ from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.pipeline.setup import load_setup, read_setup, read_values
 from starcal_ros.pipeline.topics import Topics, without_attitudes
-from starcal_ros.record_codec import check_shape, plain_record, read_record, read_value
-from starcal_ros.record_fields import fields_of
+from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
 from starcal_ros.records import Calibration, CameraGeometry, StarObservations
 
 __all__ = [

@@ -15,7 +15,7 @@ import os
 import signal
 import sys
 
-from starcal_ros.allocator import use_one_arena
+from starcal_ros.processes import use_one_arena
 
 _REMEDY = (
     'Source the setup files of ROS 2 and of the workspace with starcal, or run it from the'
@@ -26,7 +26,7 @@ _REMEDY = (
 def _run(name: str) -> int:
     """Run the function ``main`` of a module of `starcal_ros.ros`."""
     use_one_arena()
-    # Read when NumPy is imported: see `starcal_ros.blas_threads`, which a vehicle may not have.
+    # Read when NumPy is imported: see `starcal_ros.processes`, which a vehicle may not have.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     # Unless nohup or a shell ignores it; `main` sets the handler of the node.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from starcal_ros.errors import errors_as, OptionError
-from starcal_ros.record_codec import nearest, read_value
-from starcal_ros.record_fields import FieldType, MOST
+from starcal_ros.record_fields import FieldType, MOST, nearest, read_value
 from starcal_ros.untrusted import PARAMETER_BYTES, read_text, shown, yaml_value
 
 OptionValue = bool | int | float | str | tuple[float, ...] | tuple[str, ...]

@@ -1,25 +1,38 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Marks that describe the fields of records, in the types of the fields.
+The marks that describe the fields of records; the one reader and the one writer of records.
 
 A record is a frozen dataclass.  The types of its fields with their marks, such as
-``Annotated[Floats, Finite(), Shape(('n', 2))]``, are its only description: `record_codec` reads
-and writes records by them.
+``Annotated[Floats, Finite(), Shape(('n', 2))]``, are its only description.
+
+`read_record` makes a record of plain values, which JSON, YAML, ROS parameters and messages have in
+common: None, bool, int, float, str, lists or arrays of numbers, and mappings with texts as keys.
+`plain_record` is its inverse.
+
+Reading is strict.  A value of another type or out of range, a wrong shape and a missing key are
+errors of one line with the path of the field, the value and what is allowed.  A key may be missing
+where its field has a default; keys without a field are ignored.  None in place of a number is NaN,
+an unknown number, unless the field is marked `Finite`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 import dataclasses
 from dataclasses import dataclass
+import difflib
 import functools
+import math
 import sys
 import types
-from typing import Annotated, Any, get_args, get_origin, get_type_hints, Union
+from typing import Annotated, Any, get_args, get_origin, get_type_hints, TypeVar, Union
 
 import numpy as np
+from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import MAX_STAMP_NS
+from starcal_ros.untrusted import check_text, shown
 
 MOST = sys.float_info.max
 
@@ -168,3 +181,268 @@ def _field_type(hint: Any, marks: tuple[object, ...] = ()) -> FieldType:
     if origin is tuple:
         return FieldType(tuple, item=_field_type(arguments[0], of_items), **limits)
     return FieldType(dict, item=_field_type(arguments[1], of_items), **limits)  # a Mapping
+
+
+T = TypeVar('T')
+
+_PLAIN = {bool, int, float, str, np.ndarray, type(None)}
+_INT64 = 2**63
+_KINDS = {'f': 'fiu', 'i': 'iu', 'u': 'iu', 'b': 'b'}  # of arrays that are converted
+_COMPARED = 100  # characters: of a word of a million, each comparison takes seconds
+
+
+def plain_record(record: Any) -> dict[str, Any]:
+    """Plain values of a record by field; arrays stay arrays, nested records are mappings."""
+    return {one.name: _plain(getattr(record, one.name)) for one in dataclasses.fields(record)}
+
+
+def _plain(value: Any) -> Any:
+    if type(value) in _PLAIN:
+        return value
+    if dataclasses.is_dataclass(value):
+        return plain_record(value)
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def json_object(record: Any) -> dict[str, Any]:
+    """
+    Plain values of a record or mapping for JSON.
+
+    Arrays are lists, a number that is not finite is null.
+    """
+    found: dict[str, Any] = _json_value(_plain(record))
+    return found
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _json_value(item) for name, item in value.items()}
+    if isinstance(value, np.ndarray):
+        finite = value.dtype.kind != 'f' or np.isfinite(value).all()
+        return value.tolist() if finite else _json_value(value.tolist())
+    if isinstance(value, list):
+        return [_json_value(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_record(record_type: type[T], content: object, path: str = '') -> T:
+    """
+    The record of a mapping of plain values; ``path`` is the place of the mapping in its source.
+
+    A nested record may be one already.  Raises ValueError in one line with the path of a field,
+    its value and what is allowed.
+    """
+    if isinstance(content, record_type):
+        return content
+    if not isinstance(content, dict):
+        raise _refused(path, content, 'an object')
+    values: dict[str, Any] = {}
+    sizes: dict[str, int] = {}
+    of_type: Any = record_type
+    for name, kind in fields_of(of_type).items():
+        names = (name, kind.in_messages, kind.formerly)
+        key = next((key for key in names if key in content), None)
+        if key is not None:
+            values[name] = read_value(kind, content[key], _inside(path, key), sizes)
+        elif not kind.has_default:
+            raise ValueError(f'key {_inside(path, name)!r} is missing')
+    try:
+        return record_type(**values)
+    except ValueError as error:  # the record's own checks
+        raise ValueError(_inside(path, ' '.join(str(error).split()))) from error
+
+
+def read_value(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> Any:
+    """
+    A value of a type; ``sizes`` are those of the named dimensions of its record, and grow.
+
+    Raises ValueError in one line with the path of the field, its value and what is allowed.
+    """
+    if value is None and kind.optional:
+        return None
+    if kind.is_record:
+        return read_record(kind.kind, value, path)
+    if kind.kind is np.ndarray:
+        return _array(kind, value, path, sizes)
+    if kind.kind is tuple:
+        return _tuple(kind, value, path, sizes)
+    if kind.kind is dict:
+        return _mapping(kind, value, path, sizes)
+    if kind.kind is str:
+        return _text(kind, value, path)
+    if kind.kind is bool:
+        if not isinstance(value, bool):
+            raise _refused(path, value, 'true or false')
+        return value
+    return _number(kind, value, path)
+
+
+def check_shape(
+    found: tuple[int, ...], dimensions: tuple[int | str, ...], path: str, sizes: dict[str, int]
+) -> None:
+    """Check a shape; ``sizes`` of named dimensions grow.  Raises ValueError with the path."""
+    expected = tuple(
+        one if isinstance(one, int) else sizes.setdefault(one, size) if one else size
+        for one, size in zip(dimensions, found, strict=False)
+    )
+    if found != expected or len(found) != len(dimensions):
+        wanted = expected if len(found) == len(dimensions) else dimensions
+        sides = (' x '.join(map(str, shape)) or '1' for shape in (found, wanted))
+        raise ValueError('{}: {} numbers, not {}'.format(path, *sides))
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Suggestion for an unknown word, to append to an error message; '' without a close match."""
+    near = difflib.get_close_matches(word[:_COMPARED], known, 1)
+    return f' (did you mean {near[0]}?)' if near else ''
+
+
+def _inside(path: str, name: str) -> str:
+    return f'{path}.{name}' if path else name
+
+
+def _refused(path: str, value: object, allowed: str) -> ValueError:
+    return ValueError(f'{path or "content"}: {shown(value)} is not {allowed}')
+
+
+def _text(kind: FieldType, value: object, path: str) -> str:
+    if not isinstance(value, str):
+        raise _refused(path, value, 'a text')
+    if kind.most_characters is not None and len(value) > kind.most_characters:
+        raise _refused(path, value, f'a text of at most {kind.most_characters} characters')
+    if kind.choices and value not in kind.choices:
+        words = ', '.join(filter(None, kind.choices))
+        raise _refused(path, value, f'one of {words}{nearest(value, kind.choices)}')
+    try:
+        return check_text(value)
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from error
+
+
+def _number(kind: FieldType, value: object, path: str) -> float:
+    if value is None and kind.kind is float and not kind.is_finite:
+        return math.nan
+    number = value.item() if isinstance(value, np.generic) else value
+    is_whole = kind.kind is int
+    is_part = is_whole and isinstance(number, float) and not number.is_integer()
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or is_part:
+        raise _refused(path, value, 'a whole number' if is_whole else 'a number')
+    if is_whole:
+        number = int(number)
+        if not -_INT64 <= number < _INT64:
+            raise _refused(path, value, 'within 64 bit')
+    else:
+        try:
+            number = float(number)
+        except OverflowError as error:
+            raise _refused(path, value, 'a finite number') from error
+    low, high = kind.low, kind.high
+    if (kind.is_finite and not math.isfinite(number)) or (low is not None and math.isinf(number)):
+        raise _refused(path, value, 'a finite number')
+    if low is not None and high is not None and (number < low or number > high):
+        raise _refused(path, value, kind.allowed)
+    return number
+
+
+def _tuple(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> tuple[Any, ...]:
+    assert kind.item is not None  # of a tuple
+    items = value.tolist() if hasattr(value, 'tolist') else value  # of NumPy or array.array
+    if not isinstance(items, (list, tuple)):
+        raise _refused(path, value, 'a list')
+    _check_count(kind, len(items), path)
+    check_shape((len(items),), kind.dimensions, path, sizes)
+    item = kind.item
+    found = tuple(read_value(item, one, f'{path}[{k}]', {}) for k, one in enumerate(items))
+    if kind.are_different and len(set(found)) < len(found):
+        twice = next(one for one in found if found.count(one) > 1)
+        raise ValueError(f'{path}: {twice} is given twice')
+    return found
+
+
+def _mapping(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> dict[str, Any]:
+    assert kind.item is not None  # of a mapping
+    if not isinstance(value, Mapping):
+        raise _refused(path, value, 'an object')
+    _check_count(kind, len(value), path)
+    return {
+        _text(kind, name, path): read_value(kind.item, item, f'{path}.{name[:_COMPARED]}', sizes)
+        for name, item in value.items()
+    }
+
+
+def _check_count(kind: FieldType, count: int, path: str) -> None:
+    if kind.most_items is not None and count > kind.most_items:
+        raise ValueError(f'{path}: {count} values, at most {kind.most_items} are read')
+
+
+def _array(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> NDArray[Any]:
+    assert kind.dtype is not None  # of an array
+    wanted, depth = kind.dtype, len(kind.dimensions)
+    if isinstance(value, np.ndarray):
+        array = value
+    else:
+        item = FieldType(float if wanted.kind == 'f' else int, is_finite=kind.is_finite)
+        rows = _rows(item, value, path, depth)
+        try:
+            array = np.array(rows, np.float64 if wanted.kind == 'f' else np.int64)
+        except OverflowError as error:
+            raise ValueError(f'{path}: a number is out of the range of {wanted}') from error
+        if array.ndim < depth:  # no rows: their length is not in the source
+            array = array.reshape(
+                0, *(d if isinstance(d, int) else 0 for d in kind.dimensions[1:])
+            )
+    if wanted.kind in 'iu' and array.size and array.dtype != wanted:
+        least, most = np.iinfo(wanted).min, np.iinfo(wanted).max
+        if array.min() < least or array.max() > most:
+            raise ValueError(f'{path}: a number is out of the range of {wanted}')
+    check_shape(array.shape, kind.dimensions, path, sizes)
+    if array.dtype.kind not in _KINDS[wanted.kind]:
+        raise _refused(path, array, f'an array of {wanted}')
+    array = array.astype(wanted)  # a copy: the source may change
+    _check_numbers(kind, array, path)
+    return array
+
+
+def _rows(item: FieldType, value: object, path: str, depth: int) -> Any:
+    """Lists of numbers, each checked for its type; None is NaN."""
+    if depth == 0:
+        return _number(item, value, path)
+    if not isinstance(value, list):
+        raise _refused(path, value, 'a list')
+    kinds = set(map(type, value))
+    if depth == 1 and (kinds <= {int} or (item.kind is float and kinds <= {int, float})):
+        return value  # at once: grids have thousands
+    rows = [_rows(item, one, f'{path}[{k}]', depth - 1) for k, one in enumerate(value)]
+    if depth > 1 and len(set(map(len, rows))) > 1:
+        raise ValueError(f'{path}: rows of different length')
+    return rows
+
+
+def _check_numbers(kind: FieldType, array: NDArray[Any], path: str) -> None:
+    """Refuse the first number of an array, or the first vector, that is not allowed."""
+    if kind.is_finite or kind.low is not None:
+        wrong = ~np.isfinite(array) if kind.is_finite else np.isinf(array)
+        if wrong.any():
+            raise _refused(*_first(wrong, array, path), 'a finite number')
+    if kind.low is not None and kind.high is not None:
+        wide = array.astype(np.float64)  # single precision does not hold the limits
+        wrong = (wide < kind.low) | (wide > kind.high)
+        if wrong.any():
+            raise _refused(*_first(wrong, array, path), kind.allowed)
+    if kind.unit_tolerance is not None:
+        with np.errstate(over='ignore'):
+            length = np.linalg.norm(array, axis=-1)
+        wrong = np.abs(length - 1.0) > kind.unit_tolerance  # NaN where the marks allow it
+        if wrong.any():
+            place, found = _first(wrong, length, path)
+            raise ValueError(f'{place}: length {found:.6g} is not 1')
+
+
+def _first(where: Mask, array: NDArray[Any], path: str) -> tuple[str, Any]:
+    """Path and value of the first number that a mask marks."""
+    index = np.argwhere(where)[0].tolist()
+    return path + ''.join(f'[{k}]' for k in index), array[tuple(index)].item()

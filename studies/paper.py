@@ -22,7 +22,6 @@ from scipy.stats import norm
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import (
     CameraModel,
     distortion_px,
@@ -37,6 +36,7 @@ from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.star_equations import squared_sigmas, star_table
 from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.report.detector_figures import distortion_contours, distortion_vectors, star_cloud
 from starcal_ros.report.figures import outline

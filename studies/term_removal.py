@@ -18,8 +18,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.levenberg_marquardt import covariance, NotObservable
-from starcal_ros.estimation.minimise import minimise, Minimum, without_parameter
 from starcal_ros.estimation.problem import image_parameters, Problem, State
+from starcal_ros.estimation.search import minimise, Minimum, without_parameter
 from starcal_ros.estimation.star_equations import arrange, residuals_px
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, moved
 

@@ -22,7 +22,7 @@ from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
 from starcal_ros.simulation.centroids import scaled_inverse

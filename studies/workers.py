@@ -9,9 +9,8 @@ import os
 import threading
 from typing import TypeVar
 
-from starcal_ros.blas_threads import one_blas_thread
-from starcal_ros.child_process import ChildProcess, ProcessEnded
 from starcal_ros.errors import StarcalError
+from starcal_ros.processes import ChildProcess, one_blas_thread, ProcessEnded
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')

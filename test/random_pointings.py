@@ -14,7 +14,7 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble
 from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 

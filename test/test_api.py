@@ -17,7 +17,7 @@ from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
 import starcal_ros
 from starcal_ros import api
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, StarObservations
 
 SIGMA_ARCSEC = (10.0, 10.0, 40.0)

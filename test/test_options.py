@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.options import (
     check_value,
     from_mapping,

@@ -20,7 +20,7 @@ from bench.peers import giant, solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
 from bench.trials import rms, shape_error_arcsec
-from starcal_ros.blas_threads import one_blas_thread
+from starcal_ros.processes import one_blas_thread
 
 
 class Tool(NamedTuple):

@@ -29,10 +29,9 @@ from starcal_ros.assessment.lookup import Derivatives, GRID
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.calibration_options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.equations import equations
-from starcal_ros.estimation.posterior import common_shape, ErrorParts
-from starcal_ros.estimation.shared_covariance import TRACKER_NOISE, TRACKER_SLOW
+from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
+from starcal_ros.estimation.posterior import common_shape, ErrorParts, TRACKER_NOISE, TRACKER_SLOW
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, TOTAL
 from starcal_ros.text import significant
 

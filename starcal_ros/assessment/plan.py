@@ -27,10 +27,10 @@ from starcal_ros.assessment.budget import mean_squares
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
-from starcal_ros.estimation.minimise import problem_of, start_of
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import Problem, State, whitened_attitude_errors
+from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
 from starcal_ros.records import Ensemble, StarObservations

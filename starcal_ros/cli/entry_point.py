@@ -17,7 +17,7 @@ _AGAIN_S = 0.01
 
 def main() -> int:
     """Run the tool; see `starcal_ros.cli.main.main`."""
-    # Read when NumPy is imported: see `starcal_ros.blas_threads`.
+    # Read when NumPy is imported: see `starcal_ros.processes`.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     # Unless nohup or a shell ignores it.
     is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler

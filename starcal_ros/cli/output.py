@@ -48,7 +48,7 @@ def check_file(output: Path, inputs: Sequence[Path]) -> None:
 
 
 if TYPE_CHECKING:
-    from starcal_ros.assessment.comparison import Comparison, DifferenceMap
+    from starcal_ros.assessment.agreement import Comparison, DifferenceMap
     from starcal_ros.pipeline.inspect import Inspection, TopicContent
     from starcal_ros.records import Calibration, CameraGeometry
 
@@ -56,7 +56,8 @@ if TYPE_CHECKING:
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and verdict; changes are relative to the prior."""
     from starcal_ros.assessment.agreement import alignment_difference_rad
-    from starcal_ros.estimation import mountings, temperature
+    from starcal_ros.estimation import temperature
+    from starcal_ros.estimation.problem import alignment_summary
 
     camera, sigma = calibration.geometry.camera, calibration.sigma
     changes: Floats = np.full(len(camera.parameters), np.nan)
@@ -104,7 +105,7 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     if calibration.temperature is not None:
         print_text(f'temperature     {temperature.summary(calibration.temperature)}')
     for one in calibration.star_trackers:
-        print_text(f'star tracker    {mountings.summary(one)}')
+        print_text(f'star tracker    {alignment_summary(one)}')
     if calibration.accepted:
         print_verdict(True, 'verdict         accepted')
     else:

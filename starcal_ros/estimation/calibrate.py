@@ -21,27 +21,26 @@ from starcal_ros.camera import CameraModel, project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibration_options import (
+from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     check_enough,
     check_options,
     estimated_parameters,
 )
-from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
-from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.minimise import minimise, Minimum, moved_to_stars, problem_of, start_of
-from starcal_ros.estimation.mountings import (
+from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
+from starcal_ros.estimation.problem import (
     AttitudeErrors,
     canonical_xyzw,
+    image_parameters,
+    Problem,
     star_tracker_alignments,
     star_tracker_names,
+    State,
 )
-from starcal_ros.estimation.posterior import Posterior, posterior
-from starcal_ros.estimation.problem import image_parameters, Problem, State
-from starcal_ros.estimation.refraction import Refraction
-from starcal_ros.estimation.reweighting import CentroidVariance, dropped_stars
-from starcal_ros.estimation.shared_covariance import Weights, with_shared_errors
+from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.shared_errors import (
     observation_groups,
     pixel_variance_px2,
@@ -62,13 +61,16 @@ from starcal_ros.estimation.unknowns import (
     IMAGE_ROTATION,
     Layout,
     moved,
+    Refraction,
     unknowns_of,
 )
-from starcal_ros.estimation.working_weights import (
+from starcal_ros.estimation.weights import (
     agree,
     Attitudes,
+    CentroidVariance,
     Data,
     degrees_of_freedom,
+    dropped_stars,
     FREE_FACTOR,
     judge,
     Judged,

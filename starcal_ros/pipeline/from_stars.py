@@ -21,12 +21,11 @@ from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.lens import ideal_points
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
 from starcal_ros.identification.blind.search import (
     confirm_sky,
@@ -36,6 +35,7 @@ from starcal_ros.identification.blind.search import (
     ROUNDS,
     SkyMatch,
 )
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.catalog import StarCatalog
 

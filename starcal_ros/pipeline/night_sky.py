@@ -19,7 +19,7 @@ import numpy as np
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import NotFromStars
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.images.photographs import (

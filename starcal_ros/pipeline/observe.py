@@ -15,15 +15,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
-from starcal_ros.estimation.calibration_options import assumed_tracker_sigma_rad
+from starcal_ros.estimation.options import assumed_tracker_sigma_rad
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.astrometry import velocity_of
 from starcal_ros.sky.attitude import Attitude, AttitudeHistory, attitudes_at

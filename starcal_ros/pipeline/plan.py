@@ -24,12 +24,12 @@ from starcal_ros.assessment.plan import (
     Target,
     target,
 )
-from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.text import significant
 

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""From an ensemble to a calibration: collect, solve, and judge by the gate."""
+"""From an ensemble to a calibration: collect, solve with the smallest lens, judge by the gate."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment import observability
-from starcal_ros.assessment.amplitude_checks import model_checks
 from starcal_ros.assessment.budget import sigma_budget
 from starcal_ros.assessment.gate import judge, reasons_of
+from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.residuals import Residuals, residuals_of
-from starcal_ros.blas_threads import one_blas_thread
-from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera.conversion import ros_fit
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
+from starcal_ros.camera.conversion import convert, ros_fit
+from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.identification.star_finder import realigned
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
 from starcal_ros.pipeline.setup import aligned, Setup
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import (
     Calibration,
+    CameraGeometry,
     Ensemble,
     EnsembleStatus,
     factored_field,
@@ -229,3 +231,57 @@ def _not_judged(
             result, setup.calibration, has_alignment=bool(setup.frames.star_tracker_frame)
         ),
     )
+
+
+# Twice the log likelihood of a field that is not there: the 1 % level of three amplitudes.
+_CHANCE = 9.0
+_PER_COEFFICIENT = 2.0  # Akaike 1974: less of a likelihood ratio is what any coefficient takes
+
+
+def estimate_with_smallest_lens(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> tuple[Estimate, CameraGeometry]:
+    """
+    Return the estimate with the smallest lens model that needs no field, and the prior with it.
+
+    The model of the prior camera comes first, then the others by the number of their coefficients.
+    A model is accepted where the likelihood of a field beside it is not larger than chance makes
+    it: structure over the detector, which a model does not lose by having more coefficients alone.
+    Where none is accepted, the model with the least evidence for a field is, each coefficient
+    counted as 2.
+
+    Raises
+    ------
+    TooFewObservations
+        When there are too few images or stars for the model of the prior camera.
+    OptionError
+        For options that do not go together.
+    """
+    least = math.inf
+    best: tuple[Estimate, CameraGeometry] | None = None
+    others = sorted(COEFFICIENTS.keys() - {prior.camera.model}, key=lambda m: len(COEFFICIENTS[m]))
+    for model in (prior.camera.model, *others):
+        camera, worst_px = convert(prior.camera, model)
+        if not math.isfinite(worst_px):
+            continue
+        started = dataclasses.replace(prior, camera=camera)
+        try:
+            estimate = estimate_calibration(ensemble, started, options)
+        except TooFewObservations:
+            if model == prior.camera.model:
+                raise
+            continue  # the stars do not determine a model that large
+        if estimate.termination != 'converged' and best is not None:
+            continue  # lost on the way: its lack of a field means nothing
+        found = estimate.geometry.camera
+        if not np.isfinite(line_of_sight(found, pixel_grid(found, 15, 15))).all():
+            continue  # beyond the stars it folds
+        ratio = estimate.posterior.field.likelihood_ratio
+        if ratio < _CHANCE:
+            return estimate, started
+        if ratio + _PER_COEFFICIENT * len(COEFFICIENTS[model]) < least:
+            least = ratio + _PER_COEFFICIENT * len(COEFFICIENTS[model])
+            best = estimate, started
+    if best is None:
+        raise TooFewObservations('no lens model describes the prior camera')
+    return best

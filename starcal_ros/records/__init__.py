@@ -2,9 +2,8 @@
 """
 The frozen records that pass between the stages: images -> observations -> calibration.
 
-Arrays in records are never changed after construction.  The types of the fields with
-their marks (`record_fields`) are the only description of a record: `record_codec` uses them to
-read and write JSON and messages.
+Arrays in records are never changed after construction.  The types of the fields with their marks
+are the only description of a record: `record_fields` reads and writes JSON and messages by them.
 """
 
 from starcal_ros.records.calibration import (

@@ -20,7 +20,7 @@ import jinja2
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import utc_text
 from starcal_ros.errors import ProductError
-from starcal_ros.estimation.mountings import summary as tracker_summary
+from starcal_ros.estimation.problem import alignment_summary
 from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
@@ -146,7 +146,7 @@ def _context(found: Found) -> Mapping[str, object]:
         'precision': verdict.precision_sentences(calibration),
         'next_step': verdict.next_step(calibration),
         'signed': _signed(calibration),
-        'star_trackers': [tracker_summary(one) for one in calibration.star_trackers],
+        'star_trackers': [alignment_summary(one) for one in calibration.star_trackers],
         'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,

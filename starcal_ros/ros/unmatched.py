@@ -10,10 +10,10 @@ import os
 import threading
 
 from starcal_ros.arrays import Floats
-from starcal_ros.child_process import ChildProcess
 from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
 from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, IMAGES_OF_AN_ALIGNMENT
 from starcal_ros.pipeline.setup import Setup
+from starcal_ros.processes import ChildProcess
 from starcal_ros.records import Image
 from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 

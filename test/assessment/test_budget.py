@@ -15,9 +15,9 @@ from starcal_ros.assessment.budget import sigma_budget
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.equations import equations
-from starcal_ros.estimation.shared_covariance import with_shared_errors
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.posterior import with_shared_errors
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, parts_that_matter, SigmaPart
 from studies.worlds import Campaign, simulate, World
 

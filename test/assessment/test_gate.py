@@ -13,10 +13,9 @@ from sample_records import calibration, model_checks  # type: ignore[import-not-
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.agreement import movement
-from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.gate_options import GateOptions
+from starcal_ros.assessment.gate import GateOptions, judge, reasons_of
 from starcal_ros.camera import CameraModel
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.options import names_of
 from starcal_ros.records import (
     Calibration,

@@ -23,7 +23,7 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
 from starcal_ros.simulation.centroids import cramer_rao_covariance, true_observations
 from starcal_ros.simulation.scenario import scenario

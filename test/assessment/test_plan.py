@@ -11,7 +11,7 @@ import pytest
 from starcal_ros.assessment.plan import expected_noise_px2, LINE_OF_SIGHT, MAP, prospect, target
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario

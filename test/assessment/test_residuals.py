@@ -14,7 +14,7 @@ from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.products.product_folder import read_residuals, write_residuals
 from starcal_ros.simulation import centroids as simulated_centroids
 from starcal_ros.simulation import scenario

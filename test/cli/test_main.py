@@ -22,13 +22,13 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.child_process import module_command
 from starcal_ros.cli import main
 from starcal_ros.cli.arguments import EXIT_INTERRUPTED, parser
 from starcal_ros.cli.commands import demo
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.processes import module_command
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'

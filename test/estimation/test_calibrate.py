@@ -15,17 +15,13 @@ from starcal_ros.arrays import Indices, Mask
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation import working_weights
+from starcal_ros.estimation import weights
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import (
-    CalibrationOptions,
-    check_enough,
-    estimated_parameters,
-)
+from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
 from starcal_ros.estimation.problem import METHODS
-from starcal_ros.estimation.reweighting import CentroidVariance
 from starcal_ros.estimation.shared_errors import SharedError
 from starcal_ros.estimation.star_equations import star_table
+from starcal_ros.estimation.weights import CentroidVariance
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.centroids import bound_names, cramer_rao_covariance, true_observations
 from starcal_ros.simulation.scenario import scenario
@@ -452,13 +448,13 @@ def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
     kept = np.ones(len(table), bool)
     seen: Mask = np.ones(table.image_count, bool)
     none = np.zeros((table.image_count, 3))
-    attitudes = working_weights.Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, (), ())
+    attitudes = weights.Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, (), ())
 
-    def judged(variance_px2: float, stars: Indices) -> working_weights.Judged:
+    def judged(variance_px2: float, stars: Indices) -> weights.Judged:
         error = SharedError('star places', stars, variance_px2, 0.0, True, 1.0)
-        return working_weights.Judged(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
+        return weights.Judged(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
 
     once = dataclasses.replace(table, star=np.arange(len(table)))
-    assert working_weights.agree(judged(4e-6, once.star), judged(2e-6, once.star), once)
+    assert weights.agree(judged(4e-6, once.star), judged(2e-6, once.star), once)
     often = dataclasses.replace(table, star=np.zeros(len(table), np.int64))
-    assert not working_weights.agree(judged(4e-6, often.star), judged(2e-6, often.star), often)
+    assert not weights.agree(judged(4e-6, often.star), judged(2e-6, often.star), often)

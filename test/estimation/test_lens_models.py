@@ -17,7 +17,7 @@ from starcal_ros.camera import CameraModel, pixel_grid, project_jacobians
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations

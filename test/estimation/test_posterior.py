@@ -28,11 +28,13 @@ import pytest
 from scipy.linalg import null_space
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation import amplitudes, shared_covariance
+from starcal_ros.estimation import amplitudes
 from starcal_ros.estimation import posterior as module
 from starcal_ros.estimation.amplitudes import Amplitudes, Shapes, shapes, ShapeSums
-from starcal_ros.estimation.posterior import common_shape, Posterior, posterior
-from starcal_ros.estimation.shared_covariance import (
+from starcal_ros.estimation.posterior import (
+    common_shape,
+    Posterior,
+    posterior,
     TRACKER_NOISE,
     TRACKER_SLOW,
     Weights,
@@ -69,7 +71,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, np.zeros(len(SHAPE))))
     monkeypatch.setattr(amplitudes, '_SHIFTS', np.zeros(1))
     monkeypatch.setattr(amplitudes, '_OF_TERM', np.array([-300.0]))
-    monkeypatch.setattr(shared_covariance, '_HELD', 1e-13)
+    monkeypatch.setattr(module, '_HELD', 1e-13)
 
 
 def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
@@ -386,14 +388,14 @@ def test_shared_errors_at_known_amplitudes_propagate_as_the_dense_covariance(
         assert np.abs(off / np.outer(sigma[free], sigma[free])).max() < EXACT
 
 
-@pytest.mark.parametrize(('held', 'tolerance'), [(1e-13, 1e-4), (shared_covariance._HELD, 0.03)])
+@pytest.mark.parametrize(('held', 'tolerance'), [(1e-13, 1e-4), (module._HELD, 0.03)])
 def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance(
     monkeypatch: pytest.MonkeyPatch,
     held: float,
     tolerance: float,
 ) -> None:
     # By default modes of the field below a thousandth are left out; here also with all of them.
-    monkeypatch.setattr(shared_covariance, '_HELD', held)
+    monkeypatch.setattr(module, '_HELD', held)
     given = small(2, field_px=0.2)
     truth = dense(given)
     # Far larger than centroid errors, which are mostly hidden by the field of 150 coefficients.

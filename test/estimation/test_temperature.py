@@ -21,7 +21,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation import temperature
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import (
     ALIGNMENT_NAMES,

@@ -16,7 +16,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations

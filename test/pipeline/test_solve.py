@@ -15,7 +15,7 @@ from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: igno
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.pipeline import observe, solve, topics

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import project
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.estimation.refraction import Refraction
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.unknowns import Refraction
 from starcal_ros.pipeline.from_stars import options_of, pinhole
 from starcal_ros.pipeline.unknown_air import with_air
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations

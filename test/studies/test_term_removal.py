@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.calibration_options import estimated_parameters
+from starcal_ros.estimation.options import estimated_parameters
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry
 from starcal_ros.simulation.centroids import true_observations

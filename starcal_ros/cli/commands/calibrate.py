@@ -26,7 +26,7 @@ from starcal_ros.errors import (
     StarcalError,
     TooFewObservations,
 )
-from starcal_ros.estimation.calibration_options import tracker_sigma_is_given
+from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import make_folder, REPORT_FILE, write_atomically
 from starcal_ros.formats.products.product_folder import (

@@ -22,7 +22,6 @@ import numpy as np
 import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.child_process import module_command
 from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError, StarcalError
@@ -30,6 +29,7 @@ from starcal_ros.files import mark
 from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.processes import module_command
 from starcal_ros.records import Calibration, CameraGeometry
 from starcal_ros.simulation import scenario, simulated_bag
 from starcal_ros.simulation.simulated_bag import true_geometry

@@ -20,7 +20,7 @@ from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.record_codec import json_object
+from starcal_ros.record_fields import json_object
 from starcal_ros.text import significant
 from starcal_ros.untrusted import PRODUCT_BYTES, read_text
 

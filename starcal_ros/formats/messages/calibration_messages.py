@@ -29,8 +29,7 @@ from starcal_ros.formats.messages.message_fields import (
     STATUS_TYPE,
     vector_to_message,
 )
-from starcal_ros.record_codec import plain_record, read_record
-from starcal_ros.record_fields import Named, Quaternion
+from starcal_ros.record_fields import Named, plain_record, Quaternion, read_record
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     Calibration,

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Messages to the plain values of `record_codec` and back, by the types of a record's fields.
+Messages to the plain values of `record_fields` and back, by the types of a record's fields.
 
 The message of a record is ``starcal/msg/<its class>``; a field of the record is the field of that
 name, or of the name given by `Named`, in these forms:
@@ -42,8 +42,7 @@ from starcal_ros.formats.messages.message_fields import (
     quaternion_to_message,
     stamp_ns,
 )
-from starcal_ros.record_codec import plain_record, read_record
-from starcal_ros.record_fields import fields_of, FieldType
+from starcal_ros.record_fields import fields_of, FieldType, plain_record, read_record
 
 T = TypeVar('T')
 

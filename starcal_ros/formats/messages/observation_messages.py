@@ -16,7 +16,7 @@ from starcal_ros.formats.messages.message_fields import (
     Message,
     OBSERVATIONS_TYPE,
 )
-from starcal_ros.record_codec import plain_record, read_record
+from starcal_ros.record_fields import plain_record, read_record
 from starcal_ros.records import StarObservations
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # of a measured star, smallest and largest

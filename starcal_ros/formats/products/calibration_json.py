@@ -2,7 +2,7 @@
 """
 The file of a calibration, ``calibration.json``, both ways.
 
-Most keys are the fields of `Calibration`, by `record_codec`.  Camera and alignment have the shape
+Most keys are the fields of `Calibration`, by `record_fields`.  Camera and alignment have the shape
 that the interface document publishes, which is described here.  Numbers are written with the
 shortest digits that read back to the same double, so a calibration that was written and read is
 equal to the last bit.
@@ -22,8 +22,7 @@ import numpy as np
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_json, write_atomically
-from starcal_ros.record_codec import json_object, read_record
-from starcal_ros.record_fields import Count, Finite, Quaternion
+from starcal_ros.record_fields import Count, Finite, json_object, Quaternion, read_record
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     Calibration,

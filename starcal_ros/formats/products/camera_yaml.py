@@ -20,8 +20,7 @@ from starcal_ros.camera.conversion import ros_fit
 from starcal_ros.camera.lens import from_ros_distortion, ros_distortion
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_text, write_atomically
-from starcal_ros.record_codec import read_record
-from starcal_ros.record_fields import Finite, Shape
+from starcal_ros.record_fields import Finite, read_record, Shape
 from starcal_ros.untrusted import PARAMETER_BYTES, shown, yaml_value
 
 CAMERA_INFO_FILE = 'camera_info.yaml'

@@ -29,7 +29,7 @@ from starcal_ros.formats.products.product_files import (
     REPORT_FILE,
     write_atomically,
 )
-from starcal_ros.record_codec import json_object, plain_record, read_record
+from starcal_ros.record_fields import json_object, plain_record, read_record
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.untrusted import read_archive
 

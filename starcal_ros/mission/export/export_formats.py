@@ -19,7 +19,7 @@ from starcal_ros.mission.export.camera_models import isd_files
 from starcal_ros.mission.export.ck import ck_of_images
 from starcal_ros.mission.export.losses import Content, Loss, temperature_losses
 from starcal_ros.mission.export.spice import check_names, spice_kernels, SpiceNames
-from starcal_ros.record_codec import nearest
+from starcal_ros.record_fields import nearest
 from starcal_ros.records import Calibration, StarObservations
 
 FORMATS = ('spice', 'ck', 'isd', 'opencv', 'kalibr', 'ros', 'giant', 'mrcal', 'csv', 'c')

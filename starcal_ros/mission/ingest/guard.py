@@ -16,8 +16,8 @@ import resource
 import signal
 from typing import TYPE_CHECKING, TypeVar
 
-from starcal_ros.child_process import ChildProcess, ProcessEnded
 from starcal_ros.errors import IngestError, StarcalError
+from starcal_ros.processes import ChildProcess, ProcessEnded
 
 if TYPE_CHECKING:
     from typing_extensions import Self

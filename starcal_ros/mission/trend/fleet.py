@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
@@ -44,6 +43,7 @@ from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import (

@@ -25,7 +25,7 @@ from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import replacing
 from starcal_ros.mission.trend.rows import Row
 from starcal_ros.pipeline.provenance import software_version
-from starcal_ros.record_codec import json_object, read_record
+from starcal_ros.record_fields import json_object, read_record
 from starcal_ros.untrusted import json_value, regular_file
 
 TABLE_FILE, PARQUET_FILE = 'trend.sqlite', 'trend.parquet'

@@ -17,7 +17,6 @@ import math
 
 import numpy as np
 
-from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel
 from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
 from starcal_ros.pipeline.diagnosis.attitude_reading import (
@@ -35,6 +34,7 @@ from starcal_ros.pipeline.diagnosis.identified import (
     Solved,
 )
 from starcal_ros.pipeline.setup import Setup
+from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 

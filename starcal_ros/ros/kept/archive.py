@@ -49,8 +49,7 @@ from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.formats.products.product_folder import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_folder import STATE_ENSEMBLE as _ENSEMBLE
-from starcal_ros.record_codec import json_object, read_record
-from starcal_ros.record_fields import Count
+from starcal_ros.record_fields import Count, json_object, read_record
 from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
 from starcal_ros.ros.kept.seal import CHECKSUMS, Seal
 from starcal_ros.ros.kept.state import Activation

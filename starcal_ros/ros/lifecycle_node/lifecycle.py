@@ -21,11 +21,11 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from starcal_ros.allocator import return_freed_memory
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
+from starcal_ros.processes import return_freed_memory
 from starcal_ros.ros.lifecycle_node.inputs import Inputs
 from starcal_ros.ros.lifecycle_node.parameters import OptionParameters
 from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog

@@ -22,7 +22,7 @@ from sample_records import (  # type: ignore[import-not-found]
 
 from starcal_ros.camera import line_of_sight, project
 from starcal_ros.estimation import levenberg_marquardt
-from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages.calibration_messages import (
     alignment_to_message,

@@ -7,11 +7,10 @@ from four_images import CAMERA, IMAGES, usual  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
-from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.reweighting import CentroidVariance
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.shared_errors import observation_groups
-from starcal_ros.estimation.working_weights import Data, judge, Judged
+from starcal_ros.estimation.weights import CentroidVariance, Data, judge, Judged
 from starcal_ros.records import CameraGeometry
 
 

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.amplitude_checks import model_checks
-from starcal_ros.assessment.gate import model_gate, star_tracker_gate
-from starcal_ros.assessment.gate_options import GateOptions
+from starcal_ros.assessment.gate import GateOptions, model_gate, star_tracker_gate
+from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.records import Ensemble, StarObservations, StarTrackerAlignment

@@ -20,9 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.levenberg_marquardt import covariance
-from starcal_ros.estimation.minimise import (
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.problem import image_blocks, Problem
+from starcal_ros.estimation.search import (
     equations_in_state,
     minimise,
     Minimum,
@@ -30,7 +31,6 @@ from starcal_ros.estimation.minimise import (
     start_of,
     without_parameter,
 )
-from starcal_ros.estimation.problem import image_blocks, Problem
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.records import Ensemble
 from starcal_ros.simulation.centroids import true_observations

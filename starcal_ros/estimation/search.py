@@ -19,11 +19,6 @@ from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.calibration_options import (
-    assumed_tracker_sigma_rad,
-    CalibrationOptions,
-    estimated_parameters,
-)
 from starcal_ros.estimation.equations import arrow, stars_alone
 from starcal_ros.estimation.levenberg_marquardt import (
     levenberg_marquardt,
@@ -31,11 +26,15 @@ from starcal_ros.estimation.levenberg_marquardt import (
     Solution,
     solve_arrow,
 )
-from starcal_ros.estimation.mountings import star_tracker_names
-from starcal_ros.estimation.problem import image_blocks, Problem, State
-from starcal_ros.estimation.reweighting import FEWEST_STARS
+from starcal_ros.estimation.options import (
+    assumed_tracker_sigma_rad,
+    CalibrationOptions,
+    estimated_parameters,
+)
+from starcal_ros.estimation.problem import image_blocks, Problem, star_tracker_names, State
 from starcal_ros.estimation.star_equations import Measurements, StarTable
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
+from starcal_ros.estimation.weights import FEWEST_STARS
 from starcal_ros.records import CameraGeometry, Ensemble
 
 Minimum = Solution[State, NormalEquations]

@@ -8,7 +8,7 @@ import pytest
 from random_pointings import displaced, estimated, HEIGHT, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.amplitude_checks import detector_step
+from starcal_ros.assessment.model_checks import detector_step
 from starcal_ros.simulation.centroids import true_observations
 
 

@@ -11,7 +11,7 @@ import pytest
 
 GAPS_IN_MEMORY = """
 import ctypes
-from starcal_ros.allocator import return_freed_memory
+from starcal_ros.processes import return_freed_memory
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
 libc.free.argtypes = [ctypes.c_void_p]

@@ -15,8 +15,7 @@ import pytest
 from sample_records import assert_same  # type: ignore[import-not-found]
 
 from starcal_ros.arrays import Floats
-from starcal_ros.record_codec import json_object, read_record
-from starcal_ros.record_fields import Count, Finite, Shape, Within
+from starcal_ros.record_fields import Count, Finite, json_object, read_record, Shape, Within
 
 
 @dataclass(frozen=True)

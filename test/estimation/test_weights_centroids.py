@@ -9,12 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.reweighting import (
-    _brightness,
-    _line,
-    CentroidVariance,
-    estimate_variance,
-)
+from starcal_ros.estimation.weights import _brightness, _line, CentroidVariance, estimate_variance
 
 N = 6000
 

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from starcal_ros.child_process import module_command
+from starcal_ros.processes import module_command
 
 ROOT = Path(__file__).parents[1]
 TOOL = 'starcal_ros.cli.main'

@@ -11,8 +11,8 @@ from random_pointings import honesty, of_random_pointings  # type: ignore[import
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera.conversion import convert
-from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.pipeline.solve import estimate_with_smallest_lens
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import Scenario
 

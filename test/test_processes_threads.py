@@ -13,7 +13,7 @@ import threading
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from starcal_ros.blas_threads import one_blas_thread
+from starcal_ros.processes import one_blas_thread
 from studies.workers import run_each
 
 TINY = Path(__file__).parents[1] / 'bags/tiny'
@@ -68,7 +68,7 @@ def test_a_trial_runs_on_one_thread() -> None:
 
 
 LOADED_LATER = """
-from starcal_ros.blas_threads import one_blas_thread
+from starcal_ros.processes import one_blas_thread
 import numpy
 with one_blas_thread():
     pass

@@ -10,7 +10,7 @@ import pytest
 from random_pointings import displaced, estimated, HEIGHT, honesty, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.amplitude_checks import model_checks
+from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks
 from starcal_ros.simulation.centroids import true_observations
