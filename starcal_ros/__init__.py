@@ -47,7 +47,6 @@ __all__ = [
     '__version__',
     'calibrate',
     'calibrate_bag',
-    'calibrate_images',
     'lines_of_sight',
     'observations_of',
     'project',

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 import dataclasses
 import hashlib
 from pathlib import Path
-import tempfile
 from typing import Literal
 
 import numpy as np
@@ -27,7 +26,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_folder import calibration_file
 from starcal_ros.options import names_of, unknown_option
-from starcal_ros.pipeline import night_sky, solve
+from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.pipeline.setup import load_setup, read_setup, read_values
@@ -45,7 +44,6 @@ __all__ = [
     'TooFewObservations',
     'calibrate',
     'calibrate_bag',
-    'calibrate_images',
     'lines_of_sight',
     'observations_of',
     'project',
@@ -195,13 +193,11 @@ def calibrate_bag(
     velocity_topic: str = '',
     temperature_topic: str = '',
     observations_topic: str = '',
-    camera_alone: bool = False,
 ) -> Calibration:
     """
     Calibration from MCAP bags, as by ``starcal calibrate``; nothing is written.
 
-    Bags without attitudes give the camera alone, as images do, unless the parameter file states a
-    star tracker.
+    Bags without attitudes give the camera alone: `starcal_ground.calibrate_images`.
 
     Parameters
     ----------
@@ -211,8 +207,6 @@ def calibrate_bag(
         ROS parameter file with the prior camera, the prior alignment and all other options.
     image_topic, attitude_topic, velocity_topic, temperature_topic, observations_topic : str
         Needed where a bag has more than one topic of the type.
-    camera_alone : bool
-        True: by the stars alone, with attitudes in the bags and a stated star tracker or not.
 
     Raises
     ------
@@ -227,45 +221,10 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
-    inputs, values = (
-        inputs_of((*reader.mcap_files(paths), Path(params))),
-        read_values(Path(params)),
-    )
-    if not without_attitudes(paths, asked, values, camera_alone):
-        return calibrate_bags(paths, read_setup(Path(params)), asked, inputs).calibration
-    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-        sky = night_sky.from_bags(paths, asked, values, Path(folder))
-        return calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air).calibration
-
-
-def calibrate_images(images: Path | str | Sequence[Path | str], **options: object) -> Calibration:
-    """
-    Calibration of a camera from photographs of the sky alone; nothing is written.
-
-    Parameters
-    ----------
-    images : path or sequence of paths
-        FITS, JPEG, PNG or TIFF files, folders of them, or patterns.
-    **options
-        Options of a parameter file by name.
-
-    Returns
-    -------
-    Calibration
-        Of the camera alone: ``has_alignment`` is False.
-
-    Raises
-    ------
-    StarcalError
-        One line that names the cause, and the images to take.
-    """
-    paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
-    chosen, _ = night_sky.photographs_of(paths)
-    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-        found = night_sky.from_photographs(chosen, options, Path(folder))
-        inputs = inputs_of([one.path for one in chosen])
-        campaign = calibrate_bags(found.bags, found.setup, found.topics, inputs, found.through_air)
-    return campaign.calibration
+    inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
+    if without_attitudes(paths, asked, read_values(Path(params))):
+        raise OptionError(f'{paths[0]}: no attitudes; starcal_ground.calibrate_images needs none')
+    return calibrate_bags(paths, read_setup(Path(params)), asked, inputs).calibration
 
 
 def read_calibration(path: Path | str) -> Calibration:

@@ -4,7 +4,7 @@ Entry points of the console scripts, with the default action for SIGINT during i
 
 The imports take over a second; Python would answer Ctrl-C then with a traceback, the default
 action of the system ends the process without one.  ``-m starcal_ros.entry_points NAME``
-runs a node in the same way.
+runs a node in the same way, or another module by its whole name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _REMEDY = (
 
 
 def _run(name: str) -> int:
-    """Run the function ``main`` of a module of `starcal_ros.ros`."""
+    """Run the function ``main`` of a module of `starcal_ros.ros`, or of one by its whole name."""
     use_one_arena()
     # Read when NumPy is imported: see `starcal_ros.processes`, which a vehicle may not have.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -34,9 +34,9 @@ def _run(name: str) -> int:
     # `starcal play` and `starcal monitor` block it until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
-        module = importlib.import_module(f'starcal_ros.ros.{name}')
+        module = importlib.import_module(name if '.' in name else f'starcal_ros.ros.{name}')
     except ImportError as error:
-        if (error.name or '').startswith('starcal_ros'):
+        if (error.name or '').startswith(('starcal_ros', 'starcal_ground')):
             raise
         if error.name in ('mcap', 'rosbags'):  # rosdep has no key for them
             install = f'{sys.executable} -m pip install mcap rosbags'
@@ -44,7 +44,7 @@ def _run(name: str) -> int:
         else:
             words = ' '.join(str(error).split())
             why = f'ROS 2 is not complete for {sys.executable}: {words}. {_REMEDY}'
-        print(f'{name}: {why}', file=sys.stderr)
+        print(f'{name.rpartition(".")[2]}: {why}', file=sys.stderr)
         return 2
     return int(module.main())
 

@@ -175,7 +175,7 @@ def _diagnose(args: argparse.Namespace) -> int:
 
 def _compare(args: argparse.Namespace) -> int:
     """Compare two calibrations."""
-    from starcal_ros.assessment import agreement
+    from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
     from starcal_ros.cli.commands.demo import is_truth
     from starcal_ros.formats.products.calibration_json import read_calibration
@@ -184,14 +184,14 @@ def _compare(args: argparse.Namespace) -> int:
     files = [calibration_file(path) for path in (args.a, args.b)]
     if files[1].suffix == '.json' and is_truth(files[1]):
         return _compare_with_truth(args)
-    found = agreement.compare(*map(read_calibration, files))
+    found = comparison.compare(*map(read_calibration, files))
     if args.output:
         from starcal_ros.report.detector_figures import write_comparison
 
         output.check_file(args.output, files)
         write_comparison(found, args.output)
     if args.json:
-        terminal.print_text(json.dumps(agreement.content(found), indent=1, allow_nan=False))
+        terminal.print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:
         output.print_comparison(found)
         if args.output:
@@ -260,7 +260,7 @@ def _monitor(args: argparse.Namespace) -> int:
     if args.once is None and not sys.stdout.isatty():
         raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
     once = [] if args.once is None else ['--once', repr(args.once)]
-    return demo.become(demo.node_command('monitor_client', once, args.remap))
+    return demo.become(demo.node_command('starcal_ros.ros.monitor_client', once, args.remap))
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -314,7 +314,7 @@ def _mistakes(args: argparse.Namespace) -> Mistakes:
 
 def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
-    from starcal_ros.assessment import agreement
+    from starcal_ros.assessment import comparison
     from starcal_ros.cli.commands import demo
     from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings
     from starcal_ros.cli.output import check_folder
@@ -347,7 +347,7 @@ def _demo(args: argparse.Namespace) -> int:
     setup = load_setup(bag.parameters)
     again, _ = calibrate_into(args.output, source_of([bag.bag], setup, Topics()), dict)
     write_products(calibration, args.output)
-    apart_px = float(agreement.compare(calibration, again.calibration).before.length_px.max())
+    apart_px = float(comparison.compare(calibration, again.calibration).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
     terminal.print_verdict(
         same,

@@ -48,7 +48,7 @@ def check_file(output: Path, inputs: Sequence[Path]) -> None:
 
 
 if TYPE_CHECKING:
-    from starcal_ros.assessment.agreement import Comparison, DifferenceMap
+    from starcal_ros.assessment.comparison import Comparison, DifferenceMap
     from starcal_ros.pipeline.inspect import Inspection, TopicContent
     from starcal_ros.records import Calibration, CameraGeometry
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.errors import IngestError, OptionError
-from starcal_ros.formats.images.image_files import read_values
+from starcal_ros.formats.images.image_files import read_image
 from starcal_ros.records import Image
 from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.hot_pixels import HotPixels
@@ -122,7 +122,7 @@ def flattened(image: Image, flat: Floats | None, pedestal_dn: int) -> Image:
 def _read(name: str, path: str, width: int, height: int) -> NDArray[Any]:
     expected = f'expected one channel of {width} x {height}'
     try:
-        values = read_values(Path(path.removeprefix('file://')))
+        values, _ = read_image(Path(path.removeprefix('file://')))
     except IngestError as error:
         raise OptionError(f'{name}: {error}; {expected}') from error
     if values.shape != (height, width):

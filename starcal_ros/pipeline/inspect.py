@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.frames import read_ahead, read_frames
+from starcal_ros.formats.bag.frames import read_ahead
 from starcal_ros.formats.bag.mcap_reader import Damage
 from starcal_ros.formats.messages import message_fields
 from starcal_ros.formats.messages.image_messages import decode_png
@@ -29,10 +29,11 @@ from starcal_ros.formats.messages.message_fields import (
 )
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.observe import check_order
+from starcal_ros.pipeline.diagnosis import bags
+from starcal_ros.pipeline.diagnosis.bags import placed, refusals, Refused
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.records import EnsembleStatus, IMAGE_REFUSALS, refused_image, StarObservations
+from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
 _IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
@@ -66,17 +67,6 @@ class TopicContent:
     backward: int
     kinds: Mapping[str, int]
     bad: int
-
-
-@dataclass(frozen=True)
-class Refused:
-    """Images refused for one reason: their count, its meaning, and the first of them."""
-
-    reason: str
-    count: int
-    meaning: str
-    first_ns: int
-    detail: str
 
 
 @dataclass(frozen=True)
@@ -237,47 +227,6 @@ def _kind(message: Message) -> str:
     return f'PNG {8 * pixels.itemsize} bit {pixels.shape[1]} x {pixels.shape[0]}'
 
 
-def placed(
-    paths: Sequence[Path], topics: Topics, options: AttitudeOptions, channel: str = ''
-) -> Iterator[StarObservations]:
-    """Images without their stars, refused for bad encoding, order or attitude."""
-    latest_ns = None
-    for frame in read_frames(
-        paths, Topics(topics.image, topics.attitude), options, channel=channel
-    ):
-        if isinstance(frame, StarObservations):
-            yield frame
-            continue
-        image = frame.image
-        bag_topics.warn_of_clock(image.time_ns)
-        height, width = image.pixels.shape
-        try:
-            check_order(image, latest_ns)
-            gap_s = math.nan
-            if topics.attitude:
-                before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
-                gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
-        except ImageRefused as refused:
-            yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
-            continue
-        latest_ns = image.time_ns
-        yield StarObservations.of_image(image.time_ns, (width, height), attitude_gap_s=gap_s)
-
-
-def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
-    """Refused images by their reason, the most frequent first."""
-    groups: dict[str, list[StarObservations]] = {}
-    for observations in seen:
-        if observations.refusal:
-            groups.setdefault(observations.refusal, []).append(observations)
-    return tuple(
-        Refused(
-            reason, len(group), IMAGE_REFUSALS.get(reason, ''), group[0].time_ns, group[0].detail
-        )
-        for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
-    )
-
-
 def _causes(
     paths: Sequence[Path],
     chosen: Topics,
@@ -286,8 +235,6 @@ def _causes(
     command: str,
 ) -> list[str]:
     """The cause for which all images are refused, in a sentence; ``command`` gives details."""
-    from starcal_ros.pipeline.diagnosis import bags  # seldom needed, slow
-
     if setup and not chosen.observations:
         cause = bags.of_a_failure(paths, chosen, setup, refused)
     else:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import itertools
 import math
 from pathlib import Path
+import tempfile
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from starcal_ros.formats.images.photographs import (
 )
 from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.from_stars import (
     count_of_stars,
     FEWEST_SOURCES,
@@ -43,10 +45,11 @@ from starcal_ros.pipeline.from_stars import (
     pinhole,
 )
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
-from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
 
 _FEW = 5  # images that are looked at for stars
@@ -256,3 +259,44 @@ def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:
         'longitude_deg': longitude,
         'height_m': height_m,
     }
+
+
+def calibrate_images(
+    images: Path | str | Sequence[Path | str], *, image_topic: str = '', **options: object
+) -> Calibration:
+    """
+    Calibration of a camera from images of the sky alone; nothing is written.
+
+    Parameters
+    ----------
+    images : path or sequence of paths
+        FITS, JPEG, PNG or TIFF files, folders of them, or patterns; or MCAP bags, whose attitudes
+        are not used.
+    image_topic : str
+        Needed where a bag has more than one topic of images.
+    **options
+        Options of a parameter file by name.
+
+    Returns
+    -------
+    Calibration
+        Of the camera alone: ``has_alignment`` is False.
+
+    Raises
+    ------
+    StarcalError
+        One line that names the cause, and the images to take.
+    """
+    paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        folder = Path(name)
+        if image_paths(paths):
+            photographs, _ = photographs_of(paths)
+            files = [photograph.path for photograph in photographs]
+            sky = from_photographs(photographs, options, folder)
+        else:
+            files = reader.mcap_files(paths)
+            sky = from_bags(paths, Topics(image=image_topic), options, folder)
+        inputs = inputs_of(files)
+        campaign = calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air)
+    return campaign.calibration

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import Comparison, DifferenceMap, movement
+from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.comparison import Comparison, DifferenceMap
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField

@@ -570,7 +570,7 @@ def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
     run('monitor', '--once', '2.5', '--remap', '__ns:=/cam1')
-    module = [*module_command('starcal_ros.entry_points'), 'monitor_client']
+    module = [*module_command('starcal_ros.entry_points'), 'starcal_ros.ros.monitor_client']
     assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
     # The entry point imports that module of ros/; it was once renamed without its command.
     assert importlib.util.find_spec('starcal_ros.ros.monitor_client')

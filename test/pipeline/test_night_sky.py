@@ -26,7 +26,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.pipeline.from_stars import from_stars
-from starcal_ros.pipeline.night_sky import photographs_of
+from starcal_ros.pipeline.night_sky import calibrate_images, photographs_of
 from starcal_ros.records import Image
 from starcal_ros.simulation.rendering import images
 from starcal_ros.sky.catalog import load_catalog
@@ -88,7 +88,7 @@ def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_cl
     tmp_path: Path,
 ) -> None:
     mirrored = [one.pixels[:, ::-1].copy() for one in tiny_images()]
-    calibration = starcal_ros.calibrate_images(write_pngs(mirrored, tmp_path / 'night'))
+    calibration = calibrate_images(write_pngs(mirrored, tmp_path / 'night'))
     difference, sigma = difference_and_sigma_arcsec(calibration)
     assert not calibration.has_alignment
     assert difference < 2 * sigma
@@ -142,7 +142,7 @@ def lights(seed: int) -> Pixels:
 def test_two_images_are_too_few(tmp_path: Path) -> None:
     folder = write_pngs([one.pixels for one in tiny_images()[:2]], tmp_path / 'night')
     with pytest.raises(NotFromStars, match='2 different images, 3 are needed: take 20 frames'):
-        starcal_ros.calibrate_images(folder)
+        calibrate_images(folder)
 
 
 def test_one_frame_many_times_is_too_few(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_one_frame_many_times_is_too_few(tmp_path: Path) -> None:
     folder = write_pngs([pixels] * 4, tmp_path / 'night')
     said = r'1 different images \(3 more are copies\), 3 are needed: take 20 frames'
     with pytest.raises(NotFromStars, match=said):
-        starcal_ros.calibrate_images(folder)
+        calibrate_images(folder)
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_frames_that_are_no_sky_are_counted(tmp_path: Path) -> None:
     folder = write_pngs(frames, tmp_path / 'night')
     said = '2 of 4 images match the sky, 3 are needed: take 20 frames.*no frames of anything else'
     with pytest.raises(NotFromStars, match=said):
-        starcal_ros.calibrate_images(folder)
+        calibrate_images(folder)
 
 
 @pytest.mark.slow
@@ -168,7 +168,7 @@ def test_a_zoom_between_the_frames_is_named(tmp_path: Path) -> None:
     frames[3:] = [zoomed(pixels, 1.1) for pixels in frames[3:]]
     folder = write_pngs(frames, tmp_path / 'night')
     with pytest.raises(NotFromStars, match='focal lengths of 180. to 198. px: .* zoom .*take 20'):
-        starcal_ros.calibrate_images(folder)
+        calibrate_images(folder)
 
 
 @pytest.mark.slow
@@ -187,7 +187,7 @@ def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
 def test_a_change_of_focus_is_refused_by_the_gate(tmp_path: Path) -> None:
     frames = [one.pixels for one in tiny_images()[:6]]
     frames[3:] = [zoomed(pixels, 1.005) for pixels in frames[3:]]
-    calibration = starcal_ros.calibrate_images(write_pngs(frames, tmp_path / 'night'))
+    calibration = calibrate_images(write_pngs(frames, tmp_path / 'night'))
     assert not calibration.accepted
     assert 'focal length or lens changes between images' in ' '.join(calibration.reasons)
 
@@ -196,7 +196,7 @@ def test_pictures_without_stars_are_refused_with_the_frames_to_take(tmp_path: Pa
     rng = np.random.default_rng(1)
     flat = [rng.normal(100, 3, (300, 400)).astype(np.uint8) for _ in range(3)]
     with pytest.raises(NotFromStars, match=r'no stars: .* take 20 frames'):
-        starcal_ros.calibrate_images(write_pngs(flat, tmp_path / 'night'))
+        calibrate_images(write_pngs(flat, tmp_path / 'night'))
 
 
 @pytest.mark.parametrize('side', [3, 8, 17])
@@ -206,7 +206,7 @@ def test_pictures_smaller_than_a_star_are_pictures_without_stars(
     rng = np.random.default_rng(side)
     pixels = [rng.integers(0, 255, (side, side + 3), np.uint8) for _ in range(4)]
     with pytest.raises(NotFromStars, match='no stars'):
-        starcal_ros.calibrate_images(write_pngs(pixels, tmp_path / 'night'))
+        calibrate_images(write_pngs(pixels, tmp_path / 'night'))
 
 
 @pytest.mark.slow
@@ -304,7 +304,7 @@ def test_copies_that_were_compressed_again_are_one_image(tmp_path: Path) -> None
     copies = [jpeg(pixels, quality) for quality in (95, 90, 80, 70)]
     folder = write_pngs(copies, tmp_path / 'night')
     with pytest.raises(NotFromStars, match=r'1 different images \(3 more are copies\)'):
-        starcal_ros.calibrate_images(folder)
+        calibrate_images(folder)
 
 
 def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
@@ -319,4 +319,4 @@ def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
         for _ in range(2)
     ]
     with pytest.raises(NotFromStars, match='^2 different images, 3 are needed'):
-        starcal_ros.calibrate_images(write_pngs(frames, tmp_path / 'night'))
+        calibrate_images(write_pngs(frames, tmp_path / 'night'))

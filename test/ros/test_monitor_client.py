@@ -89,7 +89,7 @@ def test_a_signal_ends_it_without_a_traceback(
 ) -> None:
     """At its start, while it draws, and a second time while it ends."""
     name = f'monitor_{number}_{after}'
-    command = [sys.executable, '-m', 'starcal_ros.entry_points', 'monitor_client']
+    command = [sys.executable, '-m', 'starcal_ros.entry_points', 'starcal_ros.ros.monitor_client']
     remap = ('--ros-args', '-r', f'__node:={name}')
     end = subprocess.PIPE
     with subprocess.Popen([*command, *remap], stdout=end, stderr=end, text=True) as monitor:
@@ -123,7 +123,12 @@ def until_ros(pid: int) -> None:
 @pytest.mark.parametrize('remap', ['__ns:=bad name', '__node:=3', ':='])
 def test_a_bad_remap_is_answered_without_a_traceback(client_name: str, remap: str) -> None:
     """The last line is ours, after those that rcl logs."""
-    command = [sys.executable, '-m', 'starcal_ros.entry_points', client_name]
+    command = [
+        sys.executable,
+        '-m',
+        'starcal_ros.entry_points',
+        f'starcal_ground.ros.{client_name}',
+    ]
     done = subprocess.run(
         [*command, '--ros-args', '-r', remap],
         capture_output=True,

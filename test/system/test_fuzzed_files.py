@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from bench.frames import write_set_up
-from starcal_ros.assessment.agreement import compare
+from starcal_ros.assessment.comparison import compare
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.conversion import ros_fit

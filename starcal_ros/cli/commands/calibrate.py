@@ -35,7 +35,7 @@ from starcal_ros.formats.products.product_folder import (
     write_observations,
     write_products,
 )
-from starcal_ros.pipeline import campaign, inspect
+from starcal_ros.pipeline import campaign
 from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.setup import files_of, read_setup, read_values
 from starcal_ros.pipeline.topics import Topics, without_attitudes
@@ -277,10 +277,10 @@ def _drawn(
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
+    from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals, refusals
 
     source, count = observed.source, len(observed.observations)
-    groups = inspect.refusals(observed.observations)
+    groups = refusals(observed.observations)
     refused = {group.reason: group.count for group in groups}
     is_none_used = sum(refused.values()) == count
     if count and is_none_used:

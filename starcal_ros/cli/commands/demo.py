@@ -145,7 +145,7 @@ def run(
                 stack.callback(_stop, nodes[name])
         _wait_for_images(bag.image_count, state / 'ensemble', nodes, folder, on_image)
         asked = subprocess.run(
-            node_command('calibrate_client', []),
+            node_command('starcal_ros.ros.calibrate_client', []),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env=environment,
@@ -211,7 +211,7 @@ def _node_command(name: str, params: Path, state: Path) -> list[str]:
 
 
 def node_command(name: str, arguments: Sequence[str], remaps: Sequence[str] = ()) -> list[str]:
-    """Command line that runs a module of `ros`, with names replaced by others, ``A:=B``."""
+    """Command line that runs a node or another module, with names replaced by others, ``A:=B``."""
     renamed = [part for remap in remaps for part in ('-r', remap)]
     ros_arguments = ['--ros-args', *renamed] if renamed else []
     return [*module_command('starcal_ros.entry_points'), name, *arguments, *ros_arguments]

@@ -77,7 +77,7 @@ def _observations_of(calibration: Path) -> Path:
 
 def _import(args: argparse.Namespace) -> int:
     """Make a bag from the files of a mission."""
-    from starcal_ros.formats.images.image_files import ImageOptions
+    from starcal_ros.formats.images.image_series import ImageOptions
     from starcal_ros.mission.ingest import recording, sources, tables
     from starcal_ros.mission.ingest.guard import Guard
 

@@ -25,13 +25,13 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
 from starcal_ros.formats.images.image_files import (
+    Card,
     content_of,
     decoded,
     MOST_VALUES,
-    number,
     read_fits,
 )
-from starcal_ros.formats.images.time_systems import Card, middle_of_exposure, TimeError
+from starcal_ros.formats.images.time_systems import middle_of_exposure, number, TimeError
 
 # Of files whose content says nothing, as of damaged ones.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts')

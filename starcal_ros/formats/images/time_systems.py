@@ -14,12 +14,12 @@ from datetime import date, datetime
 import functools
 import math
 import re
-from typing import Any, NamedTuple
 
 import erfa
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import StarcalError
+from starcal_ros.formats.images.image_files import Card
 
 _DAY_S = 86400
 _UNIX_DAY = date(1970, 1, 1).toordinal()
@@ -148,13 +148,6 @@ _OTHER_UNIT = re.compile(
 _INSTEAD = 'give --time-key or --times'
 
 
-class Card(NamedTuple):
-    """Value and comment of a keyword."""
-
-    value: Any
-    comment: str = ''
-
-
 def middle_of_exposure(header: Mapping[str, Card], key: str) -> int:
     """
     Stamp of the middle of the exposure; that of ``key`` unless it is empty.
@@ -231,3 +224,9 @@ def _exposure_s(header: Mapping[str, Card]) -> float | None:
     if not 0.0 < exposure_s < math.inf:
         raise TimeError(f'{key} = {value} is not the duration of an exposure: {_INSTEAD}')
     return exposure_s
+
+
+def number(header: Mapping[str, Card], *keys: str) -> float:
+    """Value of the first keyword with a number; NaN if there is none."""
+    values = (header[key].value for key in keys if key in header)
+    return next((float(one) for one in values if isinstance(one, (int, float))), math.nan)

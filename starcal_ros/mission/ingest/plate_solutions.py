@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.errors import IngestError, needing
-from starcal_ros.formats.images.image_files import ImageFile, is_fits
+from starcal_ros.formats.images.image_files import is_fits
+from starcal_ros.formats.images.image_series import ImageFile
 from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE
 from starcal_ros.pipeline.from_stars import pinhole
 from starcal_ros.untrusted import regular_file

@@ -22,7 +22,8 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.images import image_files
+from starcal_ros.formats.images import image_series
+from starcal_ros.formats.images.image_files import is_fits
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.mission.ingest.guard import Guard
@@ -69,10 +70,10 @@ class Recorded:
 
 def look_at_all(
     paths: Sequence[Path],
-    options: image_files.ImageOptions,
+    options: image_series.ImageOptions,
     guard: Guard,
     on_image: Callable[[], None] = lambda: None,
-) -> tuple[list[image_files.ImageFile], list[str]]:
+) -> tuple[list[image_series.ImageFile], list[str]]:
     """
     The image files in order of time, and one line for each file that cannot be taken.
 
@@ -81,16 +82,16 @@ def look_at_all(
     files, problems = [], []
     for path in paths:
         try:
-            files.append(guard.call(path, image_files.look, path, _options_of(path, options)))
+            files.append(guard.call(path, image_series.look, path, _options_of(path, options)))
         except IngestError as error:
             problems.append(str(error))
         on_image()
     if files:
-        image_files.check_alike(files)
+        image_series.check_alike(files)
     return sorted(files, key=lambda file: file.time_ns), problems
 
 
-def _options_of(path: Path, options: image_files.ImageOptions) -> image_files.ImageOptions:
+def _options_of(path: Path, options: image_series.ImageOptions) -> image_series.ImageOptions:
     """Options without the times of the other images, which are not sent with each."""
     if options.times is None:
         return options
@@ -123,8 +124,8 @@ def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
 
 def write_bag(
     bag: Path,
-    files: Sequence[image_files.ImageFile],
-    options: image_files.ImageOptions,
+    files: Sequence[image_series.ImageFile],
+    options: image_series.ImageOptions,
     guard: Guard,
     attitudes: Attitudes,
     velocities: Velocities | None = None,
@@ -143,7 +144,7 @@ def write_bag(
     covered = [_gap_s(attitudes, file.time_ns) for file in files]
     notes = [*attitudes.notes, *(velocities.notes if velocities else ())]
     notes += _coverage_notes(files, attitudes, covered)
-    scale = image_files.common_scale(files, options)
+    scale = image_series.common_scale(files, options)
     notes += _scale_notes(files, scale)
     writer = BagWriter(bag)
     record, params, copied = _files_beside(bag)
@@ -171,7 +172,7 @@ def write_bag(
     return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 
-def _near(attitudes: Attitudes, files: Sequence[image_files.ImageFile]) -> Attitudes:
+def _near(attitudes: Attitudes, files: Sequence[image_series.ImageFile]) -> Attitudes:
     """Attitudes from a minute before the first image to a minute after the last."""
     stamps = attitudes.time_ns
     first_ns, last_ns = files[0].time_ns - _MARGIN_NS, files[-1].time_ns + _MARGIN_NS
@@ -195,7 +196,7 @@ def _span(first_ns: int, last_ns: int) -> str:
 
 
 def _coverage_notes(
-    files: Sequence[image_files.ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
+    files: Sequence[image_series.ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
 ) -> list[str]:
     longest_s = AttitudeOptions().max_attitude_gap_s
     outside = [file for file, gap_s in zip(files, gaps_s, strict=True) if math.isinf(gap_s)]
@@ -220,7 +221,7 @@ def _coverage_notes(
     return notes
 
 
-def _scale_notes(files: Sequence[image_files.ImageFile], scale: image_files.Scale) -> list[str]:
+def _scale_notes(files: Sequence[image_series.ImageFile], scale: image_series.Scale) -> list[str]:
     if scale.is_none:
         return []
     notes = [f'pixel values are {scale.offset:.9g} + {scale.step:.9g} DN']
@@ -235,9 +236,9 @@ def _scale_notes(files: Sequence[image_files.ImageFile], scale: image_files.Scal
 
 def _write_messages(
     writer: BagWriter,
-    files: Sequence[image_files.ImageFile],
-    options: image_files.ImageOptions,
-    scale: image_files.Scale,
+    files: Sequence[image_series.ImageFile],
+    options: image_series.ImageOptions,
+    scale: image_series.Scale,
     guard: Guard,
     trackers: Mapping[str, Attitudes],
     velocities: Velocities | None,
@@ -263,8 +264,8 @@ def _write_messages(
                     TEMPERATURE_TOPIC, time_ns, content.temperature_degc, 'camera'
                 )
             wanted = _options_of(content.path, options)
-            pixels = guard.call(content.path, image_files.pixels_of, content.path, wanted, scale)
-            if rows_upward and image_files.is_fits(content.path):
+            pixels = guard.call(content.path, image_series.pixels_of, content.path, wanted, scale)
+            if rows_upward and is_fits(content.path):
                 pixels = pixels[::-1]
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
             on_image()
@@ -276,8 +277,8 @@ def _prior_files(
     prior: Prior,
     params: Path,
     copied: Path,
-    files: Sequence[image_files.ImageFile],
-    scale: image_files.Scale,
+    files: Sequence[image_series.ImageFile],
+    scale: image_series.Scale,
     by_stars: bool,
     others: Sequence[str],
 ) -> dict[Path, str]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from starcal_ros.errors import IngestError
-from starcal_ros.formats.images.image_files import ImageFile
+from starcal_ros.formats.images.image_series import ImageFile
 from starcal_ros.mission.ingest import ccsds, kernels, plate_solutions, tables
 from starcal_ros.mission.ingest.mission_records import Attitudes, Velocities
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +15,32 @@ from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.frames import read_frames
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
 from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
 from starcal_ros.pipeline.diagnosis.identified import LOOKED_AT
-from starcal_ros.pipeline.inspect import placed, refusals, Refused
+from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.records import Image, StarObservations
+from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations
+from starcal_ros.sky.attitude import AttitudeOptions
 
 _MEASURED = 10  # images, for the reason of their refusal
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
 """Refusals after which the sky of an image cannot be held against the set-up."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Images refused for one reason: their count, its meaning, and the first of them."""
+
+    reason: str
+    count: int
+    meaning: str
+    first_ns: int
+    detail: str
 
 
 def diagnose_bags(
@@ -153,4 +168,45 @@ def of_two_clocks(images_ns: tuple[int, int], attitudes_ns: tuple[int, int]) -> 
         ' of different times.',
         (f'the attitudes begin {shift_s:+.1f} s after the images',),
         ('# give both on one clock, or the difference of the clocks in stamp_offset_s',),
+    )
+
+
+def placed(
+    paths: Sequence[Path], topics: Topics, options: AttitudeOptions, channel: str = ''
+) -> Iterator[StarObservations]:
+    """Images without their stars, refused for bad encoding, order or attitude."""
+    latest_ns = None
+    for frame in read_frames(
+        paths, Topics(topics.image, topics.attitude), options, channel=channel
+    ):
+        if isinstance(frame, StarObservations):
+            yield frame
+            continue
+        image = frame.image
+        bag_topics.warn_of_clock(image.time_ns)
+        height, width = image.pixels.shape
+        try:
+            check_order(image, latest_ns)
+            gap_s = math.nan
+            if topics.attitude:
+                before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
+                gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+        except ImageRefused as refused:
+            yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
+            continue
+        latest_ns = image.time_ns
+        yield StarObservations.of_image(image.time_ns, (width, height), attitude_gap_s=gap_s)
+
+
+def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
+    """Refused images by their reason, the most frequent first."""
+    groups: dict[str, list[StarObservations]] = {}
+    for observations in seen:
+        if observations.refusal:
+            groups.setdefault(observations.refusal, []).append(observations)
+    return tuple(
+        Refused(
+            reason, len(group), IMAGE_REFUSALS.get(reason, ''), group[0].time_ns, group[0].detail
+        )
+        for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
     )

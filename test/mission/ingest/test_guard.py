@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import IngestError
-from starcal_ros.formats.images.image_files import ImageOptions, look
+from starcal_ros.formats.images.image_series import ImageOptions, look
 from starcal_ros.mission.ingest import sources
 from starcal_ros.mission.ingest.guard import Guard
 

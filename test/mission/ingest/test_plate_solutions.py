@@ -19,7 +19,7 @@ from starcal_ros.cli.main import main
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.images.image_files import ImageFile
+from starcal_ros.formats.images.image_series import ImageFile
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info

@@ -13,8 +13,8 @@ from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment import agreement
-from starcal_ros.assessment.agreement import compare
+from starcal_ros.assessment import comparison
+from starcal_ros.assessment.comparison import compare
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.cli import main
@@ -113,7 +113,7 @@ def test_sigmas_of_the_maps_are_those_of_the_table(tiny: Calibration) -> None:
         length_rad = part.length_px.ravel() / focal_px
         expected = length_rad / (sigma_arcsec * ARCSECOND_RAD)
         np.testing.assert_allclose(part.sigmas.ravel(), expected, rtol=1e-9)
-    made = agreement.content(found)
+    made = comparison.content(found)
     expected_arcsec = found.difference[-3:] / ARCSECOND_RAD
     assert made['alignment_arcsec'] == pytest.approx(expected_arcsec, rel=1e-12)
 
@@ -171,7 +171,7 @@ def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
     nothing = compare(exact, exact)
     assert nothing.total.degrees_of_freedom == 0
     assert np.isnan(nothing.before.sigmas).all()
-    made = json.dumps(agreement.content(nothing), allow_nan=False)
+    made = json.dumps(comparison.content(nothing), allow_nan=False)
     assert json.loads(made)['chi2'] is None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import IngestError
-from starcal_ros.formats.images.image_files import (
+from starcal_ros.formats.images.image_series import (
     check_alike,
     common_scale,
     ImageOptions,

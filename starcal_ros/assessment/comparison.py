@@ -1,0 +1,208 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Comparison of two calibrations: parameters, alignment and lines of sight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import (
+    chi_squared,
+    ChiSquared,
+    lines_of_sight,
+    parameter_difference,
+)
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.camera import pixel_grid
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import ProductError
+from starcal_ros.record_fields import json_object
+from starcal_ros.records import Calibration, CameraGeometry
+
+
+@dataclass(frozen=True)
+class DifferenceMap:
+    """
+    Movement of the lines of sight of a grid of pixels, in the camera frame of A.
+
+    ``length_px`` (rows, columns) is the angle in units of a pixel at the centre, as in the gate;
+    ``difference_px`` (rows, columns, 2) is its part along u and v; ``sigmas`` (rows, columns) is
+    the length in 1-sigma of both calibrations, NaN where nothing was estimated.
+    """
+
+    difference_px: Floats
+    length_px: Floats
+    sigmas: Floats
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    Calibration B against A.
+
+    Attributes
+    ----------
+    difference, sigma : (p,)
+        B less A of `Calibration.parameter_names`, and its 1-sigma if their errors are
+        independent.  The alignment angles (rad) are passive small rotations in the camera frame.
+    rotation_rad : float
+        The rotation common to all lines of sight.
+    before, after : DifferenceMap
+        Of the lines of sight in the star tracker frame, and with the common rotation removed.
+    total : ChiSquared
+        Of all differences together; no degrees of freedom where nothing was estimated.
+    notes : tuple of str
+        Limitations of the sigmas.
+    """
+
+    a: Calibration
+    b: Calibration
+    difference: Floats
+    sigma: Floats
+    rotation_rad: float
+    before: DifferenceMap
+    after: DifferenceMap
+    total: ChiSquared
+    notes: tuple[str, ...]
+
+    @property
+    def sigmas(self) -> Floats:
+        """The differences in their sigma, (p,); NaN where a parameter was held in both."""
+        return _ratio(self.difference, self.sigma)
+
+
+def compare(a: Calibration, b: Calibration) -> Comparison:
+    """
+    Difference of B from A.
+
+    Raises ProductError when the cameras differ in size or model, or a pixel has no line of sight.
+    """
+    camera_a, camera_b = a.geometry.camera, b.geometry.camera
+    if (camera_a.width, camera_a.height) != (camera_b.width, camera_b.height):
+        raise ProductError(
+            f'A is of a camera of {camera_a.width} x {camera_a.height}, '
+            f'B of one of {camera_b.width} x {camera_b.height}: they cannot be compared'
+        )
+    if camera_a.model != camera_b.model:
+        raise ProductError(
+            f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
+        )
+    difference = parameter_difference(b.geometry, a.geometry)
+    sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
+    old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
+    rotation, _ = Rotation.align_vectors(new, old)
+    of_a, of_b = (
+        line_of_sight_table(camera, c.map_covariance, pixel_grid(camera, GRID, GRID))
+        for c, camera in ((a, camera_a), (b, camera_b))
+    )
+    sight_sigma_rad = np.hypot(of_a.sigma_arcsec, of_b.sigma_arcsec) * ARCSECOND_RAD
+    shape_sigma_rad = np.hypot(of_a.shape_sigma_arcsec, of_b.shape_sigma_arcsec) * ARCSECOND_RAD
+    return Comparison(
+        a=a,
+        b=b,
+        difference=difference,
+        sigma=sigma,
+        rotation_rad=float(rotation.magnitude()),
+        before=_map(new - old, a.geometry, sight_sigma_rad),
+        after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
+        total=chi_squared(difference, a.covariance + b.covariance),
+        notes=_notes(a, b, difference, sigma),
+    )
+
+
+def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
+    """Lines of sight of the grid, (GRID^2, 3), star tracker frame."""
+    directions = lines_of_sight(geometry, GRID, GRID)
+    if not np.isfinite(directions).all():
+        raise ProductError(
+            'a calibration has pixels without a line of sight: its distortion folds'
+        )
+    return directions
+
+
+def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceMap:
+    """Map of differences (GRID^2, 3) of unit vectors, star tracker frame; sigmas (GRID^2,)."""
+    in_camera = frame.star_tracker_from_camera.inv().apply(moved).reshape(GRID, GRID, 3)
+    length_rad = np.linalg.norm(in_camera, axis=-1)
+    focal_px: float = frame.camera.parameters[0]
+    return DifferenceMap(
+        difference_px=in_camera[..., :2] * focal_px,
+        length_px=length_rad * focal_px,
+        sigmas=_ratio(length_rad, sigma_rad.reshape(GRID, GRID)),
+    )
+
+
+def _ratio(values: Floats, sigma: Floats) -> Floats:
+    return np.asarray(
+        np.divide(values, sigma, out=np.full(np.shape(values), np.nan), where=sigma > 0)
+    )
+
+
+def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) -> tuple[str, ...]:
+    notes = []
+    for name, calibration in (('A', a), ('B', b)):
+        if not calibration.accepted:
+            notes.append(f'the gate refused {name}: {"; ".join(calibration.reasons)}')
+    same = 'observations_sha256'
+    if a.provenance.get(same) and a.provenance.get(same) == b.provenance.get(same):
+        notes.append(
+            'A and B are from the same stars: their errors are correlated, so the true sigma of a '
+            'difference is smaller'
+        )
+    held = [
+        name
+        for name, moved, error in zip(
+            a.geometry.camera.parameter_names, difference, sigma, strict=False
+        )
+        if moved and not error
+    ]
+    if held:
+        notes.append(f'held in both, at different values: {", ".join(held)}')
+    if (a.parent_frame, a.child_frame) != (b.parent_frame, b.child_frame):
+        notes.append(
+            f'the frames have other names: {a.parent_frame}, {a.child_frame} in A, '
+            f'{b.parent_frame}, {b.child_frame} in B'
+        )
+    degc = [c.temperature.reference_degc for c in (a, b) if c.temperature is not None]
+    if len(degc) == 1 or len(set(degc)) > 1:
+        notes.append('they hold at different temperatures (reference_degc)')
+    return tuple(notes)
+
+
+def content(comparison: Comparison) -> dict[str, object]:
+    """A comparison as a JSON object; a number that is not finite is null."""
+
+    def of_map(found: DifferenceMap) -> dict[str, object]:
+        length_px = found.length_px
+        known = found.sigmas[np.isfinite(found.sigmas)]
+        return {
+            'worst_px': float(length_px.max()),
+            'rms_px': float(np.sqrt(np.mean(length_px**2))),
+            'worst_sigmas': float(known.max()) if known.size else None,
+            'rms_sigmas': float(np.sqrt(np.mean(known**2))) if known.size else None,
+            'difference_px': found.difference_px,
+            'sigmas': found.sigmas,
+        }
+
+    total = comparison.total
+    found = {
+        'parameter_names': comparison.a.parameter_names,
+        'a': comparison.a.geometry.camera.parameters,
+        'b': comparison.b.geometry.camera.parameters,
+        'difference': comparison.difference,
+        'sigma': comparison.sigma,
+        'sigmas': comparison.sigmas,
+        'alignment_arcsec': comparison.difference[-3:] / ARCSECOND_RAD,
+        'common_rotation_arcsec': comparison.rotation_rad / ARCSECOND_RAD,
+        'lines_of_sight': of_map(comparison.before),
+        'without_common_rotation': of_map(comparison.after),
+        'chi2': total.value if total.degrees_of_freedom else None,
+        'degrees_of_freedom': total.degrees_of_freedom,
+        'p_value': total.p_value if total.degrees_of_freedom else None,
+        'accepted': [comparison.a.accepted, comparison.b.accepted],
+        'notes': comparison.notes,
+    }
+    return json_object(found)
