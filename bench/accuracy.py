@@ -20,14 +20,14 @@ import numpy as np
 from bench.frames import load_set_up, observed, render_frame
 from bench.table import Table
 from bench.trials import in_processes, rms
+from starcal_ground.simulation import centroids
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import solve
 from starcal_ros.records import CameraGeometry, MapCovariance, StarObservations
-from starcal_ros.simulation import centroids
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
 from studies.trials import map_bound_px
 
 SIZE = (1296, 1024)

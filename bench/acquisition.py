@@ -21,6 +21,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from bench.table import Table
+from starcal_ground.simulation import rendering
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
@@ -32,9 +35,6 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image
-from starcal_ros.simulation import rendering
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 SEED = 20161

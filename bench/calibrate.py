@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from bench.table import Table
 from bench.trials import memory_mb
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation import simulated_bag
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation import simulated_bag
 
 MOST_MB = 300.0
 # Scenario, images, most wall time in seconds, and as a multiple of the bare read.
@@ -33,7 +33,7 @@ with open(sys.argv[1], 'rb') as stream:
 """
 
 # As the console script does.
-TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main())'
+TOOL = 'import sys; from starcal_ground.cli.entry_point import main; sys.exit(main())'
 
 
 class Cost(NamedTuple):

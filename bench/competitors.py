@@ -20,6 +20,8 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
@@ -30,8 +32,6 @@ from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.search import minimise
 from starcal_ros.estimation.star_equations import arrange, Measurements, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.scenario import scenario
 
 FREE = np.array([k for k, name in enumerate(PARAMETER_NAMES) if name not in ('cx', 'cy')])
 SIGMA_PX = 0.1

@@ -16,6 +16,8 @@ import numpy as np
 from bench.competitors import make_ensemble
 from bench.table import Table
 from bench.trials import rms
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import (
     image_information,
@@ -24,8 +26,6 @@ from starcal_ros.assessment.observability import (
 )
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.scenario import scenario
 
 TARGET = 1.05
 RANDOM_CHOICES = 200

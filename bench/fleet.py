@@ -22,14 +22,14 @@ import psutil  # type: ignore[import-untyped]
 from scipy.spatial.transform import Rotation
 
 from bench.table import Table, verdict
+from starcal_ground.mission.trend import fleet
+from starcal_ground.mission.trend.fleet import Cameras, KEPT_FOLDER, Task
+from starcal_ground.mission.trend.rows import COMPUTED, kept_name, Row
+from starcal_ground.mission.trend.series import SECONDS_PER_YEAR
+from starcal_ground.mission.trend.trend_table import Table as Rows
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend import fleet
-from starcal_ros.mission.trend.fleet import Cameras, KEPT_FOLDER, Task
-from starcal_ros.mission.trend.rows import COMPUTED, kept_name, Row
-from starcal_ros.mission.trend.series import SECONDS_PER_YEAR
-from starcal_ros.mission.trend.trend_table import Table as Rows
 
 LEAST_EFFICIENCY = 0.85
 MOST_MB, MOST_S = 300.0, 20.0  # of a run with nothing new: at 100,000 rows; over 10,000 keys
@@ -42,7 +42,7 @@ _SIGMAS = np.array(
 )
 _CLIENT = """
 import sys
-from starcal_ros.cli.main import main
+from starcal_ground.cli.main import main
 main(sys.argv[1:])
 with open('/proc/self/status') as file:
     print(next(line for line in file if line.startswith('VmHWM:')))
@@ -128,7 +128,7 @@ def kept(output: Path) -> list[Path]:
 
 def killed_client(root: Path, output: Path, count: int) -> None:
     """Run the command, and kill it once so many calibrations are kept."""
-    line = [sys.executable, '-m', 'starcal_ros.cli.main', 'trend', str(root), '-o', str(output)]
+    line = [sys.executable, '-m', 'starcal_ground.cli.main', 'trend', str(root), '-o', str(output)]
     line += ['--params', str(_PARAMS), '--workers', str(_WORKERS)]
     with subprocess.Popen(line, stdout=subprocess.DEVNULL) as client:
         while client.poll() is None and len(kept(output)) < count:

@@ -26,12 +26,12 @@ import numpy as np
 
 from bench.fleet import simulated_rows, simulated_truth
 from bench.table import Table
+from starcal_ground.mission.trend import fleet, places, trend_page
+from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
+from starcal_ground.mission.trend.places import Entry
+from starcal_ground.mission.trend.rows import Row
+from starcal_ground.mission.trend.trend_table import Table as Rows
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend import fleet, places, trend_page
-from starcal_ros.mission.trend.fleet import Answer, Cameras, Task
-from starcal_ros.mission.trend.places import Entry
-from starcal_ros.mission.trend.rows import Row
-from starcal_ros.mission.trend.trend_table import Table as Rows
 
 _PARAMS = Path(__file__).parents[1] / 'bags/tiny/params.yaml'
 _ROOT = 's3://archive/fleet'

@@ -10,6 +10,9 @@ import tempfile
 
 import yaml
 
+from starcal_ground.simulation import rendering, simulated_bag
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.formats.bag.writer import BagWriter
@@ -18,9 +21,6 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import AttitudeSample, Ensemble, Image
-from starcal_ros.simulation import rendering, simulated_bag
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.sky.attitude import AttitudeHistory
 

@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import load_set_up
 from bench.table import Table
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import project
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.simulation.scenario import scenario
 from studies.trials import draw_star_field, observe, pointing_error_arcsec, StarField
 
 SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # number of images, stars per image

@@ -16,13 +16,13 @@ import numpy as np
 
 from bench.frames import load_set_up
 from bench.table import Table
-from starcal_ros.assessment.plan import target
+from starcal_ground.planning.plan import plan_pointings, Pointing, Request
+from starcal_ground.planning.prospect import target
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.pipeline.plan import plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 _FIRST, _RANDOM = 8, 16
 _SIGMAS = ('map', 'line_of_sight')

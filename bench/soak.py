@@ -25,7 +25,7 @@ from bench import graph
 from bench.frames import paper_scenario, render_frame, write_set_up
 from bench.table import Table
 from bench.trials import memory_mb
-from starcal_ros.simulation.scenario import Scenario, scenario
+from starcal_ground.simulation.scenario import Scenario, scenario
 
 MAX_IMAGES = 50
 MAGNITUDE_LIMIT = 9.0  # the default of the node: 300 to 400 stars in a large frame

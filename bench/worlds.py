@@ -22,12 +22,12 @@ from bench import trials
 from bench.frames import load_set_up
 from bench.table import Table
 from bench.trials import rms, Score
+from starcal_ground.simulation.centroids import camera_information, scaled_inverse
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import MapCovariance
-from starcal_ros.simulation.centroids import camera_information, scaled_inverse
 from studies.worlds import Campaign, campaign, WORLDS
 
 NAMES = tuple(WORLDS)

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docs.make_images import FOLDER, setup_of
+from starcal_ground.simulation import rendering, scenario
 from starcal_ros.arrays import Floats, Picture
 from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.annotation import annotate
 from starcal_ros.records import Image, StarObservations
-from starcal_ros.report.pictures.annotation import annotate
-from starcal_ros.simulation import rendering, scenario
 from starcal_ros.sky.attitude import AttitudeHistory
 
 SCENARIO = scenario.scenario('tiny')

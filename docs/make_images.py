@@ -22,27 +22,27 @@ import PIL.Image
 from PIL.PngImagePlugin import PngInfo
 import yaml
 
-from starcal_ros.arrays import Floats, Picture
-from starcal_ros.assessment.observability import coverage
-from starcal_ros.cli import main as cli
-from starcal_ros.formats.products.calibration_json import read_calibration
-from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline import observe as observing
-from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import Calibration, CameraGeometry, Ensemble, Image, StarObservations
-from starcal_ros.report.detector_figures import (
+from starcal_ground.cli import main as cli
+from starcal_ground.report.detector_figures import (
     cell_counts,
     distortion_contours,
     distortion_vectors,
     star_cloud,
 )
-from starcal_ros.report.pictures.annotation import annotate_reduced
-from starcal_ros.report.svg import sheet
-from starcal_ros.simulation import rendering, simulated_bag
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
+from starcal_ground.report.svg import sheet
+from starcal_ground.simulation import rendering, simulated_bag
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.scenario import Scenario
+from starcal_ros.arrays import Floats, Picture
+from starcal_ros.assessment.observability import coverage
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.camera_yaml import write_camera_info
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import observe as observing
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline.annotation import annotate_reduced
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.records import Calibration, CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
 FOLDER = Path(__file__).parent / 'images'

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_ros.report.svg import arrow, Drawing, INK, MUTED, SERIES, words
+from starcal_ground.report.svg import arrow, Drawing, INK, MUTED, SERIES, words
 
 FOLDER = Path(__file__).parent / 'images'
 WIDTH, HEIGHT = 600, 410

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ground.report.plots import plot
+from starcal_ground.report.svg import Curve, MUTED, SERIES, sheet
+from starcal_ground.simulation.rendering import expose, star_electrons
+from starcal_ground.simulation.scenario import Detector
 from starcal_ros.arrays import Floats
 from starcal_ros.records import StarRefusal
-from starcal_ros.report.plots import plot
-from starcal_ros.report.svg import Curve, MUTED, SERIES, sheet
-from starcal_ros.simulation.rendering import expose, star_electrons
-from starcal_ros.simulation.scenario import Detector
 from starcal_ros.stars.centroiding import measure_stars
 from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.image_model import CentroidOptions, model_image

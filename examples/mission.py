@@ -17,8 +17,8 @@ import numpy as np
 import spiceypy
 import yaml
 
+from starcal_ground.cli.main import main as starcal
 import starcal_ros
-from starcal_ros.cli.main import main as starcal
 from starcal_ros.formats.bag import reader
 from starcal_ros.records import Image
 

@@ -18,13 +18,13 @@ import zlib
 
 import numpy as np
 
+from starcal_ground.simulation.centroids import true_observations
 from starcal_ros.assessment.agreement import parameter_difference
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
-from starcal_ros.simulation.centroids import true_observations
 from studies.term_removal import removal_study
 from studies.trials import (
     bound,

@@ -20,6 +20,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from starcal_ground.report.detector_figures import (
+    distortion_contours,
+    distortion_vectors,
+    star_cloud,
+)
+from starcal_ground.report.figures import outline
+from starcal_ground.report.plots import plot
+from starcal_ground.report.svg import Curve, Drawing, GRID, INK, Panel, SERIES, sheet
+from starcal_ground.simulation.rendering import fixed_pattern, render
+from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import (
@@ -38,12 +48,6 @@ from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, StarObservations
-from starcal_ros.report.detector_figures import distortion_contours, distortion_vectors, star_cloud
-from starcal_ros.report.figures import outline
-from starcal_ros.report.plots import plot
-from starcal_ros.report.svg import Curve, Drawing, GRID, INK, Panel, SERIES, sheet
-from starcal_ros.simulation.rendering import fixed_pattern, render
-from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.sky.attitude import AttitudeHistory
 from studies.monte_carlo import Design, Row
 from studies.study_figures import removed_terms, term_worth

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation import rendering
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
-from starcal_ros.simulation import rendering
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.astrometry import earth_velocity_c
 from studies.worlds import aberrated, eighth_order, keystone
 

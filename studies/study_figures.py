@@ -8,11 +8,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 from scipy.stats import chi2
 
+from starcal_ground.report.figures import outline
+from starcal_ground.report.plots import plot
+from starcal_ground.report.svg import (
+    Curve,
+    Drawing,
+    INK,
+    Panel,
+    Scale,
+    SERIES,
+    sheet,
+    WIDTH,
+    words,
+)
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES
-from starcal_ros.report.figures import outline
-from starcal_ros.report.plots import plot
-from starcal_ros.report.svg import Curve, Drawing, INK, Panel, Scale, SERIES, sheet, WIDTH, words
 from studies.monte_carlo import ENOUGH, Row, UNUSED_IMAGES
 from studies.summary import column, StudyResult
 from studies.term_removal import TermRemoval

@@ -15,6 +15,8 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation.centroids import scaled_inverse
+from starcal_ground.simulation.scenario import Scenario, scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import chi_squared, lines_of_sight, parameter_difference
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
@@ -25,8 +27,6 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
-from starcal_ros.simulation.centroids import scaled_inverse
-from starcal_ros.simulation.scenario import Scenario, scenario
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # half side of the square over which misidentified stars scatter

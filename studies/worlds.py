@@ -24,14 +24,14 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.centroids import observations
+from starcal_ground.simulation.scenario import Detector, Scenario, Scene
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Ensemble, StarObservations
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.centroids import observations
-from starcal_ros.simulation.scenario import Detector, Scenario, Scene
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
 from starcal_ros.sky.catalog import cone, load_catalog
 

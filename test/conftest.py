@@ -185,7 +185,7 @@ def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Products of `starcal calibrate` for that bag; tests must not change them."""
     folder = tmp_path_factory.mktemp('tiny_products')
-    command = [sys.executable, '-m', 'starcal_ros.cli.main', 'calibrate', str(tiny_bag)]
+    command = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate', str(tiny_bag)]
     command += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, ''), done.stderr
@@ -329,8 +329,8 @@ def other_client(ros_domain: None) -> Iterator[Client]:
 @pytest.fixture(scope='session')
 def tiny_observations() -> Any:
     """Simulated observations of scenario tiny, without pixels."""
-    synthetic = pytest.importorskip('starcal_ros.simulation.scenario')
-    centroids = pytest.importorskip('starcal_ros.simulation.centroids')
+    synthetic = pytest.importorskip('starcal_ground.simulation.scenario')
+    centroids = pytest.importorskip('starcal_ground.simulation.centroids')
     return centroids.true_observations(synthetic.scenario('tiny'))
 
 

@@ -8,8 +8,8 @@ import os
 from pathlib import Path
 import signal
 
-from starcal_ros.mission.trend import fleet
-from starcal_ros.mission.trend.fleet import Answer, Task
+from starcal_ground.mission.trend import fleet
+from starcal_ground.mission.trend.fleet import Answer, Task
 
 
 def kill_on_poison(task: Task) -> Answer:

@@ -9,6 +9,7 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import line_of_sight, pixel_grid
@@ -16,7 +17,6 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble
-from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 WIDTH, HEIGHT = 1296, 1024
 

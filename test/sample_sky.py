@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from starcal_ros.simulation.scenario import Detector, Scenario, Scene
+from starcal_ground.simulation.scenario import Detector, Scenario, Scene
 
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 # Venus, Jupiter, Mars, Saturn, Mercury, and Uranus, which resembles a star.

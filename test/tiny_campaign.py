@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.rendering import render
+from starcal_ground.simulation.scenario import attitude_samples, scenario, scene
 from starcal_ros.records import Ensemble, Image
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.rendering import render
-from starcal_ros.simulation.scenario import attitude_samples, scenario, scene
 from starcal_ros.sky.attitude import AttitudeHistory
 
 SCENARIO = scenario('tiny', seed=7)

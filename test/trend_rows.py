@@ -9,8 +9,8 @@ from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.mission.trend.rows import RECORDED, Row, row_of
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.mission.trend.rows import RECORDED, Row, row_of
 from starcal_ros.records import Calibration, CameraGeometry
 
 DAY_NS = 86400 * 10**9

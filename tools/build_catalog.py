@@ -41,15 +41,15 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Mask
-from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.mission.ingest.gaia_catalog import (
+from starcal_ground.mission.ingest.gaia_catalog import (
     catalog_file,
     close_pairs,
     integer_columns,
     johnson_v,
     marked_close,
 )
+from starcal_ros.arrays import Floats, Mask
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import CATALOG_PATH, load_catalog, MAGNITUDE_UNIT, MotionSource
 
 Rows = NDArray[np.intp]

@@ -268,15 +268,16 @@ def install_package(venv: Path) -> None:
     run(['cmake', '--install', build], log)
 
     # CMake has copied the sources, as it must in a ROS workspace; here they are to be live.
-    for copied in packages_of(venv).glob('starcal_ros*'):
-        shutil.rmtree(copied)
+    for pattern in ('starcal_ros*', 'starcal_ground*'):
+        for copied in packages_of(venv).glob(pattern):
+            shutil.rmtree(copied)
     # Lets ament_index find this package and its files without sourcing anything.
     underlay = "import os, sys; os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)\n"
     (packages_of(venv) / 'starcal_underlay.pth').write_text(underlay)
     pip(venv, 'install', '--no-deps', '--no-build-isolation', '--editable', ROOT)
     # As pip does for a package that it copies.  Where Python may write no bytecode, every process
     # would compile all sources again, 0.7 s.
-    sources = (ROOT / 'starcal_ros', packages_of(venv) / 'starcal')
+    sources = (ROOT / 'starcal_ros', ROOT / 'starcal_ground', packages_of(venv) / 'starcal')
     run([venv / 'bin/python', '-m', 'compileall', '-q', *sources])
 
 

@@ -14,13 +14,13 @@ import numpy as np
 
 from bench.competitors import Case, make_case
 from bench.frames import Frame, load_set_up, observed, render_frame
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import pixel_grid
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
 from studies import rendered_worlds
 from studies.worlds import simulate, World, WORLDS
 

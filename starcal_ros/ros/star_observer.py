@@ -36,6 +36,7 @@ from starcal_ros.formats.messages.observation_messages import observations_to_me
 from starcal_ros.formats.messages.telemetry import latest_at
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.annotation import annotate
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ros.pipeline.node_options import ObserverOptions
 from starcal_ros.pipeline.setup import aligned, load_setup
@@ -46,7 +47,6 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
-from starcal_ros.report.pictures.annotation import annotate
 from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
 from starcal_ros.ros.lifecycle_node.lifecycle import Health, OK, StarcalNode, WARN

@@ -13,9 +13,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from starcal_ground.simulation import centroids as simulated_centroids
+from starcal_ground.simulation import scenario
 from starcal_ros.records import Ensemble
-from starcal_ros.simulation import centroids as simulated_centroids
-from starcal_ros.simulation import scenario
 from studies import __main__ as studies
 from studies import monte_carlo, paper, summary
 from studies.paper import judge, PaperStudy, spread

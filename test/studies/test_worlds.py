@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.worlds import score
+from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.simulation import scenario as synthetic
 from studies import worlds
 from studies.worlds import Campaign
 

@@ -20,7 +20,15 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 ROOT = Path(__file__).resolve().parents[2]
-BUILT = ('CMakeLists.txt', 'package.xml', 'setup.cfg', 'msg', 'srv', 'starcal_ros')
+BUILT = (
+    'CMakeLists.txt',
+    'package.xml',
+    'setup.cfg',
+    'msg',
+    'srv',
+    'starcal_ros',
+    'starcal_ground',
+)
 TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README.md', 'LICENSE')
 INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_ANSWERS_WITHIN_S = 30.0

@@ -20,9 +20,9 @@ import numpy as np
 from PIL import Image
 import pytest
 
-from starcal_ros.cli import main
-from starcal_ros.cli.arguments import parser
-from starcal_ros.cli.commands import demo
+from starcal_ground.cli import main
+from starcal_ground.cli.arguments import parser
+from starcal_ground.cli.commands import demo
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.options import names_of, read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
@@ -174,7 +174,8 @@ FILE_ENDINGS = ('html', 'json', 'mcap', 'md', 'npz', 'py', 'tf', 'ti', 'yaml')
 @pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_named_functions_exist(document: Path) -> None:
     homes: dict[str, list[str]] = {}
-    for path in (ROOT / 'starcal_ros').rglob('*.py'):
+    packages = (ROOT / 'starcal_ros', ROOT / 'starcal_ground')
+    for path in (path for package in packages for path in package.rglob('*.py')):
         dotted = '.'.join(path.relative_to(ROOT).with_suffix('').parts)
         homes.setdefault(path.stem, []).append(dotted)
     cited = re.findall(r'`(?:(\w+)/)?(\w+)\.(\w+)(?:\.\w+)?`', document.read_text())
@@ -191,7 +192,8 @@ def test_topics_and_services_are_names_that_the_nodes_use() -> None:
     text = (ROOT / 'docs' / 'icd.md').read_text()
     documented = re.findall(r'^\| (?:sub|pub|srv) \| `([^`]+)` \|', text, re.MULTILINE)
     assert len(documented) >= 15
-    nodes = (ROOT / 'starcal_ros' / 'ros').glob('*.py')
+    rooms = (ROOT / 'starcal_ros' / 'ros', ROOT / 'starcal_ground' / 'ros')
+    nodes = [path for room in rooms for path in room.glob('*.py')]
     constants = {
         node.value
         for path in nodes
@@ -298,7 +300,7 @@ def test_a_program_of_a_document_runs(
             # Programs of other projects need not be here; a wrong name of ours is not skipped.
             name = one.module if isinstance(one, ast.ImportFrom) else one.names[0].name
             package = str(name).partition('.')[0]
-            if package not in ('bench', 'docs', 'starcal_ros'):
+            if package not in ('bench', 'docs', 'starcal_ground', 'starcal_ros'):
                 pytest.importorskip(package)
         program.body = list(imports)
     exec(compile(program, document.name, 'exec'), {})
@@ -391,7 +393,7 @@ def check_ros_arguments(words: tuple[str, ...]) -> None:
 
 def executables() -> set[str]:
     text = (ROOT / 'setup.cfg').read_text()
-    return set(re.findall(r'^ {4}(\w+) = starcal_ros', text, re.MULTILINE))
+    return set(re.findall(r'^ {4}(\w+) = starcal_(?:ros|ground)', text, re.MULTILINE))
 
 
 @pytest.mark.parametrize('line', lines_of('ros2'), ids=lambda line: ' '.join(line.words)[:60])

@@ -17,18 +17,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
+from starcal_ground.cli import main
+from starcal_ground.cli.commands import demo
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation import simulated_bag
 from starcal_ros.assessment import agreement
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
-from starcal_ros.cli import main
-from starcal_ros.cli.commands import demo
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Calibration, CameraGeometry, Image
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation import simulated_bag
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +47,7 @@ needs_interfaces = pytest.mark.skipif(
 def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Run the tool as a user does."""
     return subprocess.run(
-        [sys.executable, '-m', 'starcal_ros.cli.main', *map(str, arguments)],
+        [sys.executable, '-m', 'starcal_ground.cli.main', *map(str, arguments)],
         capture_output=True, text=True, cwd=ROOT, check=False,
     )  # fmt: skip
 
@@ -283,7 +283,7 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path
 @pytest.mark.nodes
 def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None:
     psutil = pytest.importorskip('psutil')
-    command = [sys.executable, '-m', 'starcal_ros.cli.main', 'demo', '-o', str(tmp_path)]
+    command = [sys.executable, '-m', 'starcal_ground.cli.main', 'demo', '-o', str(tmp_path)]
     tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not (tmp_path / 'bag_player.log').exists():
         time.sleep(0.05)

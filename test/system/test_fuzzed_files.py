@@ -19,11 +19,13 @@ import numpy as np
 import pytest
 
 from bench.frames import write_set_up
-from starcal_ros.assessment.comparison import compare
+from starcal_ground.cli import main
+from starcal_ground.comparison import compare
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.conversion import ros_fit
-from starcal_ros.cli import main
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
@@ -41,8 +43,6 @@ from starcal_ros.pipeline.setup import load_setup, NODES
 from starcal_ros.records import Calibration, Ensemble, Image
 from starcal_ros.ros.kept.archive import Archive
 from starcal_ros.ros.kept.state import Activation
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny')
 BAG = Path(__file__).parents[2] / 'bags' / 'tiny'

@@ -77,9 +77,9 @@ def link_distribution(name: str, packages: Path) -> None:
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files that a wheel is built from."""
     sources = tmp_path_factory.mktemp('build') / 'sources'
-    shutil.copytree(
-        ROOT / 'starcal_ros', sources / 'starcal_ros', ignore=shutil.ignore_patterns('__pycache__')
-    )
+    for package in ('starcal_ros', 'starcal_ground'):
+        compiled = shutil.ignore_patterns('__pycache__')
+        shutil.copytree(ROOT / package, sources / package, ignore=compiled)
     for name in SOURCES:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, sources / name)
@@ -209,8 +209,8 @@ def test_python_lines_of_the_tutorial(flight_install: Path, tmp_path: Path) -> N
 @pytest.mark.packaging
 @pytest.mark.slow
 def test_types_and_definitions_are_installed(flight_install: Path) -> None:
-    (package,) = flight_install.glob('lib/python*/site-packages/starcal_ros')
-    assert (package / 'py.typed').is_file()
+    packages = list(flight_install.glob('lib/python*/site-packages/starcal_[rg]*/py.typed'))
+    assert {path.parent.name for path in packages} == {'starcal_ros', 'starcal_ground'}
     installed = {path.name for path in (flight_install / 'share/starcal/msg').iterdir()}
     assert installed == {path.name for path in (ROOT / 'msg').glob('*.msg')}
 

@@ -7,7 +7,17 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ('bench', 'docs', 'examples', 'launch', 'starcal_ros', 'studies', 'test', 'tools')
+FOLDERS = (
+    'bench',
+    'docs',
+    'examples',
+    'launch',
+    'starcal_ground',
+    'starcal_ros',
+    'studies',
+    'test',
+    'tools',
+)
 LINE = '# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0'
 
 

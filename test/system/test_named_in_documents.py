@@ -16,6 +16,7 @@ import shlex
 import pytest
 
 from bench import LONG, NAMES
+import starcal_ground
 import starcal_ros
 import studies as studies_package
 from studies import __main__ as studies
@@ -30,9 +31,14 @@ DOCUMENTS = sorted(
     ]
 )
 MODULES = [
-    *(module.name for module in pkgutil.walk_packages(starcal_ros.__path__, 'starcal_ros.')),
-    *(module.name for module in pkgutil.walk_packages(studies_package.__path__, 'studies.')),
+    module.name
+    for package in (starcal_ros, starcal_ground, studies_package)
+    for module in pkgutil.walk_packages(package.__path__, f'{package.__name__}.')
 ]
+OF_PACKAGES = [
+    path for package in ('starcal_ros', 'starcal_ground')
+    for path in sorted((ROOT / package).rglob('*.py'))
+]  # fmt: skip
 # Composed by the code, of other packages of ROS, or of the tools whose users read coming_from.md.
 ELSEWHERE = {
     *(
@@ -52,7 +58,9 @@ SUFFIXES = (
     *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'png'),
     *('sh', 'sqlite', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
 )
-FOLDERS = 'bench|config|docs|examples|launch|requirements|starcal_ros|studies|test|tools'
+FOLDERS = (
+    'bench|config|docs|examples|launch|requirements|starcal_ground|starcal_ros|studies|test|tools'
+)
 ROLE = re.compile(r'(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)')  # in a docstring: one backtick
 NAME = re.compile(r'(?:\w+/)*[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+')
 
@@ -93,7 +101,12 @@ def words() -> frozenset[str]:
 
 def resolves(name: str) -> bool:
     """True for ``[room/]module[.class].attribute``, or a name of another package."""
-    path = name.replace('/', '.').removeprefix('starcal_ros.').split('.')
+    path = (
+        name.replace('/', '.')
+        .removeprefix('starcal_ros.')
+        .removeprefix('starcal_ground.')
+        .split('.')
+    )
     is_ours = False
     for count in range(len(path), 0, -1):
         tail = '.' + '.'.join(path[:count])
@@ -168,7 +181,7 @@ def are_tests(span: str) -> bool:
 
 def test_what_a_docstring_names_exists() -> None:
     strange = []
-    for path in sorted((ROOT / 'starcal_ros').rglob('*.py')):
+    for path in OF_PACKAGES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
                 text = ast.get_docstring(node) or ''
@@ -188,7 +201,7 @@ def identifiers() -> frozenset[str]:
     """Names in the code of the package: of modules, definitions, arguments, and attributes."""
     names: set[object] = {part for module in MODULES for part in module.split('.')}
     names |= vars(builtins).keys()
-    for path in (ROOT / 'starcal_ros').rglob('*.py'):
+    for path in OF_PACKAGES:
         for node in ast.walk(ast.parse(path.read_text())):
             names |= {getattr(node, field, None) for field in ('name', 'arg', 'id', 'attr')}
     return frozenset(name for name in names if isinstance(name, str))
@@ -198,7 +211,12 @@ def identifiers() -> frozenset[str]:
     'span',
     [
         *('estimation/calibrate.no_such', 'docs/no_such.md', 'no_such_option', '--no-such'),
-        *('pytest test/test_api.py -k no_such', 'bench no_such', 'no such message', 'no_such.py'),
+        *(
+            'pytest test/onboard/test_api.py -k no_such',
+            'bench no_such',
+            'no such message',
+            'no_such.py',
+        ),
     ],
 )
 def test_a_name_that_does_not_exist_is_found(span: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from docs import make_gallery, make_images, make_nodes, make_phase, make_trend
-from starcal_ros.simulation import scenario
+from starcal_ground.simulation import scenario
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.mission.export.export_formats import export
 from starcal_ros.camera import line_of_sight
-from starcal_ros.mission.export.export_formats import export
 from starcal_ros.records import Calibration
 
 if TYPE_CHECKING:

@@ -63,7 +63,7 @@ except ArchiveError as error:
     params = TINY / 'params.yaml'
     for words in (
         ('starcal_ros.entry_points', 'bag_player'),
-        ('starcal_ros.cli.main', 'calibrate', TINY, '--params', params, '-o', 'none'),
+        ('starcal_ground.cli.main', 'calibrate', TINY, '--params', params, '-o', 'none'),
     ):
         refused = run(vehicle, '-m', *words)
         assert refused.returncode == 2, refused.stderr

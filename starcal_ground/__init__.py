@@ -1,0 +1,41 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Ground side of starcal: the tool, reports, images without attitudes, mission formats, trends.
+
+``starcal_ros`` flies and imports nothing of this package.  The public functions are those of
+``__all__``, each imported at its first use.
+"""
+
+import sys
+
+# ``python -m starcal_ground...`` in the folder of an untrusted bag would import a ``yaml.py`` that
+# lies there.  Before any other import, __future__ included; other programs keep their path.
+_is_found = sys.argv[:1] == ['-m'] and not getattr(sys.flags, 'safe_path', False)
+if _is_found and any(word.startswith('starcal_ground.') for word in sys.orig_argv):
+    del sys.path[0]
+
+from typing import TYPE_CHECKING  # noqa: E402
+
+if TYPE_CHECKING:
+    from starcal_ground.comparison import compare
+    from starcal_ground.images.night_sky import calibrate_images
+
+__all__ = ['calibrate_images', 'compare']
+
+if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
+    _MODULES = {'calibrate_images': 'images.night_sky', 'compare': 'comparison'}
+
+    def __getattr__(name: str) -> object:
+        """Import a public name at its first use (PEP 562)."""
+        if name not in __all__:
+            raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+        import importlib
+
+        value: object = getattr(importlib.import_module(f'{__name__}.{_MODULES[name]}'), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """Names of the module, the public ones that are not imported yet included."""
+    return sorted({*globals(), *__all__})

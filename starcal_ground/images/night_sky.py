@@ -1,0 +1,302 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Set-up of a calibration from images alone: photographs, or bags without attitudes.
+
+Photographs are written to one bag, and the rotations that `from_stars` finds to another.  The
+calibration of these bags is the same as that of any bag.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
+from dataclasses import dataclass
+import itertools
+import math
+from pathlib import Path
+import tempfile
+
+import numpy as np
+
+from starcal_ground.images.from_stars import (
+    count_of_stars,
+    FEWEST_SOURCES,
+    from_stars,
+    FromStars,
+    options_of,
+    pinhole,
+)
+from starcal_ground.images.photographs import (
+    by_camera,
+    image_paths,
+    in_order,
+    look_at,
+    Photograph,
+    pixels_of_photograph,
+    Refusals,
+    without_copies,
+)
+from starcal_ground.images.unknown_air import EARTH_M_S, with_air
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import NotFromStars
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
+from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.provenance import inputs_of
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
+from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.sky.catalog import load_catalog
+
+_FEW = 5  # images that are looked at for stars
+_ATTITUDE_TOPIC = '/stars/attitude'
+
+
+@dataclass(frozen=True)
+class NightSky:
+    """
+    Bags and set-up of a calibration by the stars alone, and notes for the user.
+
+    ``topics`` are those to read: the attitudes of the stars, in place of any in the bags.
+    ``is_located`` is False if neither the options nor the files state the site of the camera.
+    """
+
+    bags: tuple[Path, ...]
+    setup: Setup
+    notes: tuple[str, ...]
+    is_located: bool
+    topics: Topics
+    copies_ns: frozenset[int] = frozenset()
+
+    def through_air(
+        self, observations: Sequence[StarObservations]
+    ) -> tuple[list[StarObservations], str]:
+        """Observations, refracted if the stars show it and no site is given, and a note on it."""
+        images = [self._in_words_of_stars(one) for one in observations]
+        if self.is_located:
+            return images, ''
+        return with_air(images, self.setup.prior.camera)
+
+    def _in_words_of_stars(self, one: StarObservations) -> StarObservations:
+        """Observations of a copy refused, and of an image without stars as such."""
+        if one.time_ns in self.copies_ns:
+            reason, detail = 'frozen', 'a copy of another image'
+        elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
+            reason, detail = 'no_match', 'its stars are no part of the sky'
+        else:
+            return one
+        return refused_image(one.time_ns, one.width, one.height, reason, detail)
+
+
+def photographs_of(
+    paths: Sequence[Path], focal_length_mm: float = 0.0, pixel_um: float = 0.0
+) -> tuple[list[Photograph], list[str]]:
+    """
+    Photographs of one camera in order of time, and notes on the omitted files.
+
+    Raises NotFromStars when no file can be read.
+    """
+    looked: list[Photograph] = []
+    refusals = Refusals()
+    for path in image_paths(paths):
+        with refusals.of(path):
+            looked.append(look_at(path, focal_length_mm, pixel_um))
+    groups = by_camera(looked)
+    if not groups:
+        raise NotFromStars('; '.join(['no image can be read', *refusals.lines()]))
+    if len(groups) > 1:
+        with_stars = {name: _shows_stars(group) for name, group in groups.items()}
+        groups = dict(sorted(groups.items(), key=lambda item: not with_stars[item[0]]))
+    (name, group), *others = groups.items()
+    chosen = without_copies(group, refusals)
+    notes = refusals.lines()
+    if others:
+        left = ', '.join(
+            f'{len(group)} of {other}{"" if with_stars[other] else ", which show no stars"}'
+            for other, group in others
+        )
+        notes.append(f'{len(chosen)} images of {name} are used; left out: {left}')
+    return in_order(chosen), notes
+
+
+def _shows_stars(group: Sequence[Photograph]) -> bool:
+    """True if one of a few images of a group, from its first to its last, shows stars."""
+    few = [group[k * (len(group) - 1) // (_FEW - 1)] for k in range(min(_FEW, len(group)))]
+    images = _images(few, Refusals())
+    return any(count_of_stars(image.pixels) >= FEWEST_SOURCES for image in images)
+
+
+def from_photographs(
+    photographs: Sequence[Photograph], values: Mapping[str, object], folder: Path
+) -> NightSky:
+    """
+    Set-up of a calibration of photographs, whose bags are written into a folder.
+
+    Raises NotFromStars when the stars give no camera.
+    """
+    found, notes = camera_of_photographs(photographs, values)
+    bag = folder / 'images.mcap'
+    with BagWriter(bag) as writer:
+        for image in _images(photographs, Refusals()):
+            if found.mirrored:
+                image = Image(image.time_ns, image.pixels[:, ::-1].copy())
+            writer.write_image('/camera/image_raw', image, 'camera')
+    stated = {**site_of(photographs), **values}
+    is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
+    if is_located and not all(one.dated for one in photographs):
+        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
+    return _set_up(found, [bag], stated, folder, is_located, Topics(), notes)
+
+
+def camera_of_photographs(
+    photographs: Sequence[Photograph], values: Mapping[str, object]
+) -> tuple[FromStars, list[str]]:
+    """
+    Camera and rotations of photographs, and notes on files that turned out to be damaged.
+
+    The search starts at their stated focal length, if any.  Raises NotFromStars when the stars
+    give no camera.
+    """
+    first = photographs[0]
+    focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
+    hint = pinhole((first.width, first.height), focal_px) if focal_px < 1e9 else None
+    refusals = Refusals()
+    try:
+        return _found(_images(photographs, refusals), values, hint), refusals.lines()
+    except NotFromStars as error:
+        raise NotFromStars('; '.join([str(error), *refusals.lines()])) from error
+
+
+def _images(photographs: Sequence[Photograph], refusals: Refusals) -> Iterator[Image]:
+    """Images of the files that can be decoded."""
+    for one in photographs:
+        with refusals.of(one.path):
+            yield Image(one.time_ns, pixels_of_photograph(one.path))
+
+
+def from_bags(
+    bags: Sequence[Path], asked: Topics, values: Mapping[str, object], folder: Path
+) -> NightSky:
+    """
+    Set-up of a calibration of bags without attitudes; attitudes by the stars go into a folder.
+
+    Raises NotFromStars when the stars give no camera, or the images are mirrored.
+    """
+    found = camera_of_bags(bags, choose_image_topic(bags, asked), values)
+    types = {topic.type_name for topic in reader.topics(bags)}
+    is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
+    if is_located and min(found.icrf_from_camera) < CLOCKS_SET_NS:
+        values = {'velocity_sigma_m_s': EARTH_M_S, **values}
+    return _set_up(found, bags, values, folder, is_located, asked)
+
+
+def camera_of_bags(
+    bags: Sequence[Path], topic: str, values: Mapping[str, object], most: int | None = None
+) -> FromStars:
+    """
+    Camera and rotations of the images of bags, at most the first few.
+
+    Raises NotFromStars when the stars give no camera, or the images are mirrored.
+    """
+    read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
+    images = (image for image in read if isinstance(image, Image))
+    found = _found(itertools.islice(images, most), values, None)
+    if found.mirrored:
+        raise NotFromStars('the images are mirrored: mirror them where they are read out')
+    return found
+
+
+def _found(
+    images: Iterator[Image], values: Mapping[str, object], hint: CameraModel | None
+) -> FromStars:
+    """Camera and rotations; the camera file of the options has priority over a hint."""
+    if url := str(values.get('camera_info_url', '')):
+        hint = read_camera_info(url)
+    path = str(values.get('catalog', ''))
+    catalog = load_catalog(Path(path) if path else None)
+    least = int(str(values.get('min_images', CalibrationOptions().min_images)))
+    return from_stars(images, catalog, hint, least)
+
+
+def _set_up(
+    found: FromStars,
+    bags: Sequence[Path],
+    values: Mapping[str, object],
+    folder: Path,
+    is_located: bool,
+    asked: Topics,
+    notes: Sequence[str] = (),
+) -> NightSky:
+    attitudes = folder / 'attitudes.mcap'
+    with BagWriter(attitudes) as writer:
+        for time_ns in sorted(found.icrf_from_camera):
+            xyzw = found.icrf_from_camera[time_ns].as_quat()
+            writer.write_attitude(_ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
+    prior = CameraGeometry(found.camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
+    stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
+    setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
+    notes = [*notes, found.in_a_sentence()]
+    if unused := stated_tracker(values):
+        notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
+    topics = dataclasses.replace(asked, attitude=_ATTITUDE_TOPIC)
+    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics, found.copies_ns)
+
+
+def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:
+    """Options of the site, if all files have a position and a date."""
+    sites = [one.site for one in photographs if one.site is not None and one.dated and one.utc]
+    if len(sites) < len(photographs):
+        return {}
+    latitude, longitude, height_m = sites[0]
+    return {
+        'observer': 'ground',
+        'latitude_deg': latitude,
+        'longitude_deg': longitude,
+        'height_m': height_m,
+    }
+
+
+def calibrate_images(
+    images: Path | str | Sequence[Path | str], *, image_topic: str = '', **options: object
+) -> Calibration:
+    """
+    Calibration of a camera from images of the sky alone; nothing is written.
+
+    Parameters
+    ----------
+    images : path or sequence of paths
+        FITS, JPEG, PNG or TIFF files, folders of them, or patterns; or MCAP bags, whose attitudes
+        are not used.
+    image_topic : str
+        Needed where a bag has more than one topic of images.
+    **options
+        Options of a parameter file by name.
+
+    Returns
+    -------
+    Calibration
+        Of the camera alone: ``has_alignment`` is False.
+
+    Raises
+    ------
+    StarcalError
+        One line that names the cause, and the images to take.
+    """
+    paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        folder = Path(name)
+        if image_paths(paths):
+            photographs, _ = photographs_of(paths)
+            files = [photograph.path for photograph in photographs]
+            sky = from_photographs(photographs, options, folder)
+        else:
+            files = reader.mcap_files(paths)
+            sky = from_bags(paths, Topics(image=image_topic), options, folder)
+        inputs = inputs_of(files)
+        campaign = calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air)
+    return campaign.calibration

@@ -1,0 +1,443 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Photographs: JPEG, PNG, TIFF, FITS and camera raw, with the facts that the files state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import contextlib
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+import glob
+import importlib
+import io
+import math
+import os
+from pathlib import Path
+import re
+from typing import Any
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ground.images.time_systems import middle_of_exposure, number, TimeError
+from starcal_ros.arrays import Pixels
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import errors_as, IngestError, needing
+from starcal_ros.formats.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
+from starcal_ros.formats.images.image_files import (
+    Card,
+    content_of,
+    decoded,
+    MOST_VALUES,
+    read_fits,
+)
+
+# Of files whose content says nothing, as of damaged ones.
+_ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts')
+_DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
+_EXIF, _GPS = 0x8769, 0x8825
+_FOCAL_LENGTH = 0x920A
+_GREEN = 1
+_SAME_STAMP_NS = NANOSECONDS_PER_SECOND  # file times are often equal; stamps must differ
+# Outside of it a clock was not set, or a file is damaged; stamps of ROS end in 2038.
+_DATES = datetime(1990, 1, 1, tzinfo=timezone.utc), datetime(2037, 1, 1, tzinfo=timezone.utc)
+_FIRST_NS, _LAST_NS = (round(date.timestamp()) * NANOSECONDS_PER_SECOND for date in _DATES)
+_NAMES_SHOWN, _MOST_REASONS = 3, 8
+_LONGEST_EXPOSURE_S = 86400.0
+# Focal length over the diagonal: fields of 160 degrees to 0.1 degrees.
+_SHORTEST, _LONGEST = 0.08, 600.0
+# Tags before the pixels: Pillow would look through all of a damaged file for them, byte by byte.
+_JPEG_HEADER_BYTES = 2**22
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """
+    Facts that a file states about its image.
+
+    ``time_ns`` middle of the exposure; ``dated`` False where it is the time of the file, and
+    ``utc`` False where its time zone is not known.  ``focal_px`` NaN where it is not stated.
+    ``site`` latitude, longitude (degrees) and height (m), or None.  ``camera`` names camera, lens
+    and focal length, empty where the file does not.
+    """
+
+    path: Path
+    time_ns: int
+    dated: bool
+    utc: bool
+    width: int
+    height: int
+    focal_px: float = math.nan
+    site: tuple[float, float, float] | None = None
+    camera: str = ''
+    file_bytes: int = 0
+
+
+def image_paths(paths: Iterable[Path]) -> list[Path]:
+    """
+    Files of paths, folders and patterns if an image is among them, else none: they are bags.
+
+    Files that are no images are in the list too, so that each is read or refused with a reason.
+    A folder with a bag in it is a bag.  Raises IngestError for a pattern that matches nothing.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if glob.has_magic(str(path)) and not path.exists():
+            names = sorted(glob.glob(str(path)))
+            if not names:
+                raise IngestError(f'{path}: no such files')
+            files += map(Path, names)
+        elif not path.is_dir():
+            files.append(path)
+        elif not (any(path.glob('*.mcap*')) or (path / 'metadata.yaml').exists()):
+            files += sorted(file for file in path.iterdir() if not file.name.startswith('.'))
+    return files if any(map(_is_image, files)) else []
+
+
+def _is_image(path: Path) -> bool:
+    """True if a file is an image of any kind, or was to be one by its name."""
+    with contextlib.suppress(OSError, ValueError):
+        kind = kind_of(path)
+        if kind is not UNKNOWN:
+            return kind.is_image
+    return path.name.lower().endswith(_ENDINGS)
+
+
+class Refusals:
+    """Files that are left out, counted by their reason."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, list[str]] = {}
+
+    @contextlib.contextmanager
+    def of(self, path: Path) -> Iterator[None]:
+        """Count a file whose reading in the block raises IngestError."""
+        try:
+            yield
+        except IngestError as error:
+            self.add(path, str(error).removeprefix(f'{path}: '))
+
+    def add(self, path: Path, reason: str) -> None:
+        """Count a file."""
+        self._names.setdefault(reason, []).append(path.name)
+
+    def lines(self) -> list[str]:
+        """A line for each reason, with a few names."""
+        by_count = sorted(self._names.items(), key=lambda item: -len(item[1]))
+        lines = [_left_out(names, reason) for reason, names in by_count[:_MOST_REASONS]]
+        if others := [name for _, names in by_count[_MOST_REASONS:] for name in names]:
+            lines.append(_left_out(others, 'for other reasons'))
+        return lines
+
+
+def _left_out(names: Sequence[str], reason: str) -> str:
+    count = '1 file' if len(names) == 1 else f'{len(names)} files'
+    more = ', ...' if len(names) > _NAMES_SHOWN else ''
+    return f'left out: {count} ({", ".join(names[:_NAMES_SHOWN])}{more}): {reason}'
+
+
+def _readable(path: Path) -> FileKind:
+    """Kind of an image that is read; raises IngestError for another file."""
+    if path.is_dir():
+        raise IngestError(f'{path}: a folder: give it too, or leave it out')
+    with errors_as(IngestError, path):
+        kind = kind_of(path)
+    if kind is UNKNOWN:
+        raise IngestError(f'{path}: no image, by its content')
+    if kind.instead:
+        raise IngestError(f'{path}: {kind.name}, which is not read: {kind.instead}')
+    if not kind.is_image:
+        raise IngestError(f'{path}: {kind.name}: calibrate it by itself')
+    return kind
+
+
+def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
+    """Facts of a file; a given length or pixel size replaces its own.  Raises IngestError."""
+    kind = _readable(path)
+    if kind is FITS:
+        values, header = read_fits(path, '')
+        stated = _of_fits(path, values, header)
+        stated_mm, stated_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
+    else:
+        tags, gps, width, height = (
+            _facts_of_raw(path) if kind is RAW else _facts_of_picture(path, kind)
+        )
+        stated = _of_tags(path, tags, gps, width, height)
+        stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+    if not (focal_length_mm or pixel_um):
+        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
+    given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
+    if math.isnan(given_px):
+        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
+    if math.isnan(_plausible(given_px, stated)):
+        raise IngestError(
+            f'{path}: --focal-length-mm and --pixel-size-um give a focal length of {given_px:.3g}'
+            f' px for {stated.width} x {stated.height} pixels'
+        )
+    return replace(stated, focal_px=given_px)
+
+
+def _plausible(focal_px: float, of: Photograph) -> float:
+    """A focal length, or NaN for one that no camera has."""
+    ratio = focal_px / math.hypot(of.width, of.height)
+    return focal_px if _SHORTEST < ratio < _LONGEST else math.nan
+
+
+def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
+    """By time, then name; equal stamps, as of copied files, a second apart."""
+    ordered = sorted(photographs, key=lambda one: (one.time_ns, one.path.name))
+    found: list[Photograph] = []
+    for one in ordered:
+        if found and one.time_ns <= found[-1].time_ns:
+            one = replace(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
+        found.append(one)
+    return found
+
+
+def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
+    """Photographs of one camera; of those with the same time of exposure, the largest file."""
+    kept: dict[object, Photograph] = {}
+    for one in sorted(photographs, key=lambda one: (-one.file_bytes, one.path.name)):
+        if kept.setdefault(one.time_ns if one.dated else one.path, one) is not one:
+            refusals.add(one.path, 'a copy: another file has its time of exposure')
+    return list(kept.values())
+
+
+def by_camera(photographs: Sequence[Photograph]) -> dict[str, list[Photograph]]:
+    """Photographs of each camera and image size, the largest group first."""
+    groups: dict[str, list[Photograph]] = {}
+    for one in photographs:
+        groups.setdefault(f'{one.camera} {one.width} x {one.height}'.strip(), []).append(one)
+    return dict(sorted(groups.items(), key=lambda group: -len(group[1])))
+
+
+def pixels_of_photograph(path: Path) -> Pixels:
+    """
+    Light of each pixel (height, width), as the sensor has it: not turned by the EXIF orientation.
+
+    Green of a colour image, interpolated in one of camera raw.  The sRGB curve of 8-bit colour is
+    undone into 16 bit.
+    """
+    kind = _readable(path)
+    if kind is RAW:
+        values = _linear(path)
+    elif kind is FITS:
+        values = read_fits(path, '')[0]
+    else:
+        content = content_of(path)
+        with _quiet():
+            values = decoded(path, content)  # the EXIF orientation is not applied
+    if values.ndim == 3:
+        is_rendered = values.dtype == np.uint8
+        values = np.ascontiguousarray(values[:, :, _GREEN])
+        values = _SRGB_TO_LIGHT[values] if is_rendered else values
+    if values.dtype in (np.uint8, np.uint16):
+        return values
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    if values.dtype.kind in 'iu' and low >= 0 and high <= 65535:
+        return values.astype(np.uint16)
+    scaled = (np.nan_to_num(values, nan=low) - low) * (65000.0 / max(high - low, 1e-30))
+    return np.rint(scaled).astype(np.uint16)
+
+
+def _srgb_to_light() -> NDArray[np.uint16]:
+    """Light in 16 bit of the 8-bit values of sRGB, IEC 61966-2-1."""
+    value = np.arange(256) / 255.0
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return np.rint(65535.0 * light).astype(np.uint16)
+
+
+_SRGB_TO_LIGHT = _srgb_to_light()
+
+
+_Tags = Mapping[int, Any]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Drop the lines that libpng, libtiff and OpenCV print on a damaged file."""
+    with open(os.devnull, 'wb') as nothing, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # there is no stderr
+            kept = os.dup(2)
+            stack.callback(os.close, kept)
+            os.dup2(nothing.fileno(), 2)
+            stack.callback(os.dup2, kept, 2)
+        yield
+
+
+def _facts_of_picture(path: Path, kind: FileKind) -> tuple[_Tags, _Tags, int, int]:
+    """Tags of EXIF and GPS, width and height."""
+    with needing('report', IngestError, path):
+        from PIL import Image
+    start = content_of(path, _JPEG_HEADER_BYTES) if kind is JPEG else content_of(path)
+    try:
+        # Opened, not decoded: size and tags only.
+        with warnings.catch_warnings(), Image.open(io.BytesIO(start)) as image:
+            warnings.simplefilter('ignore')
+            width, height = image.size
+            _check_size(path, width, height)
+            exif = image.getexif()
+            tags = {**dict(exif), **dict(exif.get_ifd(_EXIF))}
+            gps = dict(exif.get_ifd(_GPS))
+    except IngestError:
+        raise
+    except Exception as error:  # a damaged file makes Pillow raise anything
+        raise IngestError(f'{path}: {kind.name}, not readable: damaged') from error
+    return tags, gps, width, height
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MOST_VALUES:
+        raise IngestError(f'{path}: claims {width} x {height} pixels')
+
+
+def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
+    """Return the same of camera raw, as far as LibRaw reads them."""
+    with _raw(path) as raw:
+        sizes, stated, lens = raw.sizes, raw.other, raw.lens
+    taken = stated.timestamp  # the digits of the camera's clock, whatever its time zone
+    tags = {
+        0x829A: stated.shutter_speed,
+        _FOCAL_LENGTH: stated.focal_length,
+        0x9003: f'{taken:%Y:%m:%d %H:%M:%S}' if taken else '',
+        0xA434: f'{lens.make} {lens.model}'.strip(),
+    }
+    _check_size(path, sizes.width, sizes.height)
+    return tags, {}, sizes.width, sizes.height
+
+
+def _linear(path: Path) -> NDArray[Any]:
+    """Colours (height, width, 3) of camera raw in 16 bit, linear in light, one factor for all."""
+    rawpy = _rawpy(path)
+    with _raw(path) as raw:
+        return np.asarray(
+            raw.postprocess(
+                # Other algorithms follow edges, and change the shape of a star.
+                demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
+                gamma=(1, 1),
+                no_auto_bright=True,
+                adjust_maximum_thr=0.0,  # white is that of the camera, not of the image
+                user_wb=[1.0] * 4,
+                output_color=rawpy.ColorSpace.raw,
+                output_bps=16,
+                user_flip=0,
+            )
+        )
+
+
+@contextlib.contextmanager
+def _raw(path: Path) -> Iterator[Any]:
+    """An open file of camera raw; raises IngestError."""
+    rawpy = _rawpy(path)
+    try:
+        with rawpy.imread(io.BytesIO(content_of(path))) as raw:
+            yield raw
+    except rawpy.LibRawError as error:
+        why = os.fsdecode(*error.args[:1] or [''])
+        raise IngestError(f'{path}: camera raw, not readable: {why}') from error
+
+
+def _rawpy(path: Path) -> Any:
+    with needing('raw', IngestError, path):
+        return importlib.import_module('rawpy')
+
+
+def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Photograph:
+    """Facts of tags of EXIF."""
+    time_ns, dated, utc = _exif_time(path, tags)
+    # Make, Model, BodySerialNumber, LensModel
+    names = (tags.get(tag) for tag in (0x010F, 0x0110, 0xA431, 0xA434))
+    words = [str(name).strip('\0 ') for name in names if name]
+    focal_mm, pixel_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+    if words and focal_mm > 0:
+        words.append(f'{focal_mm:g} mm')
+    focal_px = _focal_px(focal_mm, pixel_um)
+    equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
+    if math.isnan(focal_px) and equivalent_mm > 0:
+        focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
+    site, camera = _exif_site(gps), ' '.join(words)
+    size = path.stat().st_size
+    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera, size)
+
+
+def _real(value: object) -> float:
+    """A number of EXIF, NaN for none: rationals may have a denominator of zero."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return math.nan
+
+
+def _pixel_um(tags: Mapping[int, Any], width: int) -> float:
+    """Size of a pixel by FocalPlaneXResolution, of the full image of PixelXDimension."""
+    per_unit, unit_mm = _real(tags.get(0xA20E)), _UNIT_MM.get(tags.get(0xA210, 2), math.nan)
+    full = _real(tags.get(0xA002, width))
+    if not (per_unit > 0 and full > 0):
+        return math.nan
+    return 1000.0 * unit_mm / per_unit * full / width
+
+
+def _focal_px(focal_mm: float, pixel_um: float) -> float:
+    """Focal length in pixels; NaN where it or the size of a pixel is not known."""
+    return 1000.0 * focal_mm / pixel_um if focal_mm > 0 and pixel_um > 0 else math.nan
+
+
+def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
+    """Stamp of the middle of the exposure, and whether it has a date and a time zone."""
+    exposure_s = _real(tags.get(0x829A))
+    half_s = 0.5 * exposure_s if 0 < exposure_s < _LONGEST_EXPOSURE_S else 0.0
+    zone = str(tags.get(0x9011) or tags.get(0x9010) or '').strip('\0 ')  # OffsetTimeOriginal
+    text = str(tags.get(0x9003) or tags.get(0x0132) or '').strip('\0 ')  # DateTimeOriginal
+    with contextlib.suppress(ValueError, OverflowError):
+        aware = datetime.strptime(f'{text} {zone or "+0000"}', '%Y:%m:%d %H:%M:%S %z')
+        if _DATES[0] <= aware < _DATES[1]:
+            digits = str(tags.get(0x9291) or '').strip('\0 ')  # SubSecTimeOriginal
+            part_s = float(f'0.{digits}') if digits.isdecimal() and len(digits) < 10 else 0.0
+            middle_s = aware.timestamp() + part_s + half_s
+            return round(middle_s * NANOSECONDS_PER_SECOND), True, bool(zone)
+    return _time_of_file(path), False, False
+
+
+def _time_of_file(path: Path) -> int:
+    """Stamp of the last change of a file."""
+    with errors_as(IngestError, path):
+        return min(max(path.stat().st_mtime_ns, _FIRST_NS), _LAST_NS)
+
+
+def _exif_site(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    try:
+        degrees = [
+            # Degrees, minutes and seconds, or fewer of them.
+            sum(float(part) / 60.0**k for part, k in zip(gps[tag], range(3), strict=False))
+            * (-1.0 if str(gps[tag - 1]).upper()[:1] in 'SW' else 1.0)
+            for tag in (2, 4)  # GPSLatitude, GPSLongitude, each after its reference
+        ]
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    height_m = _real(gps.get(6))
+    if not (abs(degrees[0]) <= 90 and abs(degrees[1]) <= 180):
+        return None
+    return degrees[0], degrees[1], height_m if -500 < height_m < 1e5 else 0.0
+
+
+def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Photograph:
+    for key in ('IMAGETYP', 'OBSTYPE', 'FRAME'):
+        kind = str(header[key].value).strip().lower() if key in header else ''
+        if re.search('dark|flat|bias', kind):
+            raise IngestError(f'{path}: no image of the sky: {key} is {kind[:40]!r}')
+    time_ns, dated = _time_of_file(path), False
+    with contextlib.suppress(TimeError, ValueError, OverflowError):
+        stated_ns = middle_of_exposure(header, '')
+        if _FIRST_NS <= stated_ns < _LAST_NS:
+            time_ns, dated = stated_ns, True
+    focal_mm, pixel_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
+    matrix = (number(header, key) for key in ('CD1_1', 'CD2_1'))
+    step_deg = math.hypot(*(value for value in matrix if not math.isnan(value)))
+    if not step_deg > 0:
+        step_deg = abs(number(header, 'CDELT1'))
+    focal_px = math.degrees(1.0 / step_deg) if step_deg > 0 else _focal_px(focal_mm, pixel_um)
+    words = [str(header[key].value) for key in ('TELESCOP', 'INSTRUME') if key in header]
+    height, width = values.shape[:2]
+    return Photograph(path, time_ns, dated, dated, width, height, focal_px, None, ' '.join(words))

@@ -1,0 +1,297 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Export to camera models of other tools; all lose the field.
+
+OpenCV, kalibr and ROS.  GIANT's ``OpenCVModel`` is OpenCV's rational model with thin prism, skew
+(``alpha``) and a focal length that depends on temperature
+(``giant/camera_models/opencv_model.py``, its equations).  mrcal has OpenCV's models of 5, 8 and 12
+coefficients in OpenCV's order, without skew.  It has the pixel convention of starcal; its
+reference frame represents the star tracker.
+
+USGS tools: a fragment of an ALE image support data (ISD), and ISIS IK keywords.  Sources:
+``usgscsm`` (Distortion.cpp: model radtan, the equations of plumb_bob; Utilities.cpp: focal plane,
+line of sight) and ISIS (CameraDistortionMap: ``OD_K``; CameraFocalPlaneMap: ``ITRANSS``,
+``ITRANSL``).  The first pixel has its centre at (0.5, 0.5) in an ISD, at (1, 1) in ISIS.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+from scipy.optimize import least_squares
+import yaml
+
+from starcal_ground.mission.export.losses import (
+    about,
+    ascii_line,
+    Content,
+    Files,
+    fitted,
+    GRID,
+    Loss,
+    origin,
+)
+from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel, pixel_grid, project
+from starcal_ros.camera.lens import ros_distortion
+from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
+from starcal_ros.records import Calibration
+
+# kalibr's word for a lens model, and the parameters that kalibr lacks.
+_KALIBR = {'plumb_bob': ('radtan', ('skew', 'k3')), 'equidistant': ('equidistant', ('skew',))}
+_OF_GIANT = ('plumb_bob', 'rational_polynomial', 'thin_prism')  # within OpenCVModel
+_GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
+_MRCAL = {
+    'plumb_bob': 'LENSMODEL_OPENCV5',
+    'rational_polynomial': 'LENSMODEL_OPENCV8',
+    'thin_prism': 'LENSMODEL_OPENCV12',
+}
+
+
+def opencv_yaml(calibration: Calibration) -> Content:
+    """
+    YAML for ``cv2.FileStorage``: camera matrix, distortion, rotation.
+
+    ``distortion_coefficients`` are for ``cv2.projectPoints``, or for ``cv2.fisheye`` if
+    ``lens_model`` is ``fisheye``.
+    """
+    camera, made = fitted(calibration, calibration.geometry.camera.model, ('skew',))
+    _, D = ros_distortion(camera.model, camera.distortion)
+    lines = [
+        '%YAML:1.0',
+        *_commented(about(calibration, made)),
+        '# rotation: camera_from_star_tracker',
+        '---',
+        f'image_width: {camera.width}',
+        f'image_height: {camera.height}',
+        f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
+        *_opencv_matrix('camera_matrix', camera.matrix),
+        *_opencv_matrix('distortion_coefficients', D[None, :]),
+        *_opencv_matrix(
+            'rotation', calibration.geometry.star_tracker_from_camera.inv().as_matrix()
+        ),
+        f'largest_error_px: {made.worst_px!r}',
+    ]
+    return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
+
+
+def kalibr_yaml(calibration: Calibration, topic: str) -> Content:
+    """
+    A camchain of kalibr with one camera.
+
+    The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment without
+    translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller error.
+    """
+    candidates = [(*fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()]
+    camera, made, word = min(candidates, key=lambda candidate: candidate[1].worst_px)
+    fx, _, fy, cx, cy = camera.intrinsics.tolist()
+    _, D = ros_distortion(camera.model, camera.distortion)
+    T = np.eye(4)
+    T[:3, :3] = calibration.geometry.star_tracker_from_camera.inv().as_matrix()
+    content = {
+        'cam0': {
+            'camera_model': 'pinhole',
+            'intrinsics': [fx, fy, cx, cy],
+            'distortion_model': word,
+            'distortion_coeffs': D[:4].tolist(),
+            'T_cam_imu': T.tolist(),
+            'timeshift_cam_imu': 0.0,
+            'rostopic': topic,
+            'resolution': [camera.width, camera.height],
+        }
+    }
+    note = '# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker'
+    text = '\n'.join([*_commented(about(calibration, made)), note, _yaml(content)])
+    return dataclasses.replace(made, files={'camchain.yaml': text})
+
+
+def ros_yaml(calibration: Calibration) -> Content:
+    """
+    The camera YAML of ROS, and ``alignment.yaml`` for a static transform publisher.
+
+    The alignment is a geometry_msgs/TransformStamped.
+    """
+    camera = calibration.geometry.camera
+    _, made = fitted(calibration, camera.model, ('skew',))
+    x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw.tolist()
+    content = {
+        'header': {'frame_id': calibration.parent_frame},
+        'child_frame_id': calibration.child_frame,
+        'transform': {
+            'translation': {'x': 0.0, 'y': 0.0, 'z': 0.0},
+            'rotation': {'x': x, 'y': y, 'z': z, 'w': w},
+        },
+    }
+    files: Files = {
+        CAMERA_INFO_FILE: lambda path: write_camera_info(camera, path, calibration.child_frame),
+        'alignment.yaml': '\n'.join([*_commented(origin(calibration)), _yaml(content)]),
+    }
+    return dataclasses.replace(made, files=files)
+
+
+def giant_json(calibration: Calibration) -> Content:
+    """
+    JSON whose ``OpenCVModel`` holds the keyword arguments of the model.
+
+    ``star_tracker_from_camera_xyzw`` is a separate key: a camera model of GIANT has no alignment.
+    """
+    own = calibration.geometry.camera.model
+    camera, made = fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
+    # GIANT has the change of the focal length with temperature: it is no loss.
+    losses = tuple(loss for loss in made.losses if 'focal' not in loss.part)
+    made = dataclasses.replace(made, losses=losses)
+    named = zip(camera.parameter_names, camera.parameters.tolist(), strict=True)
+    arguments = {_GIANT_NAMES.get(name, name): value for name, value in named}
+    arguments |= {'n_rows': camera.height, 'n_cols': camera.width}
+    terms = calibration.temperature
+    if terms is not None and terms.focal_per_degc:
+        # GIANT scales x' by 1 + a1 T + a2 T^2 with T itself: give it T - reference_degc.
+        arguments |= {f'a{k}': value for k, value in enumerate(terms.focal_per_degc, start=1)}
+    content = {
+        'about': [
+            *about(calibration, made),
+            'from giant.camera_models import OpenCVModel; OpenCVModel(**content["OpenCVModel"])',
+        ],
+        'OpenCVModel': arguments,
+        'temperature_reference_degc': None if terms is None else terms.reference_degc,
+        'star_tracker_from_camera_xyzw': (
+            calibration.geometry.star_tracker_from_camera_xyzw.tolist()
+        ),
+    }
+    return dataclasses.replace(
+        made, files={'giant_camera.json': json.dumps(content, indent=1) + '\n'}
+    )
+
+
+def mrcal_cameramodel(calibration: Calibration) -> Content:
+    """Text for ``mrcal.cameramodel``; ``extrinsics`` are rt_cam_ref."""
+    own = calibration.geometry.camera.model
+    camera, made = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
+    fx, _, fy, cx, cy = camera.intrinsics.tolist()
+    _, D = ros_distortion(camera.model, camera.distortion)
+    rt = [*calibration.geometry.star_tracker_from_camera.inv().as_rotvec().tolist(), 0.0, 0.0, 0.0]
+    lines = [
+        *_commented(about(calibration, made)),
+        '{',
+        f"    'lensmodel':  '{_MRCAL[camera.model]}',",
+        f"    'extrinsics': {rt!r},",
+        f"    'intrinsics': {[fx, fy, cx, cy, *D.tolist()]!r},",
+        f"    'imagersize': {[camera.width, camera.height]!r},",
+        '}',
+    ]
+    return dataclasses.replace(made, files={'camera.cameramodel': '\n'.join(lines) + '\n'})
+
+
+def _commented(lines: list[str]) -> list[str]:
+    return [f'# {ascii_line(line)}' for line in lines]
+
+
+def _yaml(content: object) -> str:
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    return text
+
+
+def _opencv_matrix(name: str, matrix: Floats) -> list[str]:
+    rows, cols = matrix.shape
+    data = ', '.join(repr(value) for value in matrix.ravel().tolist())
+    return [
+        f'{name}: !!opencv-matrix',
+        f'   rows: {rows}',
+        f'   cols: {cols}',
+        '   dt: d',
+        f'   data: [ {data} ]',
+    ]
+
+
+_HALF_PX = 0.5
+_ISIS_FIRST_PX = 1.0
+
+
+def isd_files(calibration: Calibration, names: SpiceNames) -> Content:
+    """
+    JSON with the keys of a frame camera in an ISD that a calibration determines; and an ISIS IK.
+
+    Without a pixel size a pixel counts as 1 mm; lines of sight do not depend on it.
+    """
+    isis, loss = _isis_kernel(calibration, names)
+    camera, made = fitted(calibration, 'plumb_bob', ())
+    fx, skew, fy, cx, cy = camera.intrinsics.tolist()
+    _, D = ros_distortion(camera.model, camera.distortion)
+    focal_px, pitch_mm = np.sqrt(fx * fy), names.pixel_size_um / UM_PER_MM or 1.0
+    content = {
+        'about': about(calibration, made),
+        'name_model': 'USGS_ASTRO_FRAME_SENSOR_MODEL',
+        'image_lines': camera.height,
+        'image_samples': camera.width,
+        'detector_sample_summing': 1.0,
+        'detector_line_summing': 1.0,
+        'starting_detector_sample': 0.0,
+        'starting_detector_line': 0.0,
+        'detector_center': {'line': cy + _HALF_PX, 'sample': cx + _HALF_PX},
+        'focal_length_model': {'focal_length': focal_px * pitch_mm},
+        'focal2pixel_samples': [0.0, fx / focal_px / pitch_mm, skew / focal_px / pitch_mm],
+        'focal2pixel_lines': [0.0, 0.0, fy / focal_px / pitch_mm],
+        'optical_distortion': {'radtan': {'coefficients': D.tolist()}},
+    }
+    files = {'camera_isd.json': json.dumps(content, indent=1) + '\n', 'camera_isis.ti': isis}
+    return Content(files, made.worst_px, (*made.losses, loss))
+
+
+def _isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss]:
+    """
+    IK with ISIS's keywords of a camera with radial distortion, and its largest error.
+
+    Lens, skew and field are fitted anew by focal length, affine focal plane and ``OD_K``.
+    """
+    camera = calibration.geometry.camera
+    intrinsics, k, worst_px = _radial(camera)
+    fx, skew, fy, cx, cy = intrinsics.tolist()
+    pitch_mm = names.pixel_size_um / UM_PER_MM or 1.0
+    focal_mm = np.sqrt(fx * fy) * pitch_mm
+    to_pixel = np.array([[fx, skew], [0.0, fy]]) / focal_mm
+    to_mm = np.linalg.inv(to_pixel)
+    prefix = f'INS{names.camera_id}_'
+    values: dict[str, list[float]] = {
+        'FOCAL_LENGTH': [focal_mm],
+        'PIXEL_PITCH': [pitch_mm],
+        'BORESIGHT_SAMPLE': [cx + _ISIS_FIRST_PX],
+        'BORESIGHT_LINE': [cy + _ISIS_FIRST_PX],
+        'TRANSX': [0.0, *to_mm[0].tolist()],
+        'TRANSY': [0.0, *to_mm[1].tolist()],
+        'ITRANSS': [0.0, *to_pixel[0].tolist()],
+        'ITRANSL': [0.0, *to_pixel[1].tolist()],
+        'OD_K': [0.0, *(k / focal_mm ** np.array([2.0, 4.0])).tolist()],
+    }
+    loss = Loss('ISIS: all but radial distortion', worst_px)
+    comments = ['Keywords of ISIS; its first pixel has its centre at (1, 1).', '']
+    comments += about(calibration, Content({}, worst_px, (loss,)))
+    return kernel_text('Camera for ISIS', comments, prefix, values), loss
+
+
+def radial_directions(intrinsics: Floats, k: Floats, pixels: Floats) -> Floats:
+    """Lines of sight (n, 3) of pixels (n, 2) by ISIS's radial model, k of r2 and r2^2."""
+    fx, skew, fy, cx, cy = intrinsics
+    y = (pixels[:, 1] - cy) / fy
+    x = (pixels[:, 0] - cx - skew * y) / fx
+    r2 = x * x + y * y
+    scale = 1.0 - r2 * (k[0] + r2 * k[1])
+    return np.stack([x * scale, y * scale, np.ones_like(x)], axis=-1)
+
+
+def _radial(camera: CameraModel) -> tuple[Floats, Floats, float]:
+    """Best intrinsics (5,) and k (2,) over the detector, and the largest error of a pixel."""
+    pixels = pixel_grid(camera, GRID, GRID)
+
+    def error_px(p: Floats) -> Floats:
+        return np.asarray(project(camera, radial_directions(p[:5], p[5:], pixels)) - pixels)
+
+    start = np.r_[camera.intrinsics, 0.0, 0.0]
+    scale = np.r_[np.full(5, camera.intrinsics[0] * 1e-3), 1e-2, 1e-1]
+    found = least_squares(
+        lambda p: np.nan_to_num(error_px(p), nan=camera.width).ravel(), start, x_scale=scale
+    )
+    worst_px = float(np.linalg.norm(error_px(found.x), axis=1).max())
+    return found.x[:5], found.x[5:], worst_px if np.isfinite(worst_px) else np.inf

@@ -1,0 +1,117 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Files of a calibration in a format of another tool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+import functools
+from pathlib import Path
+
+from starcal_ground.mission.export import camera_models
+from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
+from starcal_ground.mission.export.camera_models import isd_files
+from starcal_ground.mission.export.ck import ck_of_images
+from starcal_ground.mission.export.lookup_table import write_lookup_table
+from starcal_ground.mission.export.losses import Content, Loss, temperature_losses
+from starcal_ground.mission.export.spice import check_names, spice_kernels, SpiceNames
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.camera import pixel_grid
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import check_outputs, write_atomically
+from starcal_ros.record_fields import nearest
+from starcal_ros.records import Calibration, StarObservations
+
+FORMATS = ('spice', 'ck', 'isd', 'opencv', 'kalibr', 'ros', 'giant', 'mrcal', 'csv', 'c')
+_OF_ALIGNMENT = ('ros', 'spice', 'ck')
+_OF_SPICE = ('spice', 'ck', 'isd')
+CSV_POINTS = 65  # pixels a side
+
+
+@dataclass(frozen=True)
+class Exported:
+    """
+    Files written, the largest error of a pixel in them against the calibration, and its parts.
+
+    The error is infinite where the format cannot see the whole detector.
+    """
+
+    files: tuple[Path, ...]
+    worst_px: float
+    losses: tuple[Loss, ...]
+
+
+def export(
+    calibration: Calibration,
+    kind: str,
+    folder: Path,
+    names: SpiceNames | None,
+    topic: str = '',
+    table: bool = False,
+    observations: Iterable[StarObservations] = (),
+    kernels: Sequence[Path] = (),
+) -> Exported:
+    """
+    Write a calibration to a folder in one of `FORMATS`.
+
+    Raises OptionError for an unknown format, or names that SPICE does not allow. Raises
+    ProductError when a file cannot be written, and as `check_outputs` does.
+
+    Parameters
+    ----------
+    names : SpiceNames or None
+        Needed for ``spice``, ``ck`` and ``isd``.
+    topic : str
+        Image topic, for kalibr.
+    table : bool
+        For ``c``: the binary table alone.
+    observations, kernels
+        For ``ck``: of the images, and the LSK and SCLK of the spacecraft.
+    """
+    if kind not in FORMATS:
+        raise OptionError(
+            f'--to: {kind!r} is not one of {", ".join(FORMATS)}{nearest(kind, FORMATS)}'
+        )
+    if table and kind != 'c':
+        raise OptionError(f'--table: only --to c has a table, not {kind}')
+    if kind in _OF_ALIGNMENT and not calibration.has_alignment:
+        others = ', '.join(one for one in FORMATS if one not in _OF_ALIGNMENT)
+        raise OptionError(
+            f'--to {kind}: the calibration is of the camera alone, without the alignment that'
+            f' {kind} needs; choose one of {others}'
+        )
+    if kind in _OF_SPICE:
+        if names is None:
+            raise OptionError(f'--to {kind}: give the NAIF ID of the spacecraft, --spacecraft-id')
+        check_names(names)
+    naif = names or SpiceNames(0)
+    makers: Mapping[str, Callable[[], Content]] = {
+        'spice': lambda: spice_kernels(calibration, naif),
+        'ck': lambda: ck_of_images(calibration, observations, naif, kernels),
+        'isd': lambda: isd_files(calibration, naif),
+        'opencv': lambda: camera_models.opencv_yaml(calibration),
+        'kalibr': lambda: camera_models.kalibr_yaml(calibration, topic),
+        'ros': lambda: camera_models.ros_yaml(calibration),
+        'giant': lambda: camera_models.giant_json(calibration),
+        'mrcal': lambda: camera_models.mrcal_cameramodel(calibration),
+        'csv': lambda: _csv(calibration),
+        'c': lambda: Content(
+            {TABLE_FILE: c_table(calibration)} if table else c_files(calibration)
+        ),
+    }
+    made = makers[kind]()
+    check_outputs((folder / name for name in made.files), kernels)
+    for name, content in made.files.items():
+        if callable(content):
+            content(folder / name)
+        else:
+            write_atomically(folder / name, content)
+    return Exported(tuple(folder / name for name in made.files), made.worst_px, made.losses)
+
+
+def _csv(calibration: Calibration) -> Content:
+    camera = calibration.geometry.camera
+    pixels = pixel_grid(camera, CSV_POINTS, CSV_POINTS)
+    sights = line_of_sight_table(camera, calibration.map_covariance, pixels)
+    files = {'lines_of_sight.csv': functools.partial(write_lookup_table, sights)}
+    return Content(files, losses=temperature_losses(calibration))

@@ -1,0 +1,349 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+SPICE kernels of a calibration: a frame kernel (FK) and an instrument kernel (IK).
+
+The FK has the camera as a fixed frame (TKFRAME) in the star tracker frame.  The IK has the field
+of view, and the whole camera: lens model, skew and field; nothing is approximated.  Sources:
+NAIF's Frames Required Reading (TK frames), Kernel Required Reading (text kernels) and the
+specification of GETFOV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+import re
+import textwrap
+
+import numpy as np
+
+from starcal_ground.mission.export.losses import (
+    ascii_line,
+    Content,
+    Loss,
+    origin,
+    PIXEL_CONVENTION,
+    temperature_losses,
+)
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera.detector_field import COSINE_DOMAIN
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.records import Calibration
+
+_LONGEST_NAME = 32  # of a pool variable or a frame: SPICE Required Reading, kernel.req, frames.req
+_COMMENT_COLUMNS = 78  # longer lines are read, but NAIF asks for no more than 80
+_STRING_COLUMNS = 80  # longest string value of a pool variable
+
+Value = int | str | Sequence[float] | Sequence[str]
+_INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
+_SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
+_WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
+UM_PER_MM = 1000.0
+
+_MODEL_IN_WORDS = {
+    'plumb_bob': (
+        'g  = 1 + k1 r2 + k2 r2^2 + k3 r2^3',
+        "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)",
+        "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y",
+    ),
+    'equidistant': (
+        'x = theta cos(phi), y = theta sin(phi) in place of X/Z, Y/Z, with theta the',
+        'angle from +Z in radians and phi the azimuth from +X;',
+        "(x', y') = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) (x, y)",
+    ),
+}
+_OPENCV_IN_WORDS = (
+    'g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)',
+    "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2",
+    "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2",
+    'then, with tau_x and tau_y, the tilted detector of OpenCV; absent coefficients are 0',
+)
+
+
+@dataclass(frozen=True)
+class SpiceNames:
+    """
+    NAIF identifiers and frame names of a mission.
+
+    ``instrument_id`` 0: ``1000 * spacecraft_id - 1``.  ``star_tracker_id`` 0: another frame kernel
+    defines the star tracker frame; else the FK defines it as a CK frame of this number.  Empty
+    frame names: those of the calibration.  ``pixel_size_um`` 0: not known.
+    """
+
+    spacecraft_id: int
+    instrument_id: int = 0
+    star_tracker_id: int = 0
+    camera_frame: str = ''
+    star_tracker_frame: str = ''
+    pixel_size_um: float = 0.0
+
+    @property
+    def camera_id(self) -> int:
+        """Identifier of the instrument and of its frame."""
+        return self.instrument_id or _INSTRUMENTS_PER_SPACECRAFT * self.spacecraft_id - 1
+
+
+def spice_kernels(calibration: Calibration, names: SpiceNames) -> Content:
+    """
+    The FK and the IK of a calibration.
+
+    Raises OptionError for frame names that SPICE does not allow.
+    """
+    camera_frame = _frame_name(names.camera_frame or calibration.child_frame, '--camera-frame')
+    tracker_frame = _frame_name(
+        names.star_tracker_frame or calibration.parent_frame, '--star-tracker-frame'
+    )
+    if camera_frame == tracker_frame:
+        raise OptionError(f'--camera-frame: {camera_frame} is the star tracker frame too')
+    losses = temperature_losses(calibration)
+    boresight, corners = field_of_view(calibration.geometry.camera)
+    if corners is None:
+        losses = (*losses, Loss('field of view: as wide as a half space or folded', 0.0))
+    missing = [f'Not in this kernel: {loss.part}, {loss.cost_px:.3g} px.' for loss in losses]
+    about = [*origin(calibration), '', *missing]
+    fk = _frame_kernel(calibration, names, camera_frame, tracker_frame, about)
+    ik = _instrument_kernel(calibration, names, camera_frame, boresight, corners, about)
+    return Content({'camera.tf': fk, 'camera.ti': ik}, losses=losses)
+
+
+def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
+    """
+    Boresight (3,), the line of sight of the middle of the detector, and corners (n, 3).
+
+    The corners follow the outer edge of the detector, so that a curved edge is kept; None where a
+    point of the edge has no line of sight or SPICE could not take the polygon.
+    """
+    w, h = camera.width, camera.height
+    share = np.arange(_SIDE_POINTS) / _SIDE_POINTS
+    ends = np.array([[0, 0], [w, 0], [w, h], [0, h]]) - 0.5
+    sides = np.roll(ends, -1, axis=0) - ends
+    edge = (ends[:, None] + share[:, None] * sides[:, None]).reshape(-1, 2)
+    boresight = line_of_sight(camera, np.array([(w - 1) / 2, (h - 1) / 2]))
+    corners = line_of_sight(camera, edge)
+    if not (corners @ boresight > np.cos(_WIDEST_RAD)).all():  # NaN is not either
+        return boresight, None
+    return boresight, corners
+
+
+def check_names(names: SpiceNames) -> None:
+    """Raise OptionError for identifiers that SPICE does not allow."""
+    if names.spacecraft_id >= 0:
+        raise OptionError(f'--spacecraft-id: {names.spacecraft_id} is not a negative NAIF ID')
+    if names.instrument_id > 0:
+        raise OptionError(f'--instrument-id: {names.instrument_id} is not a negative NAIF ID')
+    if names.camera_id == names.star_tracker_id:
+        raise OptionError(f'--star-tracker-id: {names.star_tracker_id} is the ID of the camera')
+    if not 0 <= names.pixel_size_um < 1e4:
+        raise OptionError(f'--pixel-size-um: {names.pixel_size_um:g} is not within 0 to 10000')
+
+
+def _frame_kernel(
+    calibration: Calibration,
+    names: SpiceNames,
+    camera_frame: str,
+    tracker_frame: str,
+    about: list[str],
+) -> str:
+    number = names.camera_id
+    sigmas = ', '.join(f'{sigma:.3f}' for sigma in calibration.sigma[-3:] / ARCSECOND_RAD)
+    comments = [
+        f'{camera_frame} is fixed in {tracker_frame}. TKFRAME_{number}_Q takes vectors of the',
+        'camera frame to the star tracker frame (SPICE quaternion, scalar first).',
+        '',
+        *PIXEL_CONVENTION,
+        '',
+        f'1-sigma of the alignment about the camera axes, arcsec: {sigmas}.',
+        f'Names of the calibration: {calibration.child_frame} in {calibration.parent_frame}.',
+        '',
+        *about,
+    ]
+    data: list[str] = []
+    tracker_id, center = names.star_tracker_id, names.spacecraft_id
+    if tracker_id:
+        comments += ['', f'{tracker_frame} is a CK frame: its attitude is in a C kernel.']
+        clock: dict[str, Value] = {f'CK_{tracker_id}_SCLK': center, f'CK_{tracker_id}_SPK': center}
+        data += [*_assignments(_frame(tracker_frame, tracker_id, 3, center) | clock), '']
+    else:
+        comments += ['', f'{tracker_frame} must be defined by the frame kernel of the mission.']
+    x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw
+    fixed: dict[str, Value] = {'RELATIVE': tracker_frame, 'SPEC': 'QUATERNION', 'Q': [w, x, y, z]}
+    data += _assignments(_frame(camera_frame, number, 4, center))
+    data += _assignments(fixed, f'TKFRAME_{number}_')
+    data += ['', f"   NAIF_BODY_NAME += '{camera_frame}'", f'   NAIF_BODY_CODE += {number}']
+    return _kernel('FK', f'Frame of the camera {camera_frame}', comments, data)
+
+
+def _frame(name: str, number: int, kind: int, center: int) -> dict[str, Value]:
+    start = f'FRAME_{number}_'
+    values = {f'{start}CLASS': kind, f'{start}CLASS_ID': number, f'{start}CENTER': center}
+    return {f'FRAME_{name}': number, f'{start}NAME': name, **values}
+
+
+def _instrument_kernel(
+    calibration: Calibration,
+    names: SpiceNames,
+    camera_frame: str,
+    boresight: Floats,
+    corners: Floats | None,
+    about: list[str],
+) -> str:
+    camera = calibration.geometry.camera
+    prefix = f'INS{names.camera_id}_'
+    values: dict[str, Value] = {}
+    if corners is not None:
+        values |= {
+            'FOV_FRAME': camera_frame,
+            'FOV_SHAPE': 'POLYGON',
+            'FOV_CLASS_SPEC': 'CORNERS',
+            'BORESIGHT': boresight.tolist(),
+            'FOV_BOUNDARY_CORNERS': corners.ravel().tolist(),
+        }
+    values |= _lens_values(camera)
+    if names.pixel_size_um:
+        mm = np.sqrt(camera.intrinsics[0] * camera.intrinsics[2]) * names.pixel_size_um
+        values |= {'FOCAL_LENGTH': [mm / UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
+    terms = calibration.temperature
+    if terms is not None:
+        values['REFERENCE_DEGC'] = [terms.reference_degc]
+        values |= {'FOCAL_PER_DEGC': terms.focal_per_degc} if terms.focal_per_degc else {}
+        rate = terms.alignment_rate_rad_per_degc
+        values |= {'ALIGNMENT_PER_DEGC': rate} if rate else {}
+    values['PARAMETERS'] = calibration.parameter_names
+    values['PARAMETER_SIGMAS'] = calibration.sigma.tolist()
+    comments = [*_lens_comments(camera, names), '', *about]
+    return kernel_text(f'Camera {camera_frame}', comments, prefix, values)
+
+
+_FAMILY_IN_WORDS = {
+    'cosine': (
+        f'   P(0; x) = 1, P(n; x) = sqrt(2) cos(pi n (x / {2.0 * COSINE_DOMAIN:g} + 0.5)),',
+        '   a = (2 U + 1) / PIXEL_SAMPLES - 1, b = (2 V + 1) / PIXEL_LINES - 1.',
+    ),
+    'legendre': (
+        '   P(n; x) = sqrt(2 n + 1) times the Legendre polynomial of degree n,',
+        '   a = (2 U + 1) / PIXEL_SAMPLES - 1, b = (2 V + 1) / PIXEL_LINES - 1.',
+    ),
+}
+
+
+def _lens_values(camera: CameraModel) -> dict[str, Value]:
+    fx, skew, fy, cx, cy = camera.intrinsics.tolist()
+    names = camera.parameter_names[len(camera.intrinsics) :]
+    values: dict[str, Value] = {
+        'PIXEL_SAMPLES': camera.width,
+        'PIXEL_LINES': camera.height,
+        'IFOV': [1.0 / fx, 1.0 / fy],
+        'FOCAL_LENGTH_PX': [fx, fy],
+        'SKEW_PX': [skew],
+        'CCD_CENTER': [cx, cy],
+        'LENS_MODEL': camera.model,
+        'LENS_COEFFICIENTS': camera.distortion.tolist(),
+        'LENS_TERMS': names,
+    }
+    if (field := camera.moving_field) is not None:
+        orders = field.orders
+        values |= {
+            'FIELD_FAMILY': field.family,
+            'FIELD_ORDERS_U': orders[:, 0].tolist(),
+            'FIELD_ORDERS_V': orders[:, 1].tolist(),
+            'FIELD_U_PX': field.coefficients[0].tolist(),
+            'FIELD_V_PX': field.coefficients[1].tolist(),
+        }
+    return values
+
+
+def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
+    lines = [
+        *PIXEL_CONVENTION,
+        '',
+        'A direction (X, Y, Z) of the camera frame is seen at pixel (u, v), with',
+        'x = X/Z, y = Y/Z, r2 = x^2 + y^2, and LENS_COEFFICIENTS named by LENS_TERMS:',
+        '',
+        *(f'   {line}' for line in _MODEL_IN_WORDS.get(camera.model, _OPENCV_IN_WORDS)),
+        "   u = FOCAL_LENGTH_PX(1) x' + SKEW_PX y' + CCD_CENTER(1)",
+        "   v = FOCAL_LENGTH_PX(2) y' + CCD_CENTER(2)",
+    ]
+    if camera.has_field:
+        lines += [
+            '',
+            'A star that these equations place at (u, v) is measured at (U, V) with',
+            '   U = u + f_u(U, V), V = v + f_v(U, V)',
+            'where f is the sum over k of FIELD_U_PX(k) (FIELD_V_PX(k)) times',
+            '   P(i; a) P(j; b), i = FIELD_ORDERS_U(k), j = FIELD_ORDERS_V(k), and',
+            *_FAMILY_IN_WORDS[camera.moving_field.family if camera.moving_field else 'cosine'],
+            'Beyond the detector f is that at its edge.',
+        ]
+    if names.pixel_size_um:
+        lines += ['', 'FOCAL_LENGTH is in mm, PIXEL_SIZE in micrometres (as given on export).']
+    return [
+        *lines,
+        '',
+        'BORESIGHT is the line of sight of the middle of the detector.',
+        'PARAMETER_SIGMAS are the 1-sigma of PARAMETERS: px, for alignment angles rad.',
+    ]
+
+
+def kernel_text(
+    title: str, comments: Iterable[str], prefix: str, values: Mapping[str, Value]
+) -> str:
+    """Text of an IK with comments and assignments."""
+    return _kernel('IK', title, comments, _assignments(values, prefix))
+
+
+def _kernel(kind: str, title: str, comments: Iterable[str], data: Iterable[str]) -> str:
+    """Text of a kernel of a kind (``FK``, ``IK``): title, comments, assignments."""
+    lines = [f'KPL/{kind}', '', title, '-' * len(title), '']
+    lines += [line for text in comments for line in _wrapped(text)]
+    lines += ['', r'\begindata', '', *data, '', r'\begintext', '']
+    return '\n'.join(lines)
+
+
+def _assignments(values: Mapping[str, Value], prefix: str = '') -> list[str]:
+    """
+    Lines that give pool variables a whole number, a string, or a list of numbers or strings.
+
+    Floating-point numbers have all digits; SPICE's reader may be off by two in the last bit.
+    Raises OptionError when a name is longer than SPICE allows: the identifier in it has too many
+    digits.
+    """
+    lines = []
+    for key, value in values.items():
+        name = prefix + key
+        if len(name) > _LONGEST_NAME:
+            raise OptionError(f'{name}: over {_LONGEST_NAME} characters, use a shorter NAIF ID')
+        if isinstance(value, (int, str)):
+            lines.append(f'   {name} = {_quoted(value) if isinstance(value, str) else value}')
+            continue
+        items = [_quoted(item) if isinstance(item, str) else repr(float(item)) for item in value]
+        lines += [f'   {name} = (', *(f'      {item}' for item in items), '   )']
+    return lines
+
+
+def _frame_name(text: str, option: str) -> str:
+    """
+    A frame name as SPICE takes it: upper case, letters, digits and underscores.
+
+    Raises OptionError when nothing is left, or more than SPICE allows; the text names the option.
+    """
+    name = re.sub(r'[^A-Z0-9_]+', '_', text.upper()).strip('_')
+    if not name or len(name) > _LONGEST_NAME:
+        raise OptionError(
+            f'{option}: {text!r} makes no frame name of 1 to {_LONGEST_NAME} characters'
+        )
+    return name
+
+
+def _quoted(text: str) -> str:
+    return "'" + ascii_line(text)[:_STRING_COLUMNS].replace("'", "''") + "'"
+
+
+def _wrapped(text: str) -> list[str]:
+    # Only the first blanks of a line are its indent; a backslash would open a data block.
+    text = ascii_line(text.replace('\\', '/'))
+    indent = ' ' * (len(text) - len(text.lstrip()))
+    below = indent + '  '
+    return textwrap.wrap(
+        text, _COMMENT_COLUMNS, subsequent_indent=below, break_on_hyphens=False
+    ) or ['']

@@ -1,0 +1,230 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+CCSDS attitude and orbit ephemerides (AEM, OEM), KVN or XML.
+
+Sources: CCSDS 504.0-B (ADM) and 502.0-B (ODM).  A quaternion A to B of an AEM is a frame
+transformation: it converts coordinates in A to coordinates in B.  Read as a rotation operator, as
+in ROS and in starcal, the same numbers convert coordinates in B to coordinates in A.  AEM 1.0 has
+keywords for direction and order of its quaternions; in AEM 2.0 they are A to B, scalar last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+import re
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.images.time_systems import from_text, system_of
+from starcal_ground.mission.ingest import mission_records
+from starcal_ground.mission.ingest.navigation_messages import read_segments, Segment
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.sky.astrometry import tt_julian_date
+
+_KM = 1000.0
+_DAY_S = 86400.0
+_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
+_KVN = re.compile(rb'^\s*CCSDS_\w+_VERS\s*=', re.MULTILINE)
+# ATTITUDE_TYPE -> numbers of a line: of which four are the quaternion, or three the angles about
+# the axes of EULER_ROT_SEQ in turn, deg; 1.0 writes XYZ as 123.
+_BOTH = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8, 'EULER_ANGLE': 3}
+_TYPES = {
+    '1.0': {**_BOTH, 'QUATERNION/RATE': 7, 'EULER_ANGLE/RATE': 6},
+    '2.0': {**_BOTH, 'QUATERNION/ANGVEL': 7, 'EULER_ANGLE/DERIVATIVE': 6, 'EULER_ANGLE/ANGVEL': 6},
+}
+_AXES = str.maketrans('123', 'XYZ')
+_SEQUENCE = re.compile(r'(?!(.)\1|.(.)\2)[XYZ]{3}')
+_STATE_NUMBERS = (6, 9)  # position and velocity, without and with acceleration
+
+
+def is_ccsds(path: Path) -> bool:
+    """True if a file begins as a CCSDS message in KVN, or as XML."""
+    start = mission_records.start_of(path).removeprefix(b'\xef\xbb\xbf')
+    return start.lstrip().startswith(b'<') or _KVN.search(start) is not None
+
+
+def read_aem(path: Path, star_tracker: str = '') -> mission_records.Attitudes:
+    """
+    Attitudes of an AEM: quaternions or, in KVN, Euler angles.
+
+    ``star_tracker`` selects the body frame if the file has several.
+
+    Raises IngestError when the file cannot be read, is not an AEM, or has a time system or frames
+    that cannot be converted.
+    """
+    segments = read_segments(path, 'AEM')
+    with mission_records.naming(path):
+        bodies = dict.fromkeys(_frames(segment)[1] for segment in segments)
+        chosen = star_tracker.upper() or next(iter(bodies))
+        if chosen not in bodies or (len(bodies) > 1 and not star_tracker):
+            raise ValueError(f'body frames {", ".join(bodies)}: choose one with --star-tracker')
+        stamps: list[Indices] = []
+        quaternions: list[Floats] = []
+        notes: list[str] = []
+        for segment in segments:
+            inertial, body, is_forward = _frames(segment)
+            if body != chosen:
+                continue
+            notes += mission_records.frame_notes(inertial)
+            system = _system(segment)
+            q, is_a_to_b = _quaternions(segment)
+            at = _stamps(segment, system)
+            keep = _useable(segment, at, system)
+            stamps.append(at[keep])
+            quaternions.append(q[keep] if is_forward == is_a_to_b else q[keep] * _CONJUGATE)
+            if system != 'UTC':
+                notes.append(f'times converted from {system} to UTC')
+        return mission_records.in_order(
+            np.concatenate(stamps), np.concatenate(quaternions), tuple(dict.fromkeys(notes))
+        )
+
+
+def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
+    """
+    Barycentric velocities at stamps (n,), interpolated in the segments of an OEM.
+
+    The velocity of the Earth or of the Sun is added if it is the centre of the ephemeris.
+    Raises IngestError when the file cannot be read, does not cover a stamp, or names a centre, a
+    time system or a frame that cannot be converted.
+    """
+    segments = read_segments(path, 'OEM')
+    with mission_records.naming(path):
+        at = np.array(at_ns, np.int64)
+        found = np.full((len(at), 3), np.nan)
+        notes: list[str] = []
+        for segment in segments:
+            notes += mission_records.frame_notes(_keyword(segment, 'REF_FRAME'))
+            system = _system(segment)
+            stamps = _stamps(segment, system)
+            states = _numbers(segment, _STATE_NUMBERS)
+            if len(stamps) < 2 or not (np.diff(stamps) > 0).all():
+                raise ValueError('a segment has fewer than two states, or is out of order')
+            inside = (at >= stamps[0]) & (at <= stamps[-1]) & _useable(segment, at, system)
+            # Seconds since the first state: those since 1970 have a resolution of 0.1 us.
+            seconds = (stamps - stamps[0]) / NANOSECONDS_PER_SECOND
+            orbit = CubicHermiteSpline(seconds, states[:, :3], states[:, 3:6])
+            since_s = (at[inside] - stamps[0]) / NANOSECONDS_PER_SECOND
+            center = _keyword(segment, 'CENTER_NAME')
+            found[inside] = orbit(since_s, 1) * _KM + _center_velocity(center, at[inside])
+        missing = ~np.isfinite(found[:, 0])
+        if missing.any():
+            raise ValueError(
+                f'no velocity for {int(missing.sum())} of {len(at)} images, '
+                f'the first at {utc_text(int(at[missing][0]))}'
+            )
+        return mission_records.Velocities(at, found, tuple(dict.fromkeys(notes)))
+
+
+def _keyword(segment: Segment, key: str, *values: str) -> str:
+    """Value of a required keyword; it must be one of ``values`` unless that is empty."""
+    found = segment.metadata.get(key, '').upper()
+    if not found or (values and found not in values):
+        expected = f' {" or ".join(values)}' if values else ''
+        raise ValueError(
+            f'keyword {key} is {found or "missing"}, but version {segment.version} requires'
+            f' it{expected}: ask the producer of the file'
+        )
+    return found
+
+
+def _frames(segment: Segment) -> tuple[str, str, bool]:
+    """Inertial frame, body frame, and True if frame A is the inertial one."""
+    a, b = (_keyword(segment, f'REF_FRAME_{name}') for name in 'AB')
+    if mission_records.is_inertial(a) == mission_records.is_inertial(b):
+        raise ValueError(
+            f'frames {a} and {b}: one must be ICRF or EME2000, the other the star tracker'
+        )
+    return (a, b, True) if mission_records.is_inertial(a) else (b, a, False)
+
+
+def _quaternions(segment: Segment) -> tuple[Floats, bool]:
+    """Quaternions (n, 4), scalar last, and True if they are from A to B."""
+    is_old = segment.version == '1.0'
+    is_a_to_b = not is_old or _keyword(segment, 'ATTITUDE_DIR', 'A2B', 'B2A') == 'A2B'
+    kind = _keyword(segment, 'ATTITUDE_TYPE')
+    count = _TYPES[segment.version].get(kind)
+    if count is None:
+        raise ValueError(f'attitudes of type {kind}, not QUATERNION or EULER_ANGLE: convert them')
+    if kind.startswith('EULER_ANGLE'):
+        return _of_euler_angles(segment, count), is_a_to_b
+    if segment.is_xml:
+        return _numbers(segment, (4,)), is_a_to_b
+    values = _numbers(segment, (count,))[:, :4]
+    if is_old and _keyword(segment, 'QUATERNION_TYPE', 'FIRST', 'LAST') == 'FIRST':
+        values = np.roll(values, -1, axis=1)
+    return values, is_a_to_b
+
+
+def _of_euler_angles(segment: Segment, count: int) -> Floats:
+    """
+    Quaternions (n, 4) of Euler angles.
+
+    Each rotation is about an axis of the frame that the rotation before it produced, so their
+    product in this order converts coordinates in the last frame to coordinates in the first.
+    """
+    sequence = _keyword(segment, 'EULER_ROT_SEQ').translate(_AXES)
+    if not _SEQUENCE.fullmatch(sequence):
+        raise ValueError(f'EULER_ROT_SEQ = {sequence[:20]} is not a sequence such as ZXZ')
+    angles = _numbers(segment, (count,))[:, :3]
+    return np.asarray(Rotation.from_euler(sequence, angles, degrees=True).as_quat())
+
+
+def _numbers(segment: Segment, counts: Sequence[int]) -> Floats:
+    """Numbers (n, k) of a segment; k is the same for all epochs and one of ``counts``."""
+    if not segment.values:
+        raise ValueError('a segment without data')
+    count = len(segment.values[0])
+    odd = [k for k, values in enumerate(segment.values) if len(values) != count]
+    if odd or count not in counts:
+        k = odd[0] if odd else 0
+        raise ValueError(
+            f'{len(segment.values[k])} numbers at {segment.epochs[k]}, expected '
+            f'{" or ".join(map(str, counts))}'
+        )
+    values = np.array(segment.values)
+    if not np.isfinite(values).all():
+        k = int(np.argmin(np.isfinite(values).all(axis=1)))
+        raise ValueError(f'a number at {segment.epochs[k]} is not finite')
+    return values
+
+
+def _system(segment: Segment) -> str:
+    return system_of(_keyword(segment, 'TIME_SYSTEM'))
+
+
+def _stamps(segment: Segment, system: str) -> Indices:
+    return np.array([from_text(epoch, system) for epoch in segment.epochs], np.int64)
+
+
+def _useable(segment: Segment, at: Indices, system: str) -> NDArray[np.bool_]:
+    """Mask of stamps in the usable span of a segment; outer states are for interpolation only."""
+    keep = np.ones(len(at), np.bool_)
+    if 'USEABLE_START_TIME' in segment.metadata:
+        keep &= at >= from_text(segment.metadata['USEABLE_START_TIME'], system)
+    if 'USEABLE_STOP_TIME' in segment.metadata:
+        keep &= at <= from_text(segment.metadata['USEABLE_STOP_TIME'], system)
+    return keep
+
+
+def _center_velocity(center: str, at_ns: Indices) -> Floats:
+    """Barycentric velocities (n, 3) of the centre of an ephemeris, m/s, ICRF axes."""
+    name = center.strip().upper()
+    if name in ('SOLAR SYSTEM BARYCENTER', 'SSB', 'SOLAR_SYSTEM_BARYCENTER'):
+        return np.zeros((len(at_ns), 3))
+    if name not in ('EARTH', 'SUN'):
+        raise ValueError(
+            f'centre {center!r} is not EARTH, SUN or SOLAR SYSTEM BARYCENTER; give the '
+            'velocity as SPK kernels with a planetary ephemeris'
+        )
+    velocity = []
+    for time_ns in at_ns:
+        heliocentric, barycentric = erfa.epv00(*tt_julian_date(int(time_ns)))
+        of_center = barycentric['v'] - (heliocentric['v'] if name == 'SUN' else 0.0)
+        velocity.append(of_center * (AU_M / _DAY_S))
+    return np.array(velocity).reshape(-1, 3)

@@ -1,0 +1,644 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The tasks of a fleet: found below a root, answered where their files are, counted into the table.
+
+A task is a calibration to read or a bag to calibrate.  Its answer is made in this process or by a
+worker of Dask: a row, or the key of the one that the table has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+import contextlib
+import csv
+import dataclasses
+from dataclasses import dataclass, field
+import errno
+import fnmatch
+import functools
+import hashlib
+import itertools
+import logging
+import math
+import os
+from pathlib import Path
+import posixpath
+import re
+import socket
+from typing import Any
+
+import numpy as np
+
+from starcal_ground.mission.trend import places
+from starcal_ground.mission.trend.places import Entry
+from starcal_ground.mission.trend.rows import COMPUTED, failure, kept_name, RECORDED, Row, row_of
+from starcal_ground.mission.trend.trend_table import Table
+from starcal_ros.errors import OptionError, ProductError, StarcalError
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
+from starcal_ros.formats.products import calibration_json, product_files
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
+from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
+from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.processes import one_blas_thread
+from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.text import printable
+from starcal_ros.untrusted import (
+    json_value,
+    METADATA_BYTES,
+    read_text,
+    regular_file,
+    shown,
+    yaml_value,
+)
+
+KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
+_ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
+_METADATA = 'metadata.yaml'
+_KEYS = ('spacecraft', 'camera')
+_COLUMNS = ('path', *_KEYS, 'params')
+_MOST_BYTES = 8 * 2**20
+_TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
+_NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
+_NO_ANSWER = (errno.EIO, errno.ETIMEDOUT)  # of a store; other errors are answers
+MOST_SILENT = 5  # files that a store does not answer for, in a run; the others wait for the next
+_CONNECT_S = 10.0
+_AHEAD = 8  # tasks submitted ahead for each thread of a cluster: cancelling 100,000 is slow
+_ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
+# A task whose worker ends is tried again here, alone.
+_SETTINGS = {
+    'distributed.scheduler.allowed-failures': 0,
+    'logging': {'distributed': 'critical'},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """
+    A calibration file to read, or a bag to calibrate.
+
+    Attributes
+    ----------
+    url : str
+        Absolute path or URL.
+    stamp : str
+        Digest of name, identity and settings, none of which is read from the file: what has it is
+        not read again.  Empty where the listing has no identity.
+    files : tuple of str
+        Those that are read, as far as the listing shows.
+    size : int
+        Their bytes; -1 if one could not be read when it was listed.
+    is_bag : bool
+    params : str
+        Parameter file for a bag; empty: options and prior of the calibration beside it.
+    settings : tuple of str
+        Files that decide about the result of a bag as well.
+    spacecraft, camera : str
+        From the table or the pattern of cameras; empty: from the metadata of the bag.
+    known : tuple of str
+        Keys in the table of which one may be that of this content.
+    """
+
+    url: str
+    stamp: str
+    files: tuple[str, ...]
+    size: int = 0
+    is_bag: bool = False
+    params: str = ''
+    settings: tuple[str, ...] = ()
+    spacecraft: str = ''
+    camera: str = ''
+    known: tuple[str, ...] = ()
+
+
+def find(root: str, cameras: Cameras) -> Iterator[Task]:
+    """
+    Tasks below a root, as it is listed; no file is read.
+
+    A bag is a task where it has parameters and no calibration beside it.  Observations beside a
+    calibration are one too: it is done only if that is of another version.  Raises OSError when
+    a folder cannot be listed. Raises StarcalError when a parameter file or a file that it names
+    cannot be read.
+    """
+    version, settings_of = software_version(), functools.cache(_settings)
+    for entries in places.listings(root):
+        listed = {e.name: e for e in entries if KEPT_FOLDER not in e.name.split('/')}
+        yield from _tasks(root, listed, cameras, version, settings_of)
+
+
+def _tasks(
+    root: str,
+    listed: dict[str, Entry],
+    cameras: Cameras,
+    version: str,
+    settings_of: Callable[[str], tuple[tuple[str, ...], str]],
+) -> Iterator[Task]:
+    """Tasks of files by name: calibrations in order of their paths, then bags."""
+    for name, entry in listed.items():
+        if posixpath.basename(name) == CALIBRATION_FILE:
+            observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
+            others = (observations,) if observations else ()
+            yield _task(root, name, (entry,), cameras, others=others)
+        elif _ARCHIVED.fullmatch(posixpath.basename(name)):
+            yield _task(root, name, (entry,), cameras)
+    for name, files in _bags(listed).items():
+        folder = posixpath.dirname(name) if name in listed else name
+        calibration = listed.get(posixpath.join(folder, CALIBRATION_FILE))
+        params = cameras.params_of(name)
+        if params and calibration is None:
+            yield _task(root, name, files, cameras, version, params, settings_of(params))
+        elif calibration is not None and posixpath.basename(name) == OBSERVATIONS_FILE:
+            yield _task(root, name, files, cameras, version, others=(calibration,))
+
+
+def _settings(params: str) -> tuple[tuple[str, ...], str]:
+    """Absolute paths of a parameter file and those that it names, and their digest."""
+    files = (Path(params), *files_of(read_setup(Path(params)).frames).values())
+    paths = tuple(map(os.path.abspath, files))
+    return paths, digest(paths)
+
+
+def digest(files: Sequence[str | Path], version: str = '') -> str:
+    """Digest of the contents of files, those that do not exist left out; raises OSError."""
+    found = hashlib.sha256(version.encode())
+    for file in files:
+        if not os.path.lexists(file):
+            continue  # metadata.yaml of a bag, which need not be there
+        with regular_file(Path(file)) as stream:
+            while block := stream.read(1 << 20):
+                found.update(block)
+    return found.hexdigest()
+
+
+def _task(
+    root: str,
+    name: str,
+    files: Sequence[Entry],
+    cameras: Cameras,
+    version: str = '',
+    params: str = '',
+    settings: tuple[tuple[str, ...], str] = ((), ''),
+    others: Sequence[Entry] = (),
+) -> Task:
+    """A task; ``version`` is that which would calibrate a bag, ``others`` are read with it."""
+    # A calibration is the same whatever is beside it, a bag is not.
+    decide = [*files, *(others if version else ())]
+    identities = [(entry.name, entry.identity) for entry in decide]
+    spacecraft, camera = map(printable, cameras.of(name))
+    text = f'{identities!r} {version} {settings[1]} {spacecraft!r} {camera!r}'
+    return Task(
+        url=places.join(root, name),
+        stamp=hashlib.sha256(text.encode()).hexdigest() if all(i for _, i in identities) else '',
+        files=tuple(entry.url for entry in (*files, *others)),
+        size=sum(entry.size for entry in files) if all(e.size >= 0 for e in files) else -1,
+        is_bag=bool(version),
+        params=params,
+        settings=settings[0],
+        spacecraft=spacecraft,
+        camera=camera,
+    )
+
+
+def _bags(listed: dict[str, Entry]) -> dict[str, list[Entry]]:
+    """Bag folders with a metadata.yaml, and single files elsewhere; no files of an archive."""
+    found: dict[str, list[Entry]] = {}
+    for name, entry in listed.items():
+        folder, file = posixpath.split(name)
+        # One image each: the state of a calibrator, calibrated there.
+        if not file.endswith('.mcap') or posixpath.basename(folder) == 'ensemble':
+            continue
+        metadata = listed.get(posixpath.join(folder, _METADATA))
+        if metadata and file != OBSERVATIONS_FILE:
+            found.setdefault(folder, [metadata]).append(entry)
+        else:
+            found[name] = [entry]
+    return found
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """
+    Which camera a path below the root belongs to, and the parameters of that camera.
+
+    Attributes
+    ----------
+    pattern : regular expression or None
+        Of the start of a path, with groups for spacecraft and camera.
+    table : tuple of mappings
+        Rows of a table with the columns path (a pattern of shell), spacecraft, camera and params;
+        the first that matches counts.
+    params : str
+        Parameter file, in which ``{spacecraft}`` and ``{camera}`` are replaced; may be empty.
+    """
+
+    pattern: re.Pattern[str] | None = None
+    table: tuple[Mapping[str, str], ...] = field(default=(), repr=False)
+    params: str = ''
+
+    def of(self, name: str) -> tuple[str, str]:
+        """Spacecraft and camera of a path below the root, empty if nothing names them."""
+        found = self._row(name)
+        if self.pattern and (match := self.pattern.match(name)):
+            found = {**match.groupdict(), **found}
+        return found.get(_KEYS[0], ''), found.get(_KEYS[1], '')
+
+    def params_of(self, name: str) -> str:
+        """Absolute path of the parameters of a bag; empty if there are none."""
+        own = self._row(name).get('params', '')
+        if own or not self.params:
+            return own
+        spacecraft, camera = self.of(name)
+        text = self.params.replace('{spacecraft}', spacecraft).replace('{camera}', camera)
+        return os.path.abspath(text)
+
+    def _row(self, name: str) -> Mapping[str, str]:
+        return next((row for row in self.table if fnmatch.fnmatchcase(name, row['path'])), {})
+
+
+def read_cameras(text: str, params: str) -> Cameras:
+    """
+    Cameras by a pattern such as ``{spacecraft}/{camera}/*.mcap``, or by the path of a CSV table.
+
+    Raises StarcalError in one line, for a pattern without a name or a table that cannot be read.
+    """
+    if '{' in text:
+        return Cameras(pattern=_compiled(text), params=params)
+    return Cameras(table=_rows(Path(text)) if text else (), params=params)
+
+
+def _compiled(pattern: str) -> re.Pattern[str]:
+    """Expression for the start of a path, up to the segment of the last name."""
+    start = pattern[: pattern.rindex('}') + 1] if '}' in pattern else pattern
+    start += pattern[len(start) :].partition('/')[0]
+    found, names = '', []
+    for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
+        if other or (name and name not in _KEYS) or name in names:
+            raise OptionError(
+                f'--cameras: {shown(pattern)}: not a pattern with {{spacecraft}} and {{camera}}'
+            )
+        names += [name] if name else []
+        found += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
+    return re.compile(f'{found}(?:/|$)')
+
+
+def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
+    text = product_files.read_text(path, _MOST_BYTES)
+    rows = csv.DictReader(text.splitlines(), restval='')
+    if 'path' not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= {*_COLUMNS}:
+        raise OptionError(f'{path}: the first line does not name columns of {", ".join(_COLUMNS)}')
+    found = []
+    for row in rows:
+        if None in row:
+            raise OptionError(f'{path}:{rows.line_num}: more values than columns')
+        values = {name: value.strip() for name, value in row.items() if value.strip()}
+        if 'path' not in values:
+            raise OptionError(f'{path}:{rows.line_num}: no path')
+        if 'params' in values:
+            values['params'] = os.path.abspath(path.parent / values['params'])
+        found.append(values)
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """
+    The answer to a task.
+
+    Attributes
+    ----------
+    key : str
+        Of the row that the table has; empty where none is due.
+    row : Row or None
+        New row.
+    calibration : str
+        Content of ``calibration.json`` of a bag.
+    is_silence : bool
+        True if the store of the file did not answer.
+    """
+
+    key: str = ''
+    row: Row | None = None
+    calibration: str = ''
+    is_silence: bool = False
+
+
+def compute(task: Task) -> Answer:
+    """Answer to a task; for one that fails, the row with its error."""
+    try:
+        if task.size >= 0 and not places.exists(task.url):
+            raise FileNotFoundError(errno.ENOENT, _NOT_SEEN, task.url)
+        # The result must not depend on the threads of BLAS.
+        with places.fetched(task.url, task.files, task.size) as path, one_blas_thread():
+            return _answer(task, path)
+    except (OSError, ModuleNotFoundError) as error:
+        return _unreachable(task, error)
+    # One bag must not end a run over thousands, whatever is in it.
+    except Exception as error:
+        return failed(task, f'{type(error).__name__}: {error}')
+
+
+def failed(task: Task, error: str, is_passing: bool = False, is_silence: bool = False) -> Answer:
+    """Answer to a task that failed."""
+    row = dataclasses.replace(failure(task.url, error), is_passing=is_passing)
+    return Answer(row=_of_task(row, task), is_silence=is_silence)
+
+
+def _unreachable(task: Task, error: OSError | ModuleNotFoundError) -> Answer:
+    """The row of a file that could not be read; it passes unless the client saw that too."""
+    reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
+    if task.size < 0:
+        return failed(task, reason)
+    is_silence = places.is_remote(task.url) and getattr(error, 'errno', None) in _NO_ANSWER
+    return failed(task, f'{socket.gethostname()}: {reason}', True, is_silence)
+
+
+def _answer(task: Task, path: Path) -> Answer:
+    version = software_version() if task.is_bag else ''
+    try:
+        if task.is_bag and not task.params:
+            beside = path.with_name(CALIBRATION_FILE)
+            if not _is_older(beside, version):
+                return Answer()
+            settings: tuple[str | Path, ...] = (beside,)
+        else:
+            settings = task.settings
+        # By content: a copy counts once, a tree may move, and what is repaired is another task.
+        files = reader.files_of_bags([path]) if task.is_bag else (path,)
+        key = digest((*files, *settings), version)
+        if key in task.known:
+            return Answer(key)
+        if not task.is_bag:
+            made, temperature = _recorded(path)
+            return Answer(key, _of_task(row_of(made, key, task.url, RECORDED, temperature), task))
+        setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
+        campaign = calibrate_bags([path], setup, Topics())
+        made, records = campaign.calibration, campaign.observations
+        row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
+        text = calibration_json.calibration_text(made)
+        return Answer(key, _of_task(row, task, path), text)
+    except (StarcalError, ValueError) as error:
+        cause = error.__cause__
+        if isinstance(cause, OSError):
+            raise cause from error
+        return failed(task, str(error).replace(str(path), task.url))
+
+
+def _of_task(row: Row, task: Task, bag: Path = Path()) -> Row:
+    """A row with what its task and the metadata of the bag add."""
+    names = _custom_data(bag / 'metadata.yaml') if task.is_bag else {}
+    return dataclasses.replace(
+        row,
+        stamp=task.stamp,
+        size_bytes=max(task.size, 0),
+        spacecraft=task.spacecraft or names.get('spacecraft', ''),
+        camera=task.camera or names.get('camera', ''),
+    )
+
+
+def _custom_data(metadata: Path) -> dict[str, str]:
+    """Texts that the recorder of a bag was given; empty where there are none."""
+    try:
+        content = yaml_value(read_text(metadata, METADATA_BYTES))
+        found = content['rosbag2_bagfile_information']['custom_data']
+        return {name: value for name, value in found.items() if isinstance(value, str)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
+
+
+def _recorded(path: Path) -> tuple[Calibration, float]:
+    """A recorded calibration and its mean temperature."""
+    temperature = _temperature(path.with_name(OBSERVATIONS_FILE))
+    return calibration_json.read_calibration(path), temperature
+
+
+def _setup_beside(bag: Path) -> Setup:
+    """The setup of the calibration beside a bag: its options and its prior."""
+    path = bag.with_name(CALIBRATION_FILE)
+    calibration = calibration_json.read_calibration(path)
+    prior = calibration_json.prior_of(calibration)
+    try:
+        options = json_value(calibration.provenance['options'])
+    except (KeyError, ValueError) as error:
+        raise ProductError(f'{path}: has no options to calibrate with: give --params') from error
+    if prior is None:
+        raise ProductError(f'{path}: has no prior to calibrate with: give --params')
+    # Files that may be gone, and that observations do not need.
+    files = dict.fromkeys(('dark_frame', 'flat_field', 'bad_pixel_map', 'catalog'), '')
+    return load_setup({**options, **files}, prior=prior)
+
+
+def _is_older(calibration: Path, version: str) -> bool:
+    """True for a calibration by another version; False for none."""
+    try:
+        software = calibration_json.read_calibration(calibration).provenance.get('software', '')
+    except StarcalError:
+        return False  # named by its own task
+    return software != f'starcal {version}'
+
+
+def _temperature(observations: Path) -> float:
+    """Mean temperature of recorded observations; NaN without any."""
+    if not observations.is_file():
+        return math.nan
+    try:
+        topic = reader.choose_topic([observations], OBSERVATIONS_TYPE)
+        records: list[StarObservations] = list(reader.read_observations([observations], topic))
+    except StarcalError:
+        return math.nan
+    return _mean_temperature([record for record in records if not record.refusal])
+
+
+def _mean_temperature(records: Sequence[StarObservations]) -> float:
+    degc = np.array([record.temperature_degc for record in records])
+    known = degc[~np.isnan(degc)]
+    return float(np.mean(known)) if len(known) else math.nan
+
+
+@dataclass
+class Done:
+    """
+    How many tasks were computed, failed, or have the content of a row in the table.
+
+    ``silent``: how many of the failed ones a store did not answer for.
+    """
+
+    computed: int = 0
+    failed: int = 0
+    known: int = 0
+    silent: int = 0
+
+    def count(self, table: Table, task: Task, answer: Answer) -> None:
+        """Put an answer into the table, and count it."""
+        row = answer.row
+        if row is None or table.has(row):
+            table.add_seen(task.stamp, answer.key)
+            self.known += bool(answer.key)
+            return
+        if answer.calibration:
+            folder = table.path.with_name(KEPT_FOLDER) / kept_name(row)
+            product_files.make_folder(folder)
+            product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
+        table.add(row)
+        self.computed += not row.error
+        self.failed += bool(row.error)
+        self.silent += answer.is_silence
+
+
+def update(
+    table: Table,
+    tasks: Iterable[Task],
+    workers: int = 0,
+    scheduler: str = '',
+    on_row: Callable[[], None] = lambda: None,
+) -> Done:
+    """
+    Add the rows of the tasks that the table does not have; a task is taken when it is submitted.
+
+    A task that ends its worker process, also alone, becomes the row of a failure; the others go
+    on.  Failures that may pass are tried again, after the tasks that have no row.  The run ends
+    early, and the next one continues, once a store has not answered for 5 files.
+    The calibration of a bag is written beside the table before its row, and each row is on disk
+    before the next, so a run that was stopped starts where it stopped.
+    Raises OptionError when no scheduler answers at the address.
+
+    Parameters
+    ----------
+    workers : int
+        Processes to start on this machine; 0 runs in-process.
+    scheduler : str
+        Address of a Dask scheduler whose workers have this package and see the same files; then
+        no process is started.
+    on_row : callable
+        Called after each answer.
+    """
+    table.forget_failures([''])  # of files whose place does not tell when they change
+    done, failures = Done(), table.failures()
+    waiting = _not_known(table, tasks, done, failures)
+    with contextlib.closing(_answers(waiting, workers, scheduler)) as answers:
+        for task, answer in answers:
+            done.count(table, task, answer)
+            on_row()
+            if done.silent == MOST_SILENT:
+                return done
+    # A file that was repaired or removed is no longer among the tasks.
+    table.forget_failures(failures)
+    return done
+
+
+def _not_known(
+    table: Table, tasks: Iterable[Task], done: Done, failures: dict[str, bool]
+) -> Iterator[Task]:
+    """Tasks that the table has no row of, then failures to try again; others are counted."""
+    again: list[Task] = []
+    for task in tasks:
+        is_again = failures.pop(task.stamp, False)
+        key = None if is_again else table.key_of(task.stamp)
+        if key is not None:
+            done.known += bool(key)
+            continue
+        likely = table.likely(task.size, task.spacecraft, task.camera)
+        task = dataclasses.replace(task, known=likely)
+        if is_again:
+            again.append(task)
+        else:
+            yield task
+    yield from again
+
+
+def _answers(
+    tasks: Iterator[Task], workers: int, scheduler: str
+) -> Generator[tuple[Task, Answer], None, None]:
+    """Tasks with their answers, in any order."""
+    first = list(itertools.islice(tasks, 1))
+    tasks = itertools.chain(first, tasks)
+    if first and (workers or scheduler):
+        with _cluster(workers, scheduler) as (client, ahead):
+            yield from _as_completed(client, ahead, tasks)
+    else:
+        yield from ((task, compute(task)) for task in tasks)
+
+
+def _as_completed(
+    client: Any, ahead: int, tasks: Iterator[Task]
+) -> Generator[tuple[Task, Answer], None, None]:
+    """Answers of a cluster as they come, with ``ahead`` tasks submitted at a time."""
+    from distributed import as_completed, KilledWorker
+
+    running: dict[str, Task] = {}
+    killed: list[Task] = []
+
+    def submit(task: Task) -> Any:
+        future = client.submit(compute, task, pure=False)
+        running[future.key] = task
+        return future
+
+    # The second time alone: with its worker, tasks end that only waited there.
+    for is_alone in (False, True):
+        waiting = iter(killed) if is_alone else tasks
+        first = map(submit, itertools.islice(waiting, 1 if is_alone else ahead))
+        futures = as_completed(first, loop=client.loop)  # type: ignore[no-untyped-call]
+        for future in futures:
+            task, error = running.pop(future.key), future.exception()
+            if error is None:
+                yield task, future.result()
+            elif isinstance(error, KilledWorker) and not is_alone:
+                killed.append(task)
+            else:
+                if isinstance(error, KilledWorker):
+                    error = 'ends its worker process, also alone: out of memory?'
+                yield task, failed(task, str(error))
+            for task in itertools.islice(waiting, 1):
+                futures.add(submit(task))  # type: ignore[no-untyped-call]
+
+
+def _set_environment(variables: dict[str, str]) -> None:
+    os.environ.clear()
+    os.environ.update(variables)
+
+
+@contextlib.contextmanager
+def _cluster(workers: int, address: str) -> Iterator[tuple[Any, int]]:
+    """Client of a Dask cluster, here or at an address, and how many tasks to submit ahead."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    # For another scheme Dask prints a traceback after the time-out.
+    if address and not _ADDRESS.fullmatch(address):
+        raise OptionError(f'--scheduler: {address}: not tcp://HOST:PORT or tls://HOST:PORT')
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set(_SETTINGS))
+        # Dask sets the variables of its workers in this process, for good.
+        stack.callback(_set_environment, dict(os.environ))
+        # Neither workers nor the resource tracker that Python starts import from this folder.
+        os.environ['PYTHONSAFEPATH'] = '1'
+        cluster: Any = address
+        if not address:
+            import cryptography  # noqa: F401
+
+            # Without certificates another user of this machine could send it code.
+            cluster = stack.enter_context(
+                LocalCluster(  # type: ignore[no-untyped-call]
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    memory_limit=None,
+                    host='127.0.0.1',
+                    dashboard_address=None,
+                    # Its default is port 8787 of all addresses, once in a machine.
+                    scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
+                    security=True,
+                    silence_logs=logging.CRITICAL,
+                )
+            )
+        try:
+            client: Any = stack.enter_context(
+                Client(  # type: ignore[no-untyped-call]
+                    cluster, timeout=_CONNECT_S, set_as_default=False
+                )
+            )
+        except (OSError, ValueError, TypeError) as error:
+            raise OptionError(f'--scheduler: {address}: {error}') from error
+        yield client, workers or _AHEAD * max(1, sum(client.nthreads().values()))

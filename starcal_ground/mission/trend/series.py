@@ -1,0 +1,402 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Rows of a table as series in time with their trends, and what was active when.
+
+Model of a series of measurements with known sigmas: a constant, a drift with time, a coefficient
+of temperature, and steps between two neighbouring measurements.  Terms enter one by one, the most
+significant first, while its p-value is below a limit, and leave again where another term has made
+them superfluous (stepwise regression).  Candidates are judged by an F-test whose variance is that
+of the residuals, but at least that of the sigmas; the p-value of a step is multiplied by the
+number of places that it could stand at (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import fdtrc
+
+from starcal_ground.mission.trend.rows import COMPUTED, Row
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight, movement
+from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.records import CameraGeometry
+
+FEWEST = 6  # measurements; with fewer, a step and a drift are one
+MAX_P_VALUE = 1e-3  # with a dozen series on a page, one false finding in a hundred pages
+_DRIFT, _TEMPERATURE = 'drift', 'temperature'
+_STEP_SIDE = 2  # measurements on each side of a step: one alone is an outlier
+SECONDS_PER_YEAR = 365.25 * 86400.0  # Julian year, IAU
+
+
+@dataclass(frozen=True)
+class Term:
+    """
+    A significant term of a series.
+
+    ``kind`` is drift (per year), temperature (per degC) or step; ``after`` the index of the last
+    measurement before a step, -1 for the others.
+    """
+
+    kind: str
+    size: float
+    sigma: float
+    p_value: float
+    after: int = -1
+
+
+@dataclass(frozen=True)
+class Trend:
+    """
+    The terms of a series, the fit (n,) at its measurements, and the scatter about it.
+
+    ``scatter`` is the root of the reduced chi^2: over one where the sigmas are too small or
+    something else changes; NaN where the series is too short to be tested.
+    """
+
+    terms: tuple[Term, ...]
+    fit: Floats
+    scatter: float
+
+
+def trend_of(
+    time_s: Floats,
+    value: Floats,
+    sigma: Floats,
+    temperature_degc: Floats,
+    max_p_value: float = MAX_P_VALUE,
+) -> Trend:
+    """
+    Trend of a series (n,) in order of time.
+
+    Temperatures that are not all known, or all equal, are no regressor.
+    """
+    n = len(value)
+    sigma = np.where(sigma > 0, sigma, np.nan)
+    if n < FEWEST or not np.isfinite(sigma).all():
+        return Trend((), np.full(n, float(np.mean(value))) if n else np.empty(0), np.nan)
+    columns = _columns(time_s, temperature_degc)
+    chosen: list[str] = []
+    while True:
+        p_values = _p_values(columns, chosen, value, sigma)
+        p, best = min((p, name) for name, p in p_values.items() if name not in chosen)
+        if p > max_p_value or len(chosen) >= n // 3:
+            break
+        chosen = _still_needed(columns, [*chosen, best], value, sigma, max_p_value)
+        if best not in chosen:
+            break
+    return _fitted(columns, chosen, value, sigma)
+
+
+def _columns(time_s: Floats, temperature_degc: Floats) -> dict[str, Floats]:
+    """Regressors (n,) by name, '' the constant; those of steps are made when they are needed."""
+    years = (time_s - time_s.mean()) / SECONDS_PER_YEAR
+    columns = {'': np.ones(len(time_s)), _DRIFT: years}
+    if np.isfinite(temperature_degc).all() and np.ptp(temperature_degc) > 0:
+        columns[_TEMPERATURE] = temperature_degc - temperature_degc.mean()
+    return columns
+
+
+def _matrix(columns: dict[str, Floats], chosen: Sequence[str]) -> Floats:
+    """Regressors (n, 1 + c) of the constant and the chosen terms; a step is named ``step 7``."""
+    measurement, found = np.arange(len(columns[''])), [columns['']]
+    for name in chosen:
+        kind, _, after = name.partition(' ')
+        found.append(np.asarray(measurement > int(after), np.float64) if after else columns[kind])
+    return np.stack(found, axis=1)
+
+
+def _solve(
+    columns: dict[str, Floats], chosen: Sequence[str], value: Floats, sigma: Floats
+) -> tuple[Floats, Floats, float]:
+    """Coefficients of the constant and the chosen terms, their covariance, and chi^2."""
+    A = _matrix(columns, chosen) / sigma[:, None]
+    b = value / sigma
+    inverse = np.asarray(np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True), np.float64)
+    x = inverse @ (A.T @ b)
+    return x, inverse, float(np.sum((b - A @ x) ** 2))
+
+
+def _p_values(
+    columns: dict[str, Floats], chosen: Sequence[str], value: Floats, sigma: Floats
+) -> dict[str, float]:
+    """
+    p-values of all terms, each beside the chosen ones; 1 for those.
+
+    A term lowers chi^2 by the square of the residual along the part of its column that is
+    orthogonal to the columns of the chosen ones, so all are judged by one factorisation.  The
+    sums of a step are those over the measurements after it: time and memory grow with n.
+    """
+    n, w = len(value), 1.0 / sigma[:, None]
+    Q, _ = np.linalg.qr(_matrix(columns, chosen) * w)
+    b = value / sigma
+    b = b - Q @ (Q.T @ b)
+    names = [name for name in columns if name]
+    places = range(_STEP_SIDE - 1, n - _STEP_SIDE)
+    terms = np.hstack([w, b[:, None], Q]) * w  # times a column, for the sums below
+    C = np.stack([columns[name] for name in names], axis=1)
+    sums = np.vstack([C.T @ terms, np.cumsum(terms[::-1], axis=0)[::-1][places.start + 1 :]])
+    sums = sums[: len(names) + len(places)]
+    sums[: len(names), 0] = np.sum((C * w) ** 2, axis=0)
+    squares, along_b, along_Q = sums[:, 0], sums[:, 1], sums[:, 2:]
+    left = squares - np.sum(along_Q**2, axis=1)
+    # A column that the chosen ones span lowers nothing.
+    gain = np.where(left > 1e-12 * squares, along_b**2 / np.maximum(left, 1e-300), 0.0)
+    freedom = n - len(chosen) - 2
+    F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
+    p_values = fdtrc(1, freedom, np.maximum(F, 0.0))
+    p_values[len(names) :] *= len(places)
+    names += [f'step {k}' for k in places]
+    return dict(zip(names, np.minimum(p_values, 1.0).tolist(), strict=True))
+
+
+def _still_needed(
+    columns: dict[str, Floats],
+    chosen: list[str],
+    value: Floats,
+    sigma: Floats,
+    max_p_value: float,
+) -> list[str]:
+    """The chosen terms without those that the others have made superfluous."""
+    while len(chosen) > 1:
+        p_values = {
+            name: _p_values(columns, [c for c in chosen if c != name], value, sigma)[name]
+            for name in chosen
+        }
+        worst = max(p_values, key=lambda name: p_values[name])
+        if p_values[worst] <= max_p_value:
+            break
+        chosen = [name for name in chosen if name != worst]
+    return chosen
+
+
+def _fitted(columns: dict[str, Floats], chosen: list[str], value: Floats, sigma: Floats) -> Trend:
+    x, inverse, chi2 = _solve(columns, chosen, value, sigma)
+    scale = max(chi2 / (len(value) - len(chosen) - 1), 0.0)
+    error = np.sqrt(np.diag(inverse) * max(scale, 1.0))
+    terms = []
+    for k, name in enumerate(chosen, start=1):
+        others = [other for other in chosen if other != name]
+        p = _p_values(columns, others, value, sigma)[name]
+        kind, _, after = name.partition(' ')
+        terms.append(Term(kind, float(x[k]), float(error[k]), p, int(after) if after else -1))
+    fit = _matrix(columns, chosen) @ x
+    terms.sort(key=lambda term: (term.after, term.kind))
+    return Trend(tuple(terms), np.asarray(fit), float(np.sqrt(scale)))
+
+
+_GRID = (15, 12)  # columns and rows of pixels that changes are taken over
+# Series whose estimates trade with each other: one drift shows in several of them.
+_TRADING = {
+    name: group
+    for group in (
+        ('boresight about x', 'alignment_x', 'cy'),
+        ('boresight about y', 'alignment_y', 'cx'),
+    )
+    for name in group
+}
+
+
+@dataclass(frozen=True)
+class Series:
+    """
+    A number of n calibrations in order of time, with its trend.
+
+    ``value`` and ``sigma`` are (n,) in ``unit``; ``row`` the indices of the calibrations.
+    """
+
+    name: str
+    unit: str
+    row: tuple[int, ...]
+    value: Floats
+    sigma: Floats
+    trend: Trend
+
+
+@dataclass(frozen=True)
+class Active:
+    """
+    A calibration that was active from a stamp to another (0: still is).
+
+    ``assumed``: nothing records an activation; each accepted calibration is taken as active from
+    its last image.
+    """
+
+    row: int
+    since_ns: int
+    until_ns: int
+    assumed: bool
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    Change by a calibration against another one, such as that which was active then.
+
+    ``line_of_sight_px`` is the largest change of a line of sight in the star tracker frame,
+    ``shape_px`` that with the common rotation removed; px at the focal length.
+    """
+
+    row: int
+    against: int
+    line_of_sight_px: float
+    shape_px: float
+
+
+def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Series]:
+    """Series of parameters, boresight and alignment of the calibrations of one lens model."""
+    first = rows[0].geometry
+    found = []
+    for k, name in enumerate(rows[0].names):
+        values = np.array([row.values[k] for row in rows])
+        sigmas = np.array([row.sigmas[k] for row in rows])
+        unit = 'px' if name in INTRINSIC_NAMES else ''
+        found += _one(rows, name, unit, values, sigmas, max_p_value)
+    boresight = _boresight_arcsec([row.geometry for row in rows])
+    of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
+    for k, axis in enumerate('xy'):
+        name = f'boresight about {axis}'
+        found += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
+    alignment = np.array(
+        [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
+    )
+    sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
+    for k, axis in enumerate('xyz'):
+        name = f'alignment_{axis}'
+        found += _one(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
+    return found
+
+
+def findings(shown: Sequence[Series]) -> list[tuple[Series, Term]]:
+    """Terms of series, a drift of several that trade with each other where it is clearest."""
+    found = [(one, term) for one in shown for term in one.trend.terms]
+    clearest: dict[object, tuple[float, str]] = {}
+    for one, term in found:
+        if term.kind == 'drift':
+            group = _TRADING.get(one.name, one.name)
+            best = (abs(term.size) / term.sigma, one.name)
+            clearest[group] = max(best, clearest.get(group, best))
+    names = {name for _, name in clearest.values()}
+    return [(one, term) for one, term in found if term.kind != 'drift' or one.name in names]
+
+
+def _one(
+    rows: Sequence[Row],
+    name: str,
+    unit: str,
+    value: Floats,
+    sigma: Floats,
+    max_p_value: float,
+) -> list[Series]:
+    """The series of the calibrations that estimated a number; none where none did."""
+    known = np.flatnonzero(np.isfinite(sigma) & (sigma > 0) & np.isfinite(value))
+    if not len(known):
+        return []
+    time_s = np.array([rows[k].time_ns for k in known], np.float64) / NANOSECONDS_PER_SECOND
+    temperature = np.array([rows[k].temperature_degc for k in known])
+    trend = trend_of(time_s, value[known], sigma[known], temperature, max_p_value)
+    return [Series(name, unit, tuple(known.tolist()), value[known], sigma[known], trend)]
+
+
+def _boresight_arcsec(geometries: Sequence[CameraGeometry]) -> Floats:
+    """Rotations (n, 2) of the line of sight of the middle about x and y of the first camera."""
+    camera = geometries[0].camera
+    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+    in_tracker = [
+        Rotation.from_quat(one.star_tracker_from_camera_xyzw).apply(
+            line_of_sight(one.camera, middle)
+        )
+        for one in geometries
+    ]
+    tracker_from_first = Rotation.from_quat(geometries[0].star_tracker_from_camera_xyzw)
+    of_first = tracker_from_first.inv().apply(in_tracker)
+    return np.asarray(np.cross(of_first[0], of_first)[:, :2] / ARCSECOND_RAD)
+
+
+def activations(rows: Sequence[Row]) -> list[Active]:
+    """Calibrations that were active, in order; recorded activations, else assumed ones."""
+    recorded = sorted(
+        (row.active_since_ns, k) for k, row in enumerate(rows) if row.active_since_ns > 0
+    )
+    # A calibration computed from a bag was never on board.
+    on_board = [(row.last_ns, k) for k, row in enumerate(rows) if row.accepted]
+    on_board = [(since, k) for since, k in on_board if rows[k].kind != COMPUTED] or on_board
+    starts = recorded or sorted(on_board)
+    return [
+        Active(k, since, until, not recorded)
+        for (since, k), (until, _) in itertools.pairwise([*starts, (0, -1)])
+        if since != until
+    ]
+
+
+def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
+    """Change by each calibration against the one active at its last image."""
+    found = []
+    for k, row in enumerate(rows):
+        then = [one for one in active if one.since_ns <= row.last_ns and one.row != k]
+        if then:
+            found.append(_change(rows, k, then[-1].row))
+    return found
+
+
+def _change(rows: Sequence[Row], row: int, against: int) -> Change:
+    before, after = rows[against].geometry, rows[row].geometry
+    if (before.camera.width, before.camera.height) != (after.camera.width, after.camera.height):
+        return Change(row, against, math.inf, math.inf)
+    old, new = (lines_of_sight(geometry, *_GRID) for geometry in (before, after))
+    moved_rad = np.linalg.norm(new - old, axis=1).max()
+    _, left_px = movement(before, after, *_GRID)
+    total_px = float(moved_rad * after.camera.parameters[0])
+    return Change(row, against, total_px, float(left_px.max()))
+
+
+def versions(rows: Sequence[Row]) -> list[Change]:
+    """Change by this version against the recorded calibration of the same images."""
+    recorded = {_images(row): k for k, row in enumerate(rows) if row.kind != COMPUTED}
+    return [
+        _change(rows, k, recorded[_images(row)])
+        for k, row in enumerate(rows)
+        if row.kind == COMPUTED and _images(row) in recorded
+    ]
+
+
+def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """
+    Calibrations by spacecraft, camera, frame name, size and lens model; the largest group first.
+
+    Of the same images the newest version counts, so that a series has each once.
+    """
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.error:
+            continue
+        size = f'{row.width} x {row.height}'
+        parts = (row.spacecraft, row.camera, row.child_frame, size, row.lens_model)
+        name = ', '.join(filter(None, parts))
+        found.setdefault(name, []).append(row)
+    return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+
+
+def newest_of_each(rows: Sequence[Row]) -> list[Row]:
+    """
+    Rows of different calibrations, each once.
+
+    Without the recorded ones whose images this version has calibrated again, and without copies: a
+    state folder has a calibration once more for each activation.
+    """
+    again = {_images(row) for row in rows if row.kind == COMPUTED}
+    found: dict[object, Row] = {}
+    for row in rows:
+        if row.kind == COMPUTED or _images(row) not in again:
+            found.setdefault((_images(row), row.kind, tuple(row.values)), row)
+    return list(found.values())
+
+
+def _images(row: Row) -> tuple[int, int]:
+    return row.first_ns, row.last_ns

@@ -1,0 +1,354 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The page of a trend, ``trend.html``: one file that needs no network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+import math
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ground.mission.trend.overview import Overview, overview_of, swapped_with
+from starcal_ground.mission.trend.rows import Row
+from starcal_ground.mission.trend.series import (
+    activations,
+    Active,
+    Change,
+    changes,
+    findings,
+    groups,
+    MAX_P_VALUE,
+    newest_of_each,
+    SECONDS_PER_YEAR,
+    Series,
+    series_of,
+    Term,
+    versions,
+)
+from starcal_ground.report.page import page_template
+from starcal_ground.report.plots import plot
+from starcal_ground.report.svg import (
+    Chart,
+    Curve,
+    Drawing,
+    in_digits,
+    MUTED,
+    Panel,
+    round_step,
+    SERIES,
+)
+from starcal_ros.arrays import Floats
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.text import printable
+
+TREND_FILE = 'trend.html'
+_LISTED = 200
+_DRAWN = 10  # cameras with figures, 0.1 MB each, those that need attention first
+_POINTS = 400  # calibrations in a figure; of more, each second one and so on: 200 bytes a point
+_RECALIBRATE_PX = 0.1  # change from which a new calibration is worth its upload, on the figure
+_HEIGHT = 270.0
+_MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
+_TICKS = 6
+_DIGITS = 1e4  # a number with more of them than a label holds is drawn as a difference
+_STEPS_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240)
+_PER = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}
+_LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axis
+
+
+@dataclass(frozen=True)
+class Page:
+    """Path of a page, calibrations on it and their span; failures, and of the first their rows."""
+
+    path: Path
+    calibrations: int
+    years: float
+    failed: int
+    failures: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A camera with its overview, and its calibrations and series for the figures."""
+
+    overview: Overview
+    group: Sequence[Row]
+    shown: Sequence[Series]
+    line: tuple[object, ...]
+
+
+def write_page(
+    cameras: Iterable[Sequence[Row]], camera_count: int, folder: Path, root: str
+) -> Page:
+    """
+    Write ``trend.html`` from the rows of one camera after the other.
+
+    p-values are corrected for the number of cameras.  Raises ProductError when the page cannot be
+    written.
+    """
+    max_p_value = MAX_P_VALUE / max(camera_count, 1)
+    failures: list[Row] = []
+    drawn: list[_Judged] = []
+    lines: list[tuple[Overview, tuple[object, ...]]] = []
+    failed = count = 0
+    times: list[int] = []
+    for rows in cameras:
+        bad = [row for row in rows if row.error]
+        failures += bad[: _LISTED - len(failures)]
+        failed, count = failed + len(bad), count + len(rows) - len(bad)
+        for name, group in groups(rows).items():
+            one = _judged(name, group, max_p_value)
+            lines.append((one.overview, one.line))
+            times += [group[0].time_ns, group[-1].time_ns]
+            drawn = sorted([*drawn, one], key=_order)[:_DRAWN]
+    lines.sort(key=lambda line: not line[0].needs_attention)
+    overviews = [overview for overview, _ in lines]
+    swaps = {one.name: swapped_with(one, overviews) for one in overviews}
+    text = page_template('trend.html').render(
+        root=printable(root),
+        lines=[(o, swaps[o.name], *line) for o, line in lines] if len(lines) > 1 else (),
+        attention=sum(one.needs_attention for one in overviews),
+        cameras=[_camera(one, swaps[one.overview.name]) for one in drawn],
+        failures=[(row.path, row.error) for row in failures],
+        failure_count=failed,
+        count=count,
+        max_p_value=f'{max_p_value:.2g}',
+    )
+    path = folder / TREND_FILE
+    write_atomically(path, text)
+    span_ns = max(times) - min(times) if times else 0
+    years = span_ns / NANOSECONDS_PER_SECOND / SECONDS_PER_YEAR
+    return Page(path, count, years, failed, tuple(failures))
+
+
+def _order(one: _Judged) -> tuple[bool, int, str]:
+    """Sort key of the cameras with figures."""
+    return not one.overview.needs_attention, -len(one.group), one.overview.name
+
+
+@np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
+def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
+    rows = newest_of_each(group)
+    active = activations(group)
+    shown = series_of(rows, max_p_value)
+    new = changes(group, active[-1:])
+    is_stable, verdict = verdict_of(group, active, new, shown)
+    px = new[-1].line_of_sight_px if new else math.nan
+    line = (len(rows), utc_text(rows[-1].time_ns)[:10], px, verdict[1])
+    return _Judged(overview_of(name, rows, shown, is_stable), group, shown, line)
+
+
+@np.errstate(all='ignore')
+def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
+    """The part of the page on one camera."""
+    group, shown = judged.group, judged.shown
+    rows = newest_of_each(group)
+    active = activations(group)
+    new = changes(group, active)
+    charts = [_change_chart(group, new)] if new else []
+    charts += [_chart(one, rows) for one in shown]
+    is_stable, verdict = verdict_of(group, active, new, shown)
+    return {
+        'name': judged.overview.name,
+        'is_stable': is_stable,
+        'verdict': (
+            *verdict,
+            f'Since its step it has the parameters of {swapped}.' * bool(swapped),
+        ),
+        'rows': rows,
+        'findings': [_finding(one, term, rows) for one, term in findings(shown)],
+        'charts': charts,
+        'active': [_active(one, group, new) for one in active],
+        'versions': [
+            (
+                utc_text(group[v.against].time_ns)[:10],
+                group[v.against].software,
+                group[v.row].software,
+                f'{v.line_of_sight_px:.3f}',
+            )
+            for v in versions(group)
+        ],
+        'assumed': any(one.assumed for one in active),
+    }
+
+
+def verdict_of(
+    rows: Sequence[Row], active: Sequence[Active], new: Sequence[Change], shown: Sequence[Series]
+) -> tuple[bool, tuple[str, str]]:
+    """True while the active calibration holds, with sentences on that and on the changes."""
+    words = {'step': 'steps of', 'drift': 'drifts of', 'temperature': 'effects of temperature on'}
+    found = []
+    for kind, word in words.items():
+        names = list(dict.fromkeys(one.name for one, t in findings(shown) if t.kind == kind))
+        found += [f'{word} {", ".join(names)}'] if names else []
+    text = f'Found: {"; ".join(found)}.' if found else 'No step or drift was found.'
+    later = [change for change in new if active and change.against == active[-1].row]
+    if not later:
+        return True, ('The active calibration is the newest one.' if active else '', text)
+    px = max(later, key=lambda change: rows[change.row].time_ns).line_of_sight_px
+    if px <= _RECALIBRATE_PX:
+        judged = f'within {_RECALIBRATE_PX:g} px: the active one holds'
+    else:
+        judged = f'not within {_RECALIBRATE_PX:g} px: consider activating it'
+    newest = f'The newest calibration changes lines of sight by up to {px:.2g} px, {judged}.'
+    return px <= _RECALIBRATE_PX, (newest, text)
+
+
+def _finding(series: Series, term: Term, rows: Sequence[Row]) -> dict[str, str]:
+    """A row of the table of findings."""
+    unit = series.unit and f' {series.unit}'
+    when = 'throughout'
+    if term.kind == 'step':
+        last, first = (rows[series.row[k]].time_ns for k in (term.after, term.after + 1))
+        when = f'between {utc_text(last)[:10]} and {utc_text(first)[:10]}'
+    sign = '\N{MINUS SIGN}' if term.size < 0 else '+'
+    size = f'{sign}{abs(term.size):.3g} ± {term.sigma:.2g}{unit}{_PER[term.kind]}'
+    p_value = f'{term.p_value:.1e}' if term.p_value > 1e-12 else 'below 1e-12'
+    return {
+        'series': series.name,
+        'kind': term.kind,
+        'size': size,
+        'p_value': p_value,
+        'when': when,
+    }
+
+
+def _active(one: Active, rows: Sequence[Row], new: Sequence[Change]) -> tuple[str, str, str, str]:
+    """Times of a calibration, its name, and the largest change that was missed meanwhile."""
+    row = rows[one.row]
+    missed = [c.line_of_sight_px for c in new if c.against == one.row]
+    until = utc_text(one.until_ns)[:16] if one.until_ns else 'now'
+    name = f'{row.number}' if row.number else Path(row.path).parent.name
+    worst = f'{max(missed):.3f}' if missed else 'none made'
+    return utc_text(one.since_ns)[:16], until, name, worst
+
+
+def _chart(series: Series, rows: Sequence[Row]) -> Chart:
+    words = ', '.join(_words(term, series) for term in series.trend.terms) or 'no change found'
+    scatter = series.trend.scatter
+    about = '' if math.isnan(scatter) else f' Scatter about the fit: {scatter:.2f} of the sigmas.'
+    every = _every(series.row)
+    about += f' One in {every} calibrations is drawn.' if every > 1 else ''
+    text = f'{words[0].upper()}{words[1:]}.{about}'
+    return Chart(series.name, series_figure(series, rows), text)
+
+
+def _every(numbers: Sequence[object]) -> int:
+    """Distance of those that are drawn; 1 for up to 400."""
+    return -(-len(numbers) // _POINTS)
+
+
+def _words(term: Term, series: Series) -> str:
+    unit = series.unit and f' {series.unit}'
+    size = f'{term.size:.3g}'.replace('-', '\N{MINUS SIGN}')
+    return f'{term.kind} of {size}{unit}{_PER[term.kind]}'
+
+
+def _change_chart(rows: Sequence[Row], new: Sequence[Change]) -> Chart:
+    worst = max(change.line_of_sight_px for change in new)
+    over = sum(change.line_of_sight_px > _RECALIBRATE_PX for change in new)
+    text = (
+        f'Largest change of a line of sight that each calibration would have made: up to '
+        f'{worst:.3g} px, {over} of {len(new)} over {_RECALIBRATE_PX:g} px (dashed).'
+    )
+    return Chart('Change by a recalibration', change_figure(new, rows), text)
+
+
+def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:
+    """A number of calibrations over time with 1-sigma, its fit, and a line at each step."""
+    at = _times([rows[index] for index in series.row])
+    low, high = (series.value - series.sigma).min(), (series.value + series.sigma).max()
+    # A sigma below the last digit of its value leaves no range.
+    room = max(high - low, 1e-12 * max(abs(low), abs(high)))
+    offset = _offset(float(low - room), float(high + room))
+    sign = '\N{MINUS SIGN}' if offset > 0 else '+'
+    name = f'{series.name} {sign} {in_digits(abs(offset))}' if offset else series.name
+    drawn = slice(None, None, _every(series.row))
+    value, sigma = series.value[drawn], series.sigma[drawn]
+    titles = [
+        f'{utc_text(rows[index].time_ns)[:10]}: {v:.9g} ± {s:.2g} {series.unit}'
+        for index, v, s in zip(series.row[drawn], value, sigma, strict=True)
+    ]
+    curves = [
+        Curve(at[drawn], value - offset, SERIES[0], 'calibration, 1-sigma', 'circle', width=0,
+              sigma=sigma, titles=titles)
+    ]  # fmt: skip
+    steps = sorted(term.after for term in series.trend.terms if term.kind == 'step')
+    if series.trend.terms:
+        fit, gaps = series.trend.fit - offset, [step + 1 for step in steps]
+        curves.append(
+            Curve(np.insert(at, gaps, np.nan), np.insert(fit, gaps, np.nan), SERIES[1], 'fit')
+        )
+
+    def lines_at_steps(panel: Panel) -> None:
+        for step in steps:
+            panel.upright(at[step : step + 2].mean(), MUTED, 1.0, '5 3')
+
+    return _over_dates(
+        at, curves, f'{name} ({series.unit})' if series.unit else name, '', lines_at_steps
+    )
+
+
+def change_figure(new: Sequence[Change], rows: Sequence[Row]) -> Drawing:
+    """Largest change that each calibration would have made, px, over time; logarithmic."""
+    at = _times([rows[change.row] for change in new])
+    curves = [
+        Curve(at, np.maximum(sizes, _LEAST_PX), colour, name, mark, width=0.9)
+        for name, mark, colour, sizes in zip(
+            ('line of sight', 'common rotation removed'),
+            ('circle', 'square'),
+            SERIES[:2],
+            ([change.line_of_sight_px for change in new], [change.shape_px for change in new]),
+            strict=True,
+        )
+    ]
+    curves.append(Curve(_date_ends(at), [_RECALIBRATE_PX, _RECALIBRATE_PX], MUTED, dash='5 3'))
+    return _over_dates(at, curves, 'change against the active one (px)', 'y')
+
+
+def _over_dates(
+    at: Floats,
+    curves: Sequence[Curve],
+    y_label: str,
+    log: str = '',
+    under: Callable[[Panel], None] | None = None,
+) -> Drawing:
+    ends = _date_ends(at)
+    return plot(curves, 'date', y_label, x=ends, x_ticks=_date_ticks(*ends), log=log, under=under,
+                height=_HEIGHT)  # fmt: skip
+
+
+def _times(rows: Sequence[Row]) -> Floats:
+    """Middle times (n,), seconds since 1970."""
+    return np.array([row.time_ns for row in rows], np.float64) / NANOSECONDS_PER_SECOND
+
+
+def _date_ends(at: Floats) -> tuple[float, float]:
+    margin = _MARGIN_NS / NANOSECONDS_PER_SECOND
+    return float(at.min()) - margin, float(at.max()) + margin
+
+
+def _offset(low: float, high: float) -> float:
+    """Round number to draw values from ``low`` to ``high`` as differences to; 0: not needed."""
+    step = round_step((high - low) / _TICKS)
+    if max(abs(low), abs(high)) < _DIGITS * step:
+        return 0.0
+    coarse = round_step(50 * step)
+    return round(0.5 * (low + high) / coarse) * coarse
+
+
+def _date_ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Places, seconds since 1970, of the first days of months or years, and their names."""
+    first = datetime.fromtimestamp(low, timezone.utc)
+    last = datetime.fromtimestamp(high, timezone.utc)
+    begin, end = (12 * date.year + date.month - 1 for date in (first, last))
+    every = next((n for n in _STEPS_MONTHS if end - begin <= _TICKS * n), _STEPS_MONTHS[-1])
+    ticks = []
+    for month in range(-(-(begin + 1) // every) * every, end + 1, every):
+        year, of_year = divmod(month, 12)
+        date = datetime(year, of_year + 1, 1, tzinfo=timezone.utc)
+        ticks.append((date.timestamp(), f'{year}' if every >= 12 else f'{year}-{of_year + 1:02d}'))
+    return ticks

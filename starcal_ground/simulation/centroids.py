@@ -1,0 +1,191 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Simulated centroids without pixels, and Cramer-Rao bounds.
+
+`true_observations` gives noisy centroids, each with its Cramer-Rao bound (`centroid_bound`);
+`cramer_rao_covariance` is the bound of the camera parameters estimated from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ground.simulation.rendering import pixel_stamps
+from starcal_ground.simulation.scenario import (
+    attitude_samples,
+    CENTROID_STREAM,
+    Detector,
+    random_stream,
+    Scenario,
+    Scene,
+    scenes,
+)
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel, project_jacobians
+from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
+from starcal_ros.sky.attitude import rate_between
+
+BOUND_SNR = 5.0
+
+
+def bound_names(camera: CameraModel) -> tuple[str, ...]:
+    """Names of all parameters but the principal point, which trades with the attitude."""
+    return tuple(name for name in camera.parameter_names if name not in ('cx', 'cy'))
+
+
+def true_observations(
+    scenario: Scenario,
+    centroid_sigma_px: float | None = None,
+    centroid_noise: bool = True,
+    attitude_noise: bool = True,
+) -> Ensemble:
+    """
+    Observations of all stars on the detector above `BOUND_SNR`.
+
+    Parameters
+    ----------
+    centroid_sigma_px : float, optional
+        1-sigma error per axis of every star; default: its Cramer-Rao bound.
+    centroid_noise, attitude_noise : bool
+        False: no errors are added; the covariances stay the same.
+    """
+    images = []
+    for index, shown in enumerate(scenes(scenario, attitude_noise)):
+        covariance, snr, keep = scene_bound(scenario, shown)
+        if centroid_sigma_px is not None:
+            covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
+        # Drawn before the selection, so that the error of a star does not depend on other stars.
+        rng = random_stream(scenario.seed, CENTROID_STREAM, index)
+        error = rng.normal(size=shown.pixel_px.shape) * centroid_noise
+        root = np.linalg.cholesky(covariance)
+        measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
+        # All samples about an image have one error.
+        _, before, after, _ = attitude_samples(scenario, index)
+        observed = observations(scenario, shown, measured, covariance, snr)
+        rate_rad_s = rate_between(before, after)
+        images.append(
+            dataclasses.replace(observed.select(keep), star_tracker_rate_rad_s=rate_rad_s)
+        )
+    return Ensemble(tuple(images))
+
+
+def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
+    camera = scenario.truth.camera
+    covariance, snr = centroid_bound(
+        shown.pixel_px, shown.flux_electrons, scenario.detector, (camera.height, camera.width)
+    )
+    inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
+    return covariance, snr, inside.all(axis=1) & (snr > BOUND_SNR)
+
+
+def observations(
+    scenario: Scenario, shown: Scene, measured_px: Floats, covariance: Floats, snr: Floats
+) -> StarObservations:
+    """Observations of all stars of a scene by their centroids (n, 2) and covariances (n, 2, 2)."""
+    camera, detector = scenario.truth.camera, scenario.detector
+    signal_dn = detector.background_electrons / detector.electrons_per_dn
+    return StarObservations.of_image(
+        shown.time_ns,
+        (camera.width, camera.height),
+        icrf_from_star_tracker_xyzw=shown.icrf_from_star_tracker_xyzw,
+        attitude_gap_s=0.5,
+        catalog_id=shown.catalog_id,
+        direction_icrf=shown.direction_icrf,
+        magnitude=shown.magnitude.astype(np.float32),
+        measured_px=measured_px,
+        covariance_px2=covariance[:, [0, 0, 1], [0, 1, 1]],
+        flux_dn=(shown.flux_electrons / detector.electrons_per_dn).astype(np.float32),
+        snr=snr.astype(np.float32),
+        background_dn=detector.offset_dn + signal_dn,
+        noise_dn=detector.noise_electrons / detector.electrons_per_dn,
+        psf_sigma_px=detector.psf_sigma_px,
+        catalog_digest=shown.catalog_digest,
+        velocity_sigma_m_s=GIVEN_SIGMA_M_S,
+    )
+
+
+def centroid_bound(
+    pixels_px: Floats, flux_electrons: Floats, detector: Detector, shape: tuple[int, int]
+) -> tuple[Floats, Floats]:
+    """
+    Cramer-Rao bound of the centroids of single stars, flux free and background fixed.
+
+    Saturated pixels and pixels outside the detector carry no information.
+
+    Returns
+    -------
+    covariance_px2 : (n, 2, 2)
+        Over a thousand px^2 for a star without a usable pixel.
+    snr : (n,)
+        Flux divided by its bound.
+    """
+    height, width = shape
+    sigma_px = detector.psf_sigma_at(pixels_px, shape)
+    u, share_u, slope_u = pixel_stamps(pixels_px[:, 0], sigma_px)
+    v, share_v, slope_v = pixel_stamps(pixels_px[:, 1], sigma_px)
+    flux = np.asarray(flux_electrons, np.float64)[:, None, None]
+    shape_of_star = share_v[:, :, None] * share_u[:, None, :]
+    gradients = np.stack(
+        [
+            flux * share_v[:, :, None] * slope_u[:, None, :],
+            flux * slope_v[:, :, None] * share_u[:, None, :],
+            flux * shape_of_star,  # by log flux, which keeps the matrix well scaled
+        ],
+        axis=1,
+    )
+    mean = flux * shape_of_star
+    full_electrons = (detector.full_dn - detector.offset_dn) * detector.electrons_per_dn
+    usable = (mean + detector.background_electrons < full_electrons) & (
+        ((v >= 0) & (v < height))[:, :, None] & ((u >= 0) & (u < width))[:, None, :]
+    )
+    weight = usable / (mean + detector.noise_electrons**2)
+    information = np.einsum('niyx,nyx,njyx->nij', gradients, weight, gradients)
+    # The last term keeps stars without any information invertible.
+    covariance = np.linalg.inv(information + 1e-6 * np.eye(3))
+    return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
+
+
+def cramer_rao_covariance(scenario: Scenario) -> Floats:
+    """
+    Cramer-Rao bound of the covariance of the camera parameters named by `bound_names`.
+
+    Every star above `BOUND_SNR` counts, with its own bound; the attitude of each image is free
+    and the parameters not named are held.
+    """
+    camera = scenario.truth.camera
+    columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
+    information = np.zeros((len(columns), len(columns)))
+    for shown in scenes(scenario):
+        covariance, _, keep = scene_bound(scenario, shown)
+        in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
+        information += camera_information(camera, in_camera, covariance[keep], columns)
+    return scaled_inverse(information)
+
+
+def camera_information(
+    camera: CameraModel, in_camera: Floats, covariance_px2: Floats, columns: Sequence[int]
+) -> Floats:
+    """
+    Information (k, k) of an image on the camera parameters of some columns, its rotation free.
+
+    ``in_camera`` (n, 3) and ``covariance_px2`` (n, 2, 2) are those of its stars.
+    """
+    _, J_parameters, G = project_jacobians(camera, in_camera)
+    W, J = np.linalg.inv(covariance_px2), J_parameters[..., columns]
+    N_cc = np.einsum('nia,nij,njb->ab', J, W, J, optimize=True)
+    N_ca = np.einsum('nia,nij,njb->ab', J, W, G, optimize=True)
+    N_aa = np.einsum('nia,nij,njb->ab', G, W, G, optimize=True)
+    return np.asarray(N_cc - N_ca @ np.linalg.solve(N_aa, N_ca.T))
+
+
+def scaled_inverse(information: Floats) -> Floats:
+    """Inverse of an information matrix whose parameters have different units."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    scaled = np.linalg.inv(information * np.outer(scale, scale))
+    return np.asarray(scaled * np.outer(scale, scale))

@@ -1,0 +1,137 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""`starcal calibrate` where it fails, where little is given, and on parts of a bag."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+
+import pytest
+import yaml
+
+from starcal_ground.cli import main
+from starcal_ros.formats.products.product_folder import NOT_CALIBRATED_FILE
+
+TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+
+
+def params_with(folder: Path, **changes: Any) -> str:
+    """A parameter file of the tiny bag; None removes a parameter."""
+    content = yaml.safe_load((TINY / 'params.yaml').read_text())
+    values = content['/**']['ros__parameters']
+    values['camera_info_url'] = str(TINY / 'camera.yaml')
+    for name, value in changes.items():
+        values[name] = value
+        if value is None:
+            del values[name]
+    path = folder / 'params.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+@pytest.mark.slow
+def test_a_failure_replaces_an_older_calibration(
+    tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'out'
+    shutil.copytree(tiny_products, out)
+    assert 'Accepted' in (out / 'report.html').read_text()
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
+    assert 'Set attitude_direction: st_to_inertial.' in capsys.readouterr().err
+    record = json.loads((out / NOT_CALIBRATED_FILE).read_text())
+    assert (record['calibrated'], record['cause']) == (False, 'attitude_direction')
+    assert record['images_refused'] == {'no_match': 10}
+    assert record['mend'] == ['attitude_direction: st_to_inertial']
+    for name in ('calibration.json', 'camera_info.yaml', 'residuals.npz'):
+        assert not (out / name).exists()
+    for _ in range(2):  # as calibrate left it, and as report makes it again
+        page = (out / 'report.html').read_text()
+        assert 'Not calibrated' in page and 'Accepted' not in page
+        assert page.count('<figure><img src="data:image/png;base64,') == 3
+        assert 'attitude_direction: st_to_inertial' in page
+        assert main.main(['report', str(out)]) == 0
+    again = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
+    assert main.main(again) == 0
+    assert not (out / NOT_CALIBRATED_FILE).exists()
+    assert 'Accepted' in (out / 'report.html').read_text()
+
+
+def broken(*_: object) -> None:
+    raise TypeError('another version')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('place', 'missing'),
+    [
+        ('starcal_ground.report.page._context', 'report'),
+        ('starcal_ground.report.page.page_template', 'report'),
+        ('starcal_ground.report.thumbnails.annotate_reduced', 'pictures of images'),
+        ('starcal_ground.report.thumbnails._cut_out', 'pictures of images'),
+    ],
+)
+def test_a_drawing_that_fails_costs_the_drawing_only(
+    tmp_path: Path, capsys, monkeypatch, place: str, missing: str
+) -> None:
+    out = tmp_path / 'out'
+    monkeypatch.setattr(place, broken)
+    calibrate = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
+    assert main.main(calibrate) == 0
+    said = capsys.readouterr()
+    assert 'verdict         accepted' in said.out
+    assert f'warning: no {missing}, ' in said.err and 'TypeError: another version' in said.err
+    assert said.err.count('\n') == 1
+    assert (out / 'report.html').exists() == (missing != 'report')
+    assert json.loads((out / 'calibration.json').read_text())['accepted']
+
+
+@pytest.mark.slow
+def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr('starcal_ground.report.page.write_failure_page', broken)
+    monkeypatch.setattr('starcal_ground.report.thumbnails._expected_picture', broken)
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    out = tmp_path / 'out'
+    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
+    words = capsys.readouterr().err.splitlines()
+    assert len(words) == 3 and 'no pictures of images' in words[0] and 'no report' in words[1]
+    assert 'Set attitude_direction: st_to_inertial.' in words[2]
+    assert (out / NOT_CALIBRATED_FILE).exists() and not (out / 'report.html').exists()
+
+
+@pytest.mark.slow
+def test_alignment_and_tracker_sigma_are_found_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None)
+    out = tmp_path / 'out'
+    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 0
+    said = capsys.readouterr()
+    assert 'prior_alignment is not given: found [' in said.err
+    assert 'from the scatter: star_tracker_sigma_arcsec is not given' in said.out
+    made = json.loads((out / 'calibration.json').read_text())
+    sigma = made['star_tracker_sigma_arcsec']
+    # Ten images give a sigma to 24 %; truth is 10, 10 and 40 arcsec about axes that stars show to
+    # some arcseconds.
+    assert 4 < sigma[0] < 25 and 4 < sigma[1] < 25 and 15 < sigma[2] < 80
+    camera = yaml.safe_load((out / 'camera_info.yaml').read_text())
+    assert (
+        camera['camera_name'] == yaml.safe_load((TINY / 'camera.yaml').read_text())['camera_name']
+    )
+    assert camera['camera_name'] != 'camera'
+
+
+@pytest.mark.slow
+def test_a_part_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / 'out'
+    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
+    main.main([*command, '--to', '+20'])  # six may be too few for the gate
+    assert 'images          6 used' in capsys.readouterr().out
+
+
+def test_a_wrong_option_names_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.main(['calibrate', str(TINY), '--params', 'x', '-o', 'y', '--frm', '3'])
+    assert 'did you mean --from?' in capsys.readouterr().err

@@ -1,0 +1,58 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""`starcal diagnose`, and what `calibrate` and `inspect` say where no image matches."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from starcal_ground.cli import main
+from starcal_ros.pipeline.diagnosis.diagnose import CAUSES
+
+TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+
+
+@pytest.fixture
+def wrong_params(tmp_path: Path) -> Path:
+    """The parameters of the tiny bag with the conjugate of the attitudes asked for."""
+    content = yaml.safe_load((TINY / 'params.yaml').read_text())
+    values = content['/**']['ros__parameters']
+    values['camera_info_url'] = str(TINY / 'camera.yaml')
+    values['attitude_direction'] = 'inertial_to_st'
+    path = tmp_path / 'params.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    status = main.main(['diagnose', str(TINY), '--params', str(TINY / 'params.yaml'), '--json'])
+    found = json.loads(capsys.readouterr().out)
+    assert (status, found['cause'], found['found'], found['mend']) == (0, 'none', None, [])
+    assert found['cause'] in CAUSES and len(found['evidence']) == 3
+
+
+def test_the_cause_and_its_remedy(wrong_params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status = main.main(['diagnose', str(TINY), '--params', str(wrong_params)])
+    lines = capsys.readouterr().out.splitlines()
+    assert status == 3
+    assert lines[0] == (
+        'The attitude quaternions are st_to_inertial (x, y, z, w), not inertial_to_st.'
+    )
+    assert lines[-1].strip() == 'attitude_direction: st_to_inertial'
+
+
+@pytest.mark.slow
+def test_calibrate_and_inspect_end_with_it(
+    wrong_params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = ['--params', str(wrong_params)]
+    assert main.main(['calibrate', str(TINY), *params, '-o', str(tmp_path / 'out')]) == 2
+    error = capsys.readouterr().err
+    assert 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)' in error
+    assert error.count('\n') == 1
+    assert main.main(['inspect', str(TINY), *params, '--json']) == 3
+    problems = json.loads(capsys.readouterr().out)['problems']
+    assert 'Set attitude_direction: st_to_inertial.' in problems[-1]

@@ -1,0 +1,70 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The commands for missions, as a person types them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+import pytest
+import spiceypy
+
+from starcal_ground.cli.main import main
+from starcal_ros.formats.products.calibration_json import write_calibration
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / 'out').mkdir()
+    write_calibration(calibration(), tmp_path / 'out/calibration.json')
+    return tmp_path / 'out'
+
+
+def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, capsys) -> None:
+    kernels = tmp_path / 'deep/kernels'
+    line = (
+        f'export {folder} --to spice -o {kernels} --spacecraft-id -999 --star-tracker-id -999100'
+    )
+    assert main(line.split()) == 0
+    assert 'largest error of a pixel against the calibration: 0 px' in capsys.readouterr().out
+    spiceypy.kclear()
+    for path in kernels.iterdir():
+        spiceypy.furnsh(str(path))
+    assert spiceypy.pxform('CAMERA_OPTICAL_FRAME', 'STAR_TRACKER', 0.0).shape == (3, 3)
+    spiceypy.kclear()
+
+
+def test_export_states_the_cost_of_each_part(folder: Path, tmp_path: Path, capsys) -> None:
+    assert main(f'export {folder} --to kalibr -o {tmp_path}'.split()) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')
+
+
+@pytest.mark.parametrize(
+    ('line', 'words'),
+    [
+        ('--to spice', '--spacecraft-id'),
+        ('--to matlab', "'matlab' is not one of spice, ck, isd, opencv"),
+        ('--to spice --spacecraft-id 5', 'not a negative NAIF ID'),
+    ],
+)
+def test_export_refuses_in_one_line(folder, tmp_path, capsys, line: str, words: str) -> None:
+    assert main(f'export {folder} -o {tmp_path} {line}'.split()) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('accepted', [True, False])
+def test_export_warns_of_a_refused_calibration(folder, tmp_path, capsys, accepted: bool) -> None:
+    reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
+    judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
+    write_calibration(judged, folder / 'calibration.json')
+    assert main(f'export {folder} --to csv -o {tmp_path}'.split()) == 0
+    expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
+    assert capsys.readouterr().err.splitlines() == expected
+
+
+def test_export_needs_a_calibration(tmp_path: Path, capsys) -> None:
+    assert main(f'export {tmp_path} --to csv -o {tmp_path}'.split()) == 2
+    assert 'holds no calibration.json' in capsys.readouterr().err

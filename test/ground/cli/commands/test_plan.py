@@ -1,0 +1,59 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""`starcal plan`: table, CSV, JSON, and bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from starcal_ground.cli.main import main
+
+TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+_PARAMS = ['--params', str(TINY / 'params.yaml')]
+_BAG = [str(TINY), *_PARAMS]
+
+
+@pytest.fixture
+def allowed(tmp_path: Path) -> Path:
+    path = tmp_path / 'allowed.csv'
+    path.write_text('ra_deg,dec_deg\n10,40\n100,-20\n200,50\n')
+    return path
+
+
+def test_the_table_and_the_file_say_the_same(
+    allowed: Path, tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / 'plan.csv'
+    observed = [str(tiny_products / 'observations.mcap'), *_PARAMS]
+    given = ['--pointings', str(allowed), '--images', '5', '--minimise', 'map']
+    assert main(['plan', *observed, *given, '-o', str(output)]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    with output.open() as file:
+        rows = list(csv.DictReader(file))
+    assert sorted(float(row['ra_deg']) for row in rows) == [10.0, 100.0, 200.0]
+    for line, row in zip(shown[2:], rows, strict=False):
+        assert float(line.split()[-1]) == pytest.approx(float(row['map_arcsec']), rel=1e-3)
+    assert 'no other pointing can be reached after image 3' in shown
+    assert main(['plan', *observed, *given[:2], '--images', '1', '--json']) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content['name'] == 'line_of_sight_arcsec' and len(content['steps']) == 1
+
+
+@pytest.mark.parametrize(
+    ('text', 'why'),
+    [
+        ('ra,dec\n1,2\n', 'no column ra_deg and dec_deg'),
+        ('ra_deg,dec_deg\n1,north\n', "line 2: could not convert string to float: 'north'"),
+        ('ra_deg,dec_deg\n', 'no pointings'),
+        ('ra_deg,dec_deg\n1,95\n', 'not a direction'),
+    ],
+)
+def test_a_file_of_pointings_with_a_mistake(
+    text: str, why: str, allowed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    allowed.write_text(text)
+    assert main(['plan', *_BAG, '--pointings', str(allowed)]) == 2
+    assert why in capsys.readouterr().err

@@ -1,0 +1,262 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A mistake of the set-up is named with its remedy by `calibrate`, `inspect` and `diagnose`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from starcal_ground.cli import main
+from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, IMAGE_TYPE, make_header
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.records import Image
+
+pytestmark = pytest.mark.slow
+
+TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+IMAGES = 4
+
+Write = Callable[[BagWriter, Image], None]
+
+
+def _as(encoding: str, pixels: Callable[[Any], Any]) -> Write:
+    """Write an image in an encoding that is not read."""
+
+    def write(writer: BagWriter, image: Image) -> None:
+        height, width = image.pixels.shape
+        data = np.ascontiguousarray(pixels(image.pixels)).reshape(-1).view(np.uint8)
+        message = make_message(
+            IMAGE_TYPE,
+            header=make_header(image.time_ns, 'camera', make_message),
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=0,
+            step=len(data) // height,
+            data=data,
+        )
+        writer._write(IMAGE_TOPIC, IMAGE_TYPE, image.time_ns, message)
+
+    return write
+
+
+def _jpeg(writer: BagWriter, image: Image) -> None:
+    coded = cv2.imencode('.jpg', (image.pixels >> 4).astype(np.uint8))[1]
+    message = make_message(
+        COMPRESSED_TYPE,
+        header=make_header(image.time_ns, 'camera', make_message),
+        format='jpeg',
+        data=np.asarray(coded).ravel(),
+    )
+    writer._write(IMAGE_TOPIC, COMPRESSED_TYPE, image.time_ns, message)
+
+
+def _raw(writer: BagWriter, image: Image) -> None:
+    writer.write_image(IMAGE_TOPIC, image, 'camera')
+
+
+def _half_lost(writer: BagWriter, image: Image) -> None:
+    pixels = image.pixels.copy()
+    pixels[:200] = 0
+    writer.write_image(IMAGE_TOPIC, Image(image.time_ns, pixels), 'camera')
+
+
+def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None = None) -> Path:
+    """Write the tiny bag with images written in another way, and shifted attitudes; None: none."""
+    raws = list(reader.read_raw([TINY], [ATTITUDE_TOPIC])) if shift_s is not None else []
+    with BagWriter(path) as writer:
+        for raw in raws[:cut]:
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            time_ns += round((shift_s or 0.0) * 1e9)
+            writer.write_attitude(ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
+        images = reader.read_images([TINY], IMAGE_TOPIC)
+        for _, image in zip(range(IMAGES), images, strict=False):
+            assert isinstance(image, Image)
+            write(writer, image)
+    return path
+
+
+def params(folder: Path, camera: Path = TINY / 'camera.yaml', **changes: Any) -> Path:
+    """Write a parameter file of the tiny bag with changed values."""
+    content = yaml.safe_load((TINY / 'params.yaml').read_text())
+    content['/**']['ros__parameters'] |= {'camera_info_url': str(camera), **changes}
+    path = folder / 'params.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def rescaled_camera(folder: Path, scale: float) -> Path:
+    """Write the prior camera of the tiny bag with another focal length."""
+    content = yaml.safe_load((TINY / 'camera.yaml').read_text())
+    for k in (0, 4):
+        content['camera_matrix']['data'][k] *= scale
+    path = folder / 'camera.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def said(
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    path: Path,
+    parameters: Path,
+    commands: Sequence[str] = ('calibrate', 'diagnose', 'inspect'),
+) -> dict[str, str]:
+    """Return what each command says of a bag; checks that it is one line and no success."""
+    more = {'calibrate': ['-o', str(tmp_path / 'out'), '--no-report']}
+    found = {}
+    for command in commands:
+        given = [command, str(path), '--params', str(parameters)]
+        status = main.main([*given, *more.get(command, ['--json'])])
+        text = capsys.readouterr()
+        assert status in (2, 3) and 'Traceback' not in text.err
+        if status == 2:
+            found[command] = text.err
+            assert text.err.count('\n') == 1
+        elif command == 'diagnose':
+            content = json.loads(text.out)
+            found[command] = ' '.join([content['sentence'], *content['mend']])
+        else:
+            found[command] = ' '.join(json.loads(text.out)['problems'])
+    return found
+
+
+@pytest.mark.parametrize(
+    ('write', 'shift_s', 'words'),
+    [
+        (_as('rgb8', lambda p: np.repeat((p >> 4).astype(np.uint8)[..., None], 3, 2)), 0.0,
+         ['rgb8 is a colour image: set image_channel']),
+        (_as('32FC1', lambda p: p.astype(np.float32)), 0.0, ["'32FC1'", '8 or 16 bit']),
+        (_jpeg, 0.0, ['is a JPEG', 'raw or as PNG']),
+        (_raw, 18000.0, ['18000.0', 'stamp_offset_s: 18000.0']),
+        (_raw, -946727935.0, ['stamp_offset_s: -946727934', 'the date of the attitudes']),
+        (_half_lost, 0.0, ['incomplete', 'constant', 'max_lost_fraction']),
+    ],
+)  # fmt: skip
+def test_a_mistake_of_the_bag(
+    write: Write,
+    shift_s: float | None,
+    words: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = bag(tmp_path / 'bag.mcap', write, shift_s)
+    for text in said(capsys, tmp_path, path, params(tmp_path)).values():
+        for word in words:
+            assert word.lower() in text.lower(), text
+
+
+def test_clocks_that_cannot_be_matched_are_two_clocks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the attitudes of one image only no shift can be found."""
+    path = bag(tmp_path / 'bag.mcap', _raw, 7200.0, cut=4)
+    for text in said(capsys, tmp_path, path, params(tmp_path)).values():
+        assert 'two clocks' in text and '2026-05-15 09:19:59.250 UTC' in text
+        assert 'stamp_offset_s' in text
+
+
+@pytest.mark.parametrize(
+    ('scale', 'commands'), [(2.0, ('diagnose', 'inspect')), (0.5, ('calibrate',))]
+)
+def test_a_focal_length_of_other_pixels(
+    scale: float, commands: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The search takes each command 7 s: each meets one of the two mistakes."""
+    parameters = params(tmp_path, rescaled_camera(tmp_path, scale))
+    path = bag(tmp_path / 'bag.mcap', _raw)
+    for text in said(capsys, tmp_path, path, parameters, commands).values():
+        assert ('100 % too long' if scale > 1 else '50 % too short') in text
+        assert 'fx = fy = 180' in text
+
+
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'star_tracker_sigma_arcsec': [4.8e-5, 4.8e-5, 2e-4]}, ['radians', '[9.9, 9.9, 41.3]']),
+        ({'star_tracker_sigma_arcsec': [0.003, 0.003, 0.009]}, ['degrees', '[10.8, 10.8, 32.4]']),
+        ({'observer': 'ground'}, ['latitude_deg', 'longitude_deg']),
+        ({'magnitude_limit': 2.0}, ['magnitude_limit: 2 leaves', 'raise it']),
+    ],
+)
+def test_a_mistake_of_the_parameters(
+    changes: dict[str, Any],
+    words: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for text in said(capsys, tmp_path, TINY, params(tmp_path, **changes)).values():
+        for word in words:
+            assert word in text
+
+
+def test_inspect_names_the_remedy_without_parameters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bag(tmp_path / 'bag.mcap', _jpeg)
+    assert main.main(['inspect', str(path)]) == 3
+    assert 'is a JPEG' in capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.parametrize('start', ['2030-01-01T00:00:00', '+5000'])
+def test_no_image_is_chosen(
+    start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '--from', start]
+    assert main.main([*command, '-o', str(tmp_path / 'out')]) == 2
+    error = capsys.readouterr().err
+    assert '2026-05-15 07:20:00.000 UTC to 2026-05-15 07:20:36.000 UTC, +0 to +36 s' in error
+
+
+def test_a_folder_of_image_files_is_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / '001.fits').write_bytes(b'SIMPLE  =                    T')
+    for path in (tmp_path, tmp_path / '001.fits'):
+        assert main.main(['inspect', str(path), '--params', str(TINY / 'params.yaml')]) == 2
+        assert 'starcal import makes a bag of image files' in capsys.readouterr().err
+    # Calibrated without a bag, by the stars alone: a file that is none is named.
+    assert main.main(['calibrate', str(tmp_path), '-o', str(tmp_path / 'out')]) == 2
+    assert 'no image can be read; left out: 1 file (001.fits): not' in capsys.readouterr().err
+
+
+def test_a_bag_without_attitudes_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bag(tmp_path / 'bag.mcap', _raw, None)
+    for command in ('inspect', 'diagnose'):
+        main.main([command, str(path), '--params', str(params(tmp_path))])
+        text = ' '.join(capsys.readouterr())
+        assert 'attitudes of the star tracker' in text and 'starcal import' in text
+
+
+@pytest.mark.parametrize('top', [False, True])
+def test_parameters_outside_a_section(
+    top: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = {'camera_info_url': str(TINY / 'camera.yaml')}
+    path = tmp_path / 'params.yaml'
+    path.write_text(yaml.safe_dump({'ros__parameters': values} if top else values))
+    assert main.main(['inspect', str(TINY), '--params', str(path)]) == 2
+    wanted = 'write /**: above' if top else 'write /**: and ros__parameters: above'
+    assert wanted in capsys.readouterr().err
+
+
+def test_a_clock_error_that_shows_nothing_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ['simulate', '-o', str(tmp_path / 'bag'), '--scenario', 'tiny']
+    assert main.main([*command, '--clock-error', '-0.5']) == 2
+    assert '--clock-error: -0.5 s changes no result' in capsys.readouterr().err
+    assert not (tmp_path / 'bag').exists()

@@ -1,0 +1,697 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The tool from a user's side: exit status, one line for bad input, never a traceback."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+import importlib.util
+import json
+import os
+from pathlib import Path
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+from starcal_ground.cli import main
+from starcal_ground.cli.arguments import EXIT_INTERRUPTED, parser
+from starcal_ground.cli.commands import demo
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.processes import module_command
+from starcal_ros.records import Image
+
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
+
+Run = Callable[..., 'tuple[int, str, str]']
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the tool in this process; returns status, stdout and stderr."""
+
+    def tool(*arguments: object) -> tuple[int, str, str]:
+        try:
+            status = main.main([str(argument) for argument in arguments])
+        except SystemExit as error:  # argparse's way out
+            status = int(error.code or 0)
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return tool
+
+
+def assert_refused(result: tuple[int, str, str], *words: str) -> None:
+    """Status 2 and one line that has all the words."""
+    status, _, err = result
+    assert status == 2
+    assert err.count('\n') == 1 and err.endswith('\n'), err
+    assert err.startswith('starcal: ')
+    assert 'Traceback' not in err
+    for word in words:
+        assert word in err
+
+
+@pytest.fixture
+def params(tmp_path: Path) -> Callable[..., Path]:
+    """Write the tiny bag's parameter file with some values changed; None takes one out."""
+
+    def write(**changes: object) -> Path:
+        content = yaml.safe_load((TINY / 'params.yaml').read_text())
+        values = content['/**']['ros__parameters']
+        values['camera_info_url'] = str(TINY / 'camera.yaml')
+        values.update(changes)
+        content['/**']['ros__parameters'] = {k: v for k, v in values.items() if v is not None}
+        path = tmp_path / 'params.yaml'
+        path.write_text(yaml.safe_dump(content))
+        return path
+
+    return write
+
+
+def test_no_command_prints_the_help(run: Run) -> None:
+    status, out, err = run()
+    assert (status, err) == (0, '')
+    assert out == parser().format_help()
+
+
+def test_version(run: Run) -> None:
+    assert run('--version') == (0, f'starcal {software_version()}\n', '')
+
+
+def test_help_is_there_at_once() -> None:
+    start = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, '-X', 'importtime', '-m', 'starcal_ground.cli.main', '--help'],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert time.monotonic() - start < 10  # only so that a hang is noticed
+    for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
+        assert command in done.stdout
+    for heavy in ('numpy', 'scipy', 'cv2', 'contourpy', 'rclpy', 'rich', 'argcomplete'):
+        assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['fly'], ["'fly'"]),
+        (['calibrat'], ['did you mean calibrate?']),
+        (['calibrate', 'a.mcap', '--image-topick=/a'], ['--output']),
+        (['inspect', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
+        (['inspect', 'none.mcap'], ['none.mcap', 'no such bag']),
+        (['inspect', ''], ['empty path']),
+        (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
+        (['calibrate', str(TINY), '--params', str(TINY / 'camera.yaml'), '-o', 'x'], ['section']),
+        (
+            ['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'],
+            ['larger than'],
+        ),
+        (
+            ['calibrate', str(TINY.parent), '--params', str(TINY / 'params.yaml'), '-o', 'x'],
+            ['did you mean', str(TINY)],
+        ),
+        (['compare', 'none'], ['B']),
+        (['compare', 'none', 'none'], ['none', 'No such file']),
+        (['compare', str(TINY), str(TINY)], [str(TINY), 'no calibration.json']),
+        (['compare', *2 * [str(TINY / 'truth.json')]], ['truth.json', 'not a calibration']),
+        (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
+        (['import', '--channel', 'grene'], ['did you mean green?']),
+        (['calibrate'], ['BAG']),
+        (['calibrate', 'a.mcap'], ['--output']),
+        (['calibrate', str(TINY), '-o', 'x'], ['--params']),
+        (['calibrate', 'a.mcap', '--params', 'p.yaml'], ['--output']),
+        (['simulate', '-o', 'x'], ['--scenario']),
+        (['simulate', '-o', 'x', '--scenario', 'huge'], ["'huge'", 'tiny', 'small', 'paper']),
+        (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', '-1'], ['--seed', '-1']),
+        (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', 'one'], ['--seed', 'one']),
+        (['play'], ['BAG']),
+        (['play', 'none.mcap'], ['none.mcap', 'no such bag']),
+        (['play', str(TINY), '--rate', 'fast'], ['--rate', 'fast']),
+        (['calibrate', 'a', '-o', 'x', '--from', 'noon'], ['--from', 'is not a time: give 2026']),
+        (['play', str(TINY), '--rate', '-1'], ['--rate', '-1']),
+        (['play', str(TINY), '--rate', 'nan'], ['--rate', 'nan']),
+        (['play', str(TINY), '--remap', 'image'], ['--remap', "'image'"]),
+        (['monitor'], ['--once', 'not a terminal']),
+        (['monitor', '--once', 'nan'], ['--once', 'nan']),
+    ],
+)
+def test_bad_arguments(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert_refused(run(*arguments), *words)
+    assert not any(tmp_path.iterdir())
+
+
+def test_bags_that_are_none(run: Run, tmp_path: Path) -> None:
+    text, empty, cut = (tmp_path / name for name in ('text.mcap', 'empty.mcap', 'cut.mcap'))
+    text.write_text('not a bag, but long enough to be read as one' * 10)
+    empty.write_bytes(b'')
+    cut.write_bytes((TINY / 'tiny_0.mcap').read_bytes()[:300])
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    old = tmp_path / 'old'
+    old.mkdir()
+    (old / 'old.db3').write_bytes(b'SQLite format 3\0')
+    for bag, words in (
+        (tmp_path / 'none.mcap', ['no such bag']),
+        (text, ['not an MCAP bag']),
+        (empty, ['not an MCAP bag']),
+        (folder, ['no .mcap files']),
+        (old, ['SQLite']),
+        (TINY / 'params.yaml', ['not an MCAP bag']),
+    ):
+        result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+        assert_refused(result, str(bag), *words)
+    # Cut off before its first message: what is said of the damage comes on top.
+    status, _, err = run(
+        'calibrate', cut, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out'
+    )
+    assert status == 2 and 'cut.mcap' in err and 'Traceback' not in err
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    ('option', 'topic', 'words'),
+    [
+        ('--image-topic', '/camera/image', ['/camera/image', '/opnav/image_raw']),
+        ('--image-topic', '/star_tracker/attitude', ['/star_tracker/attitude', 'Image']),
+        ('--attitude-topic', '/attitude', ['/attitude', '/star_tracker/attitude']),
+        ('--observations-topic', '/observations', ['/observations', 'StarObservations']),
+    ],
+)
+def test_topics_that_are_not_there(
+    run: Run, tmp_path: Path, option: str, topic: str, words: list[str]
+) -> None:
+    arguments = ['calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
+    assert_refused(run(*arguments, option, topic), str(TINY), *words)
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'magnitude_limits': 7.0}, ['magnitude_limits', 'did you mean magnitude_limit?']),
+        ({'magnitude_limit': 'faint'}, ['magnitude_limit', "'faint'"]),
+        ({'magnitude_limit': float('nan')}, ['magnitude_limit', 'nan']),
+        ({'method': 'magic'}, ['method', "'magic'", 'hierarchical']),
+        ({'method': 'perimage'}, ['method', 'did you mean per_image?']),
+        ({'estimate': ['fx', 'f']}, ['estimate', "'f'"]),
+        ({'estimate': 'fx'}, ['estimate', 'list']),
+        ({'max_images': -1}, ['max_images', '-1']),
+        ({'max_images': 2.5}, ['max_images', '2.5']),
+        (
+            {'star_tracker_sigma_arcsec': [1.0, 2.0]},
+            ['star_tracker_sigma_arcsec', '2 numbers, not 3'],
+        ),
+        ({'prior_alignment': [0.0, 0.0, 0.0, 0.5]}, ['prior_alignment', 'unit']),
+        ({'attitude_direction': 'up'}, ['attitude_direction', "'up'", 'st_to_inertial']),
+        ({'camera_info_url': None}, ['camera_info_url']),
+        ({'camera_info_url': 'none.yaml'}, ['none.yaml', 'No such file']),
+        ({'camera_info_url': 'file:///none.yaml'}, ['/none.yaml', 'No such file']),
+        ({'camera_info_url': 'package://none/a.yaml'}, ['package none']),
+        ({'camera_info_url': 'http://host/a.yaml'}, ['http://host/a.yaml']),
+        ({'camera_info_url': str(TINY / 'params.yaml')}, ['params.yaml', 'image_width']),
+        ({'camera_info_url': str(TINY / 'tiny_0.mcap')}, ['tiny_0.mcap', 'larger than 256 kB']),
+        ({'catalog': 'none.npz'}, ['none.npz']),
+        ({'dark_frame': 'none.png'}, ['dark_frame', 'none.png']),
+    ],
+)
+def test_bad_parameters(
+    run: Run,
+    tmp_path: Path,
+    params: Callable[..., Path],
+    changes: dict[str, object],
+    words: list[str],
+) -> None:
+    result = run('calibrate', TINY, '--params', params(**changes), '-o', tmp_path / 'out')
+    assert_refused(result, *words)
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('', ['not a ROS parameter file']),
+        ('just words', ['not a ROS parameter file']),
+        ('a: [', ['not YAML']),
+        ('/**:\n  camera_info_url: a.yaml\n', ['ros__parameters']),
+        ('star_observer:\n  ros__parameters: 3\n', ['star_observer', 'ros__parameters']),
+        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
+        ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
+        ('/**:\n  ros__parameters: {min_images: 3}\n', ['camera_info_url', 'bad.yaml']),
+    ],
+)
+def test_bad_parameter_files(run: Run, tmp_path: Path, text: str, words: list[str]) -> None:
+    file = tmp_path / 'bad.yaml'
+    file.write_text(text)
+    assert_refused(run('calibrate', TINY, '--params', file, '-o', tmp_path / 'out'), *words)
+    for missing in (tmp_path / 'none.yaml', tmp_path):
+        result = run('calibrate', TINY, '--params', missing, '-o', tmp_path / 'out')
+        assert_refused(result, str(missing), 'cannot be read')
+
+
+@pytest.fixture(scope='module')
+def lookup_columns() -> list[str]:
+    """Columns of a table of lines of sight, as the interface document has them."""
+    text = (Path(__file__).parents[3] / 'docs' / 'icd.md').read_text()
+    (row,) = (line for line in text.splitlines() if line.startswith('| `starcal lookup '))
+    return re.findall(r'`(\w+)`', row.split('|', 2)[2])
+
+
+def test_lookup_writes_the_columns_of_the_interface_document(
+    run: Run, tmp_path: Path, tiny_products: Path, lookup_columns: list[str]
+) -> None:
+    file = tmp_path / 'table.csv'
+    status, out, err = run('lookup', tiny_products, '-o', file)
+    assert (status, err) == (0, '')
+    assert '625 lines of sight' in out and str(file) in out
+    table = np.genfromtxt(file, delimiter=',', names=True)
+    assert list(table.dtype.names or ()) == lookup_columns
+    assert len(table) == 25 * 25
+    # From corner to corner, u fastest.
+    assert (table['u_px'][0], table['v_px'][0]) == (0.0, 0.0)
+    assert (table['u_px'][24], table['v_px'][24]) == (639.0, 0.0)
+    assert (table['u_px'][-1], table['v_px'][-1]) == (639.0, 511.0)
+    status, _, err = run(
+        'lookup', tiny_products / 'calibration.json', '-o', tmp_path / 'table.npz', '--step', 100
+    )
+    assert (status, err) == (0, '')
+    with np.load(tmp_path / 'table.npz') as archive:
+        assert list(archive.files) == lookup_columns
+        assert sorted(set(archive['u_px'])) == [0, 100, 200, 300, 400, 500, 600]
+        assert sorted(set(archive['v_px'])) == [0, 100, 200, 300, 400, 500]
+
+
+@pytest.mark.parametrize(
+    ('file', 'options', 'words'),
+    [
+        ('a.csv', ('--points', '1'), ['--points', '1 is not within 2 to 2000']),
+        ('a.csv', ('--step', '0'), ['--step', '0 px']),
+        (
+            'a.csv',
+            ('--step', '1e-6'),
+            ['give 0.286 px (a table of 2000^2 pixels)'],
+        ),
+        ('a.csv', ('--step', '641'), ['--step', '641 px']),
+        ('a.txt', (), ['a.txt', '.csv', '.npz', '.fits']),
+        ('a', (), ['.csv', '.npz', '.fits']),
+        ('none/a.csv', (), ['none', 'cannot be written']),
+    ],
+)
+def test_bad_lookups(
+    run: Run,
+    tmp_path: Path,
+    tiny_products: Path,
+    file: str,
+    options: tuple[str, ...],
+    words: list[str],
+) -> None:
+    assert_refused(run('lookup', tiny_products, '-o', tmp_path / file, *options), *words)
+    assert not (tmp_path / file).exists()
+    assert_refused(run('lookup', tmp_path, '-o', tmp_path / 'a.csv'), 'no calibration.json')
+
+
+def test_outputs_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / 'file'
+    file.write_text('in the way')
+    assert_refused(run('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', file), str(file))
+    result = run('simulate', '--scenario', 'tiny', '-o', file / 'bag')
+    assert_refused(result, str(file))
+    assert file.read_text() == 'in the way'
+
+
+def write_bag_of(path: Path, pixels: np.ndarray, attitudes: bool = True, count: int = 4) -> None:
+    """Images all alike, with or without the attitudes about them."""
+    with BagWriter(path) as writer:
+        for k in range(count):
+            time_ns = 1_800_000_000_000_000_000 + k * 10**9
+            if attitudes:
+                writer.write_attitude('/att', time_ns, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+            writer.write_image('/image', Image(time_ns, pixels), 'camera')
+        if not attitudes:
+            writer.write_attitude('/att', 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+
+
+def test_bags_without_a_usable_image(run: Run, tmp_path: Path) -> None:
+    blank = np.full((512, 640), 33, np.uint16)
+    for pixels, attitudes, reason in (
+        (blank, False, 'no_attitude'),
+        (blank, True, 'blank'),
+        (blank[:100], True, 'wrong_size'),
+    ):
+        bag = tmp_path / f'{reason}.mcap'
+        write_bag_of(bag, pixels, attitudes)
+        result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+        assert_refused(result, reason)
+
+
+def test_images_of_a_wrong_encoding(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from starcal_ros.formats.messages.image_messages import image_to_message
+    from starcal_ros.formats.messages.message_fields import Make, Message
+
+    def colour(image: Image, frame_id: str, make: Make) -> Message:
+        message = image_to_message(image, frame_id, make)
+        message.encoding = 'bgr8'
+        return message
+
+    monkeypatch.setattr('starcal_ros.formats.bag.writer.image_to_message', colour)
+    bag = tmp_path / 'colour.mcap'
+    write_bag_of(bag, np.zeros((512, 640), np.uint8))
+    monkeypatch.undo()
+    result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    assert_refused(result, 'bad_encoding')
+
+
+def test_bag_with_attitudes_alone(run: Run, tmp_path: Path) -> None:
+    bag = tmp_path / 'attitudes.mcap'
+    with BagWriter(bag) as writer:
+        writer.write_attitude('/att', 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    assert_refused(result, str(bag), 'no topic of type sensor_msgs/msg/Image')
+
+
+def test_several_image_topics_must_be_named(run: Run, tmp_path: Path) -> None:
+    bag = tmp_path / 'two.mcap'
+    with BagWriter(bag) as writer:
+        for topic in ('/left', '/right'):
+            writer.write_image(topic, Image(5, np.zeros((512, 640), np.uint8)), 'camera')
+    result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    assert_refused(result, '/left, /right')
+
+
+def test_a_temperature_topic_must_be_there(
+    run: Run, tmp_path: Path, params: Callable[..., Path]
+) -> None:
+    files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    result = run('calibrate', TINY, *files, '--temperature-topic', '/box')
+    assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
+    two = tmp_path / 'two.mcap'
+    with BagWriter(two) as writer:
+        writer.write_image('/image', Image(5, np.zeros((512, 640), np.uint8)), 'camera')
+        writer.write_attitude('/att', 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+        for topic in ('/lens', '/box'):
+            writer.write_temperature(topic, 5, 20.0, 'camera')
+    # Two thermometers: which one, is asked only where it matters.
+    assert_refused(run('calibrate', two, *files), 'No image of 1 can be used', 'as blank')
+    asks = params(focal_temperature_order=1)
+    result = run('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
+    assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
+
+
+def test_interrupt_is_one_line(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('starcal_ros.pipeline.setup.load_setup', interrupted)
+    status, _, err = run('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path)
+    assert (status, err) == (130, 'starcal: interrupted\n')
+
+
+@pytest.mark.slow
+def test_simulate_writes_bag_truth_and_parameters(run: Run, tmp_path: Path) -> None:
+    status, out, err = run('simulate', '-o', tmp_path / 'bag', '--scenario', 'tiny', '--seed', '5')
+    assert (status, err) == (0, '')
+    truth = json.loads((tmp_path / 'bag' / 'truth.json').read_text())
+    assert (truth['seed'], truth['images'], truth['scenario']) == (5, 10, 'tiny')
+    assert (tmp_path / 'bag' / truth['bag']).is_file()
+    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
+    assert 'truth.json' in out and 'params.yaml' in out
+    status, _, _ = run('simulate', '-o', tmp_path / 'b.mcap', '--scenario', 'tiny', '--seed', '5')
+    assert status == 0
+    same = (tmp_path / 'bag' / truth['bag']).read_bytes()
+    assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
+    assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}
+
+
+def examples() -> list[tuple[str, list[str]]]:
+    """Every line of example in the helps, by command."""
+    (commands,) = (a for a in parser()._actions if isinstance(a, argparse._SubParsersAction))
+    epilogs = {'': parser().epilog, **{n: c.epilog for n, c in commands.choices.items()}}
+    return [
+        (name, shlex.split(line))
+        for name, epilog in epilogs.items()
+        for line in str(epilog).splitlines()
+        if line.startswith('  starcal ')
+    ]
+
+
+def test_each_command_has_examples_that_it_takes() -> None:
+    shown = Counter(name for name, _ in examples())
+    assert all(
+        shown[name] >= 2 for name in ('inspect', 'calibrate', 'compare', 'simulate', 'play')
+    )
+    assert set(shown) == {'', *main._COMMANDS}
+    for _, words in examples():
+        parser().parse_args(words[1:])  # exits where it does not understand
+
+
+@pytest.mark.slow
+def test_the_first_steps_run_in_an_empty_folder(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after `pip install`, where there is neither ROS nor the bag of the repository."""
+    monkeypatch.chdir(tmp_path)
+    *steps, demo_step = [words[1:] for name, words in examples() if not name]
+    assert [words[0] for words in steps] == ['simulate', 'calibrate', 'compare']
+    for words in steps:
+        assert run(*words)[0] == 0, words
+    assert demo_step == ['demo']
+
+
+@pytest.mark.parametrize(
+    'line', ['demo -o {t}/out', 'play {b}', 'monitor --once 1'], ids=lambda line: line.split()[0]
+)
+@pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
+def test_what_needs_ros_names_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
+) -> None:
+    find_spec = importlib.util.find_spec
+
+    def without(name: str) -> object:
+        if name == 'starcal.msg' and missing == 'starcal':
+            raise ModuleNotFoundError(name='starcal')
+        return None if name == missing else find_spec(name)
+
+    monkeypatch.setattr(importlib.util, 'find_spec', without)
+    result = run(*line.format(t=tmp_path, b=TINY).split())
+    assert_refused(result, missing, 'is not installed', 'starcal calibrate')
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    ('line', 'expected'),
+    [
+        ('starcal ca', ['calibrate', 'catalog']),
+        ('starcal inspect --ima', ['--image-topic']),
+        ('starcal simulate --scenario ', ['paper', 'small', 'tiny']),
+        ('starcal import --channel g', ['green']),
+        (f'starcal inspect {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
+    ],
+)
+def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:
+    """What argcomplete's function in the shell asks the tool, and what it is told."""
+    told = tmp_path / 'told'
+    asked = {
+        '_ARGCOMPLETE': '1',
+        '_ARGCOMPLETE_IFS': '\n',
+        '_ARGCOMPLETE_STDOUT_FILENAME': str(told),
+        '_ARGCOMPLETE_SUPPRESS_SPACE': '0',
+        'COMP_LINE': line,
+        'COMP_POINT': str(len(line)),
+        'COMP_TYPE': '9',
+    }
+    subprocess.run(
+        [sys.executable, '-m', 'starcal_ground.cli.main'], env={**os.environ, **asked}, check=False
+    )
+    found = told.read_text().split('\n')
+    assert sorted(word.strip() for word in found) == expected
+
+
+def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[list[str]] = []
+    monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
+    run('play', TINY, '--rate', '2', '--remap', 'a:=b', '--remap', 'c:=d')
+    (command,) = called
+    start = [*module_command('starcal_ros.entry_points'), 'bag_player']
+    assert command[: len(start)] == start
+    assert f'bag:={TINY.resolve()}' in command and 'rate:=2.0' in command
+    assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']
+
+
+def test_no_report_is_written_where_none_is_wanted(
+    run: Run, tmp_path: Path, tiny_bag: Path, tiny_products: Path
+) -> None:
+    write_atomically(tmp_path / 'report.html', 'of earlier products')
+    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
+    status, out, _ = run('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
+    assert status == 0 and out.endswith(f'products written to {tmp_path}\n')
+    assert (tmp_path / 'calibration.json').is_file()
+    assert not (tmp_path / 'report.html').exists()
+
+
+def test_no_older_report_stands_beside_products_that_cannot_be_drawn(
+    run: Run,
+    tmp_path: Path,
+    tiny_bag: Path,
+    tiny_products: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def cannot(*_: object) -> None:
+        raise ValueError('no such colour')
+
+    monkeypatch.setattr('starcal_ground.report.page.charts_of', cannot)
+    write_atomically(tmp_path / 'report.html', 'of earlier products')
+    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
+    status, _, err = run('calibrate', bag, '--params', params, '-o', tmp_path)
+    assert status == 0 and 'the products cannot be drawn: ValueError: no such colour' in err
+    assert (tmp_path / 'calibration.json').is_file()
+    assert not (tmp_path / 'report.html').exists()
+
+
+def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[list[str]] = []
+    monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
+    run('monitor', '--once', '2.5', '--remap', '__ns:=/cam1')
+    module = [*module_command('starcal_ros.entry_points'), 'starcal_ground.ros.monitor_client']
+    assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
+    # The entry point imports that module of ros/; it was once renamed without its command.
+    assert importlib.util.find_spec('starcal_ground.ros.monitor_client')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
+@pytest.mark.parametrize('command', [('play', str(TINY)), ('monitor', '--once', '1')])
+def test_without_ros_one_line_names_the_remedy(
+    tmp_path: Path, command: tuple[str, ...], missing: str
+) -> None:
+    """ROS 2 itself or the messages of starcal cannot be imported, as where nothing is sourced."""
+    (tmp_path / 'sitecustomize.py').write_text(f'import sys; sys.modules[{missing!r}] = None\n')
+    done = subprocess.run(
+        [sys.executable, '-m', 'starcal_ground.cli.main', *command],
+        env={**os.environ, 'PYTHONPATH': str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2 and done.stderr.count('\n') == 1, done.stderr
+    assert missing in done.stderr and 'source a ROS 2 workspace' in done.stderr
+
+
+@pytest.mark.slow
+def test_parameters_of_the_nodes_are_known_to_the_tool(
+    run: Run, tmp_path: Path, params: Callable[..., Path]
+) -> None:
+    shared = params(autostart=True, image_queue=5, use_sim_time=True, max_residual_rms_px=1e-3)
+    status, _, err = run('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
+    assert (status, err) == (3, '')
+
+
+def test_demo_takes_the_bag_of_the_repository(tmp_path: Path) -> None:
+    bag = demo.tiny_bag(tmp_path)
+    assert bag.bag == TINY
+    assert bag.image_count == 10
+    assert bag.parameters['camera_info_url'] == f'file://{(TINY / "camera.yaml").resolve()}'
+    assert not any(tmp_path.iterdir())
+
+
+def test_demo_makes_the_bag_where_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demo, '__file__', str(tmp_path / 'package' / 'demo.py'))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', '')
+    bag = demo.tiny_bag(tmp_path)
+    assert bag.bag == tmp_path / 'tiny'
+    shutil.rmtree(bag.bag)
+
+
+@pytest.mark.slow
+def test_demo_says_which_node_failed(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
+    waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
+    monkeypatch.setattr(
+        demo, 'node_command', lambda name, *_: failing if name == 'calibrator' else waiting
+    )
+    assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
+
+
+def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_args: object) -> int:
+        raise ImportError('libfreetype is not there')
+
+    monkeypatch.setitem(main._COMMANDS, 'compare', broken)
+    with pytest.raises(ImportError, match='libfreetype'):
+        main.main(['compare', 'a', 'b'])
+
+
+def test_a_ctrl_c_whose_error_has_lost_its_cause_is_one() -> None:
+    """As NumPy raises it, whose import of its own modules catches ImportError."""
+    code = """
+import os, signal, sys, time
+from starcal_ground.cli import entry_point, main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+
+def interrupted(_args):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        pass
+    raise ModuleNotFoundError('Error importing numpy')
+
+main._COMMANDS['inspect'] = interrupted
+sys.argv = ['starcal', 'inspect', 'x']
+sys.exit(entry_point.main())
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, 'starcal: interrupted\n')
+
+
+def test_a_ctrl_c_while_the_player_starts_is_silent() -> None:
+    code = """
+import os, signal
+from pathlib import Path
+from starcal_ground.cli.commands import demo
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+become = os.execv
+os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
+demo.become(demo.node_command('bag_player', demo.player_arguments(Path('none'), 1.0)))
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
+
+
+def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
+    seen: list[str] = []
+    before = signal.getsignal(signal.SIGTERM)
+
+    def start() -> None:
+        with demo._ended_like_interrupted(), demo._interrupts_wait():
+            os.kill(os.getpid(), signal.SIGTERM)
+            seen.append('the rest of the block')
+
+    with pytest.raises(KeyboardInterrupt):
+        start()
+    assert seen
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -1,0 +1,300 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Outputs that name inputs or files of others, and standard streams that are closed or full.
+
+A command that writes is in the table `WRITING`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import hashlib
+import os
+from pathlib import Path
+import random
+import shutil
+import signal
+import subprocess
+import sys
+
+from attacks import BAG, digests, in_time, many, write_product_folder  # type: ignore[import-not-found]
+from mission_files import write_frame, write_lsk, write_sclk  # type: ignore[import-not-found]
+import numpy as np
+import pytest
+
+from starcal_ground.cli import arguments, main
+from starcal_ground.mission.export.export_formats import FORMATS
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.sky.catalog import load_catalog
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope='module')
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag with its files, and the products of an earlier calibration of it in ``out/``."""
+    folder = tmp_path_factory.mktemp('campaign')
+    shutil.copytree(BAG, folder / 'bag')
+    write_product_folder(folder / 'out')
+    (folder / 'out/report.html').write_text('a page')
+    return folder
+
+
+def _prior_in_out(here: Path) -> None:
+    text = (here / 'bag/params.yaml').read_text()
+    (here / 'bag/params.yaml').write_text(
+        text.replace('camera.yaml', str(here / 'out/camera_info.yaml'))
+    )
+
+
+def _nothing(here: Path) -> None:
+    pass
+
+
+def _link(path: Path, target: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to(target)
+
+
+def _picture(folder: Path) -> Path:
+    """A folder with a picture of the user, whose name a thumbnail could have."""
+    folder.mkdir(parents=True)
+    (folder / 'image_0001.jpg').write_text('mine')
+    return folder
+
+
+_OWN = '--params HERE/bag/params.yaml -o'
+PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
+    'folder of the bag': (_nothing, f'calibrate HERE/bag {_OWN} HERE/bag'),
+    'folder of the bag, by another name': (
+        _nothing, f'calibrate HERE/bag {_OWN} HERE/out/../bag/.',
+    ),
+    'folder of the bag, by a link': (
+        lambda here: (here / 'link').symlink_to(here / 'bag'),
+        f'calibrate HERE/bag {_OWN} HERE/link',
+    ),
+    'folder of the file': (_nothing, f'calibrate HERE/bag/tiny_0.mcap {_OWN} HERE/bag'),
+    'observations of the folder': (
+        _nothing, f'calibrate HERE/out/observations.mcap {_OWN} HERE/out',
+    ),
+    'link to the bag': (
+        lambda here: _link(here / 'out/observations.mcap', here / 'bag/tiny_0.mcap'),
+        f'calibrate HERE/bag {_OWN} HERE/out',
+    ),
+    'prior in the folder': (_prior_in_out, f'calibrate HERE/bag {_OWN} HERE/out'),
+    'pictures of others': (
+        lambda here: _picture(here / 'new/thumbnails'), f'calibrate HERE/bag {_OWN} HERE/new',
+    ),
+    'pictures by a link': (
+        lambda here: _link(here / 'out/thumbnails', _picture(here / 'pictures')),
+        f'calibrate HERE/bag {_OWN} HERE/out',
+    ),
+    'figure over a product': (
+        lambda here: (here / 'figure.svg').hardlink_to(here / 'out/calibration.json'),
+        'compare HERE/out HERE/out -o HERE/figure.svg',
+    ),
+    'table over residuals': (
+        lambda here: (here / 'out/residuals.npz').write_text('residuals'),
+        'lookup HERE/out -o HERE/out/residuals.npz',
+    ),
+    'simulation over a recorded bag': (
+        lambda here: (here / 'bag/truth.json').unlink(),
+        'simulate --scenario tiny -o HERE/bag',
+    ),
+    'simulation over a file': (
+        lambda here: (here / 'a.mcap').write_text('recorded'),
+        'simulate --scenario tiny -o HERE/a.mcap',
+    ),
+    'pointings over the bag': (
+        lambda here: shutil.rmtree(here / 'out'),
+        f'plan HERE/bag {_OWN} HERE/bag/tiny_0.mcap',
+    ),
+    'pointings over the allowed ones': (
+        lambda here: write_atomically(here / 'allowed.csv', 'ra_deg,dec_deg\n1,2\n'),
+        f'plan HERE/bag --pointings HERE/allowed.csv {_OWN} HERE/allowed.csv',
+    ),
+    'catalog over its table': (
+        lambda here: write_atomically(here / 'gaia.npz', 'a table'),
+        'catalog HERE/gaia.npz -o HERE/gaia.npz',
+    ),
+    'simulation over parameters': (
+        lambda here: (here / 'a_params.yaml').write_text('mine'),
+        'simulate --scenario tiny -o HERE/a.mcap',
+    ),
+    'simulation in a folder with another bag': (
+        lambda here: (here / 'bag').rename(here / 'night'),
+        'simulate --scenario tiny -o HERE/night',
+    ),
+    'simulation beside a damaged truth': (
+        lambda here: (here / 'bag/truth.json').write_text('[' * 10**6),
+        'simulate --scenario tiny -o HERE/bag',
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', PLACES)
+def test_an_output_that_names_an_input_is_refused(
+    name: str, campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """-o names an input, its folder, or a file of another origin: nothing is changed."""
+    prepare, command = PLACES[name]
+    here = tmp_path / 'campaign'
+    shutil.copytree(campaign, here)
+    prepare(here)
+    before = digests(here)
+    with in_time():
+        assert main.main([word.replace('HERE', str(here)) for word in command.split()]) == 2
+    assert ''.join(capsys.readouterr()).count('\n') == 1
+    assert digests(here) == before
+
+
+_OF_BAG = 'HERE/bag --params HERE/bag/params.yaml'
+_CK = '--kernels HERE/bag/naif0012.tls HERE/bag/clock.tsc'
+WRITING: dict[str, str] = {
+    f'calibrate {_OF_BAG} -o HERE/o': (
+        'calibration.json camera_info.yaml observations.mcap residuals.npz report.html'
+        ' thumbnails/image_1.jpg not_calibrated.json'
+    ),
+    'report HERE/o': 'report.html',
+    'init HERE/bag -o HERE/o': 'params.yaml camera.yaml',
+    f'plan {_OF_BAG} --images 1 -o HERE/o/plan.csv': 'plan.csv',
+    'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
+    'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
+    'lookup HERE/out -o HERE/o/a.npz --points 2': 'a.npz',
+    'lookup HERE/out -o HERE/o/a.fits --points 2': 'a.fits',
+    'simulate --scenario tiny -o HERE/o': (
+        'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
+    ),
+    'simulate --scenario tiny -o HERE/o/b.mcap': ('b.mcap b.json b_params.yaml b_camera.yaml'),
+    (
+        'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
+        ' HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o'
+    ): 'o_0.mcap metadata.yaml import.json params.yaml camera.yaml',
+    'catalog HERE/gaia.csv -o HERE/o/deep.npz': 'deep.npz',
+    'trend HERE/out -o HERE/o': 'trend.html',
+    'export HERE/out --to c -o HERE/o': 'starcal_camera.c starcal_camera.h',
+    'export HERE/out --to c --table -o HERE/o': 'starcal_camera.bin',
+    'export HERE/out --to csv -o HERE/o': 'lines_of_sight.csv',
+    'export HERE/out --to giant -o HERE/o': 'giant_camera.json',
+    'export HERE/out --to isd --spacecraft-id -9 -o HERE/o': 'camera_isd.json camera_isis.ti',
+    'export HERE/out --to kalibr --image-topic /a -o HERE/o': 'camchain.yaml',
+    'export HERE/out --to mrcal -o HERE/o': 'camera.cameramodel',
+    'export HERE/out --to opencv -o HERE/o': 'opencv.yaml',
+    'export HERE/out --to ros -o HERE/o': 'camera_info.yaml alignment.yaml',
+    'export HERE/out --to spice --spacecraft-id -9 -o HERE/o': 'camera.tf camera.ti',
+    f'export HERE/out --to ck --spacecraft-id -999 -o HERE/o {_CK}': 'camera.bc',
+}
+"""Commands that write, and the files that they write in ``o/``."""
+WITH_NODES = {
+    'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json',
+}
+
+
+def _foreign(path: Path) -> None:
+    path.write_bytes(b'of another program')
+
+
+def _edited(path: Path) -> None:
+    write_atomically(path, 'of an earlier run\n')
+    with path.open('a') as file:
+        file.write('and of the user\n')
+
+
+OF_OTHERS: dict[str, Callable[[Path], object]] = {
+    'foreign': _foreign,
+    'edited': _edited,
+    'folder': Path.mkdir,
+    'dangling link': lambda path: path.symlink_to('nothing'),
+    'pipe': os.mkfifo,
+}
+
+
+@pytest.fixture(scope='module')
+def inputs(campaign: Path) -> Path:
+    """The campaign with a frame, its time and attitudes, a table of Gaia, and kernels."""
+    write_frame(campaign / 'frames')
+    stars = load_catalog(None, 3.0)
+    stars = stars.select(stars.id > 0)
+    places = np.degrees([stars.ra_rad, stars.dec_rad])
+    columns = zip(stars.id, *places, stars.magnitude, strict=True)
+    rows = [','.join(map(str, row)) for row in columns]
+    header = 'source_id,ra,dec,phot_g_mean_mag'
+    (campaign / 'gaia.csv').write_text('\n'.join([header, *rows, '']))
+    write_lsk(campaign / 'bag/naif0012.tls')
+    write_sclk(campaign / 'bag/clock.tsc')
+    return campaign
+
+
+def test_each_command_that_writes_is_in_the_table() -> None:
+    """One without an option -o that writes is `report`."""
+    actions = arguments.parser()._actions
+    commands = next(one for one in actions if isinstance(one, argparse._SubParsersAction))
+    writing = {
+        name
+        for name, command in commands.choices.items()
+        if '--output' in command._option_string_actions
+    }
+    table = (*WRITING, *WITH_NODES)
+    assert {words.partition(' ')[0] for words in table} == {*writing, 'report'}
+    assert {words.split()[3] for words in table if words.startswith('export')} == {*FORMATS}
+
+
+@pytest.mark.parametrize('command', [*WRITING, *WITH_NODES])
+def test_what_starcal_did_not_write_is_not_replaced(
+    command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file of others, or its own that was changed: nothing is written. Its own is replaced."""
+    if command.startswith('demo'):
+        pytest.importorskip('rclpy')
+    here = tmp_path / 'campaign'
+    shutil.copytree(inputs, here)
+    names = (WRITING | WITH_NODES)[command].split()
+    line = [word.replace('HERE', str(here)) for word in command.split()]
+    if command.startswith('report'):
+        shutil.copytree(inputs / 'out', here / 'o')
+        (here / 'o/report.html').unlink()
+    for name in names:
+        (here / 'o' / name).parent.mkdir(parents=True, exist_ok=True)
+        for make in OF_OTHERS.values():
+            make(here / 'o' / name)
+            before = digests(here)
+            assert main.main(line) == 2, name
+            error = ''.join(capsys.readouterr())
+            assert error.count('\n') == 1 and f'/o/{name}: ' in error
+            assert digests(here) == before
+            is_folder = (here / 'o' / name).is_dir()
+            (here / 'o' / name).rmdir() if is_folder else (here / 'o' / name).unlink()
+    if command in WITH_NODES:
+        return
+    for name in names:
+        write_atomically(here / 'o' / name, 'of an earlier run')
+    assert main.main(line) == 0, capsys.readouterr()
+    old = hashlib.sha256(b'of an earlier run').hexdigest()
+    assert old not in digests(here).values()
+
+
+@pytest.mark.parametrize(
+    'ends', ['>&-', '2>&-', '>&- 2>&-', '<&- >&- 2>&-', '>/dev/full', '| true', '2>&1 | true']
+)
+@pytest.mark.parametrize('bag', [BAG, '/none'])
+def test_standard_streams_that_are_closed_full_or_abandoned(bag: object, ends: str) -> None:
+    command = f'{sys.executable} -m starcal_ground.cli.main inspect {bag} {ends}'
+    done = subprocess.run(['bash', '-c', command], capture_output=True, text=True, timeout=60)
+    assert 'Traceback' not in done.stdout + done.stderr
+    assert 'Exception' not in done.stdout + done.stderr
+
+
+def test_ctrl_c_in_the_first_two_seconds() -> None:
+    """No traceback of starcal: while Python itself starts, its own cannot be prevented."""
+    draw = random.Random(15)
+    code = 'import sys; from starcal_ground.cli.entry_point import main; sys.exit(main())'
+    command = [sys.executable, '-c', code, 'inspect', str(BAG)]
+    for _ in range(many(6)):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        try:
+            process.communicate(timeout=draw.uniform(0.2, 2.0))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)
+        errors = process.communicate(timeout=60)[1].decode(errors='replace')
+        assert 'Traceback' not in errors or 'starcal_ros' not in errors

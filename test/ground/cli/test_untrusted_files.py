@@ -1,0 +1,130 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Each argument and option that names a file, given what is no such file: one line, in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import resource
+import shutil
+
+from attacks import BAG, in_time, write_product_folder  # type: ignore[import-not-found]
+from mission_files import write_frame, write_lsk, write_sclk  # type: ignore[import-not-found]
+import pytest
+
+from starcal_ground.cli import main
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(60)]
+_MOST_BYTES = 1 << 30  # that a file adds to the memory
+
+
+def _sparse(path: Path) -> None:
+    with path.open('wb') as file:
+        file.truncate(20 << 30)
+
+
+def _unreadable(path: Path) -> None:
+    if os.geteuid() == 0:
+        pytest.skip('root reads every file')
+    path.touch(mode=0)
+
+
+KINDS: dict[str, Callable[[Path], object]] = {
+    'pipe': os.mkfifo,
+    'device': lambda path: path.symlink_to('/dev/zero'),
+    'sparse': _sparse,
+    'dangling link': lambda path: path.symlink_to('nothing'),
+    'loop': lambda path: path.symlink_to(path),
+    'folder': Path.mkdir,
+    'unreadable': _unreadable,
+    'empty': Path.touch,
+    'garbage': lambda path: path.write_bytes(bytes(range(256)) * 64),
+    'other text': lambda path: path.write_text('# of another program\n'),
+}
+_IMPORT = (
+    'import --images HERE/frames/0.png --times HERE/frames/times.csv'
+    ' --attitude HERE/frames/attitude.csv -o HERE/o'
+)
+FILES = {
+    'BAG': 'inspect FILE',
+    'BAG of calibrate': 'calibrate FILE --params HERE/bag/params.yaml -o HERE/o',
+    'file of a bag': 'inspect HERE/bag/metadata.yaml',
+    '--params': 'inspect HERE/bag --params FILE',
+    '--params of calibrate': 'calibrate HERE/bag --params FILE -o HERE/o',
+    'camera_info_url': 'inspect HERE/bag --params HERE/params.yaml',
+    'catalog': 'inspect HERE/bag --params HERE/params.yaml',
+    '--pointings': 'plan HERE/bag --params HERE/bag/params.yaml --pointings FILE',
+    'A': 'compare FILE HERE/out',
+    'B': 'compare HERE/out FILE',
+    'calibration.json': 'report HERE/out',
+    'residuals.npz': 'report HERE/out',
+    'observations.mcap': 'report HERE/out',
+    'DIR of lookup': 'lookup FILE -o HERE/o.csv',
+    'DIR of export': 'export FILE --to csv -o HERE/o',
+    '--kernels': 'export HERE/out --to ck --spacecraft-id -999 -o HERE/o --kernels FILE',
+    'kernel of a meta-kernel': (
+        'export HERE/out --to ck --spacecraft-id -999 -o HERE/o --kernels HERE/meta.tm'
+    ),
+    '--attitude': _IMPORT.replace('HERE/frames/attitude.csv', 'FILE'),
+    '--attitude of a meta-kernel': _IMPORT.replace('HERE/frames/attitude.csv', 'HERE/meta.tm'),
+    '--velocity': f'{_IMPORT} --velocity FILE',
+    '--times': _IMPORT.replace('HERE/frames/times.csv', 'FILE'),
+    '--camera': f'{_IMPORT} --camera FILE',
+    '--cameras': 'trend HERE/out -o HERE/o --cameras FILE',
+    '--params of trend': 'trend HERE/bag -o HERE/o --params FILE',
+}
+"""Arguments and options that name a file; images are in the tests of their readers."""
+PLACES = {
+    'file of a bag': 'bag/metadata.yaml',
+    'calibration.json': 'out/calibration.json',
+    'residuals.npz': 'out/residuals.npz',
+    'observations.mcap': 'out/observations.mcap',
+}
+"""Where the file is, if the command does not name it; in `MAY_LACK` it may be missing."""
+MAY_LACK = ('file of a bag', 'residuals.npz', 'observations.mcap', '--params of trend')
+
+
+@pytest.fixture(scope='module')
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag, a product folder, a frame to import, and kernels."""
+    folder = tmp_path_factory.mktemp('campaign')
+    shutil.copytree(BAG, folder / 'bag')
+    write_product_folder(folder / 'out')
+    write_frame(folder / 'frames')
+    write_lsk(folder / 'naif.tls')
+    write_sclk(folder / 'clock.tsc')
+    return folder
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('name', FILES)
+def test_a_file_that_is_none_costs_one_line(
+    name: str, kind: str, campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = tmp_path / 'campaign'
+    shutil.copytree(campaign, here)
+    file = here / PLACES.get(name, 'file')
+    file.unlink(missing_ok=True)
+    KINDS[kind](file)
+    params = (here / 'bag/params.yaml').read_text().replace(': camera.yaml', ': bag/camera.yaml')
+    if name == 'camera_info_url':
+        (here / 'params.yaml').write_text(params.replace('bag/camera.yaml', 'file'))
+    else:
+        (here / 'params.yaml').write_text(f'{params}    {name}: {file}\n')
+    parts = [f"'{str(here)[k : k + 40]}+'" for k in range(0, len(str(here)), 40)]
+    (here / 'meta.tm').write_text(
+        'KPL/MK\n\\begindata\nPATH_VALUES = (\n' + '\n'.join(parts).removesuffix("+'") + "' )\n"
+        "PATH_SYMBOLS = ( 'HERE' )\nKERNELS_TO_LOAD = ( '$HERE/naif.tls' '$HERE/file' )\n"
+    )
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with in_time():
+        status = main.main(
+            [w.replace('HERE', str(here)).replace('FILE', str(file)) for w in FILES[name].split()]
+        )
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < _MOST_BYTES // 1024
+    error = capsys.readouterr().err
+    if status == 0 and name in MAY_LACK:
+        return
+    assert status == 2 and error.count('\n') == 1, error
+    assert kind not in ('pipe', 'device') or 'not a regular file' in error

@@ -1,0 +1,303 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Image files of every kind that is read, and the ones that are refused in one line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import struct
+import zlib
+
+from astropy.io import fits
+import cv2
+from mission_files import date, images, write_fits  # type: ignore[import-not-found]
+import numpy as np
+import pytest
+
+from starcal_ground.images.image_series import (
+    check_alike,
+    common_scale,
+    ImageOptions,
+    look,
+    pixels_of,
+)
+from starcal_ros.errors import IngestError
+
+IMAGE = images()[0]
+PLAIN = ImageOptions()
+
+
+def read(path: Path, options: ImageOptions = PLAIN) -> np.ndarray:
+    return np.asarray(pixels_of(path, options, common_scale([look(path, options)], options)))
+
+
+@pytest.mark.parametrize('kind', ['uint16', 'tiled', 'extension'])
+def test_whole_numbers_of_fits_are_kept(tmp_path: Path, kind: str) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, kind)
+    found = look(path, PLAIN)
+    assert found.time_ns == IMAGE.time_ns
+    assert common_scale([found], PLAIN).is_none
+    pixels = read(path)
+    assert pixels.dtype == IMAGE.pixels.dtype and (pixels == IMAGE.pixels).all()
+
+
+def test_floating_point_is_mapped_to_16_bit_by_a_scale_that_is_known(tmp_path: Path) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, 'float32')
+    scale = common_scale([look(path, PLAIN)], PLAIN)
+    pixels = read(path)
+    values = IMAGE.pixels.astype('f4') * 2.5 - 100.0
+    assert pixels.dtype == np.uint16 and 0 < pixels.max() <= 65000
+    back = pixels * scale.step + scale.offset
+    assert np.abs(back - values).max() <= scale.step * 0.5001  # rounding to whole numbers
+
+
+def test_negative_whole_numbers_are_shifted_without_loss(tmp_path: Path) -> None:
+    path = tmp_path / 'a.fits'
+    values = IMAGE.pixels.astype(np.int32) - 1000
+    fits.PrimaryHDU(values, fits.Header({'DATE-AVG': date(IMAGE.time_ns)})).writeto(path)
+    scale = common_scale([look(path, PLAIN)], PLAIN)
+    assert (scale.offset, scale.step) == (values.min(), 1.0)
+    assert (read(path) + scale.offset == values).all()
+
+
+def test_not_a_number_becomes_the_median(tmp_path: Path) -> None:
+    path = tmp_path / 'a.fits'
+    values = IMAGE.pixels.astype('f4')
+    values[3, 5] = np.nan
+    fits.PrimaryHDU(values, fits.Header({'DATE-AVG': date(IMAGE.time_ns)})).writeto(path)
+    pixels = read(path)
+    assert abs(int(pixels[3, 5]) - int(np.median(pixels))) <= 1
+
+
+def test_a_range_clips(tmp_path: Path) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, 'float32')
+    options = ImageOptions(value_range=(0.0, 650.0))
+    pixels = read(path, options)
+    values = IMAGE.pixels.astype('f4') * 2.5 - 100.0
+    expected = np.clip(np.rint(values / 0.01), 0, 65535)
+    assert np.abs(pixels - expected).max() <= 1  # float32 of 650 resolves 6e-5, 0.01 of a step
+
+
+@pytest.mark.parametrize('ending', ['.png', '.tiff'])
+def test_pictures_take_their_time_from_a_table(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f'a{ending}'
+    cv2.imwrite(str(path), IMAGE.pixels)
+    options = ImageOptions(times={path.name: 17})
+    assert look(path, options).time_ns == 17
+    assert (read(path, options) == IMAGE.pixels).all()
+    with pytest.raises(IngestError, match='has no time: give --times'):
+        look(path, PLAIN)
+    with pytest.raises(IngestError, match='not in the table of --times'):
+        look(path, ImageOptions(times={}))
+
+
+def test_a_colour_of_an_image_is_chosen(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(1).integers(0, 60000, (12, 10, 3), np.uint16)
+    path, cube = tmp_path / 'a.png', tmp_path / 'a.fits'
+    cv2.imwrite(str(path), rgb[:, :, ::-1])  # OpenCV writes BGR
+    hdu = fits.PrimaryHDU(
+        np.moveaxis(rgb, -1, 0), fits.Header({'DATE-AVG': '2026-05-15T07:20:00'})
+    )
+    hdu.writeto(cube)
+    for number, channel in enumerate(('red', 'green', 'blue')):
+        options = ImageOptions(times={'a.png': 1, 'a.fits': 1}, channel=channel)
+        for file in (path, cube):
+            assert (read(file, options) == rgb[:, :, number]).all()
+    with pytest.raises(IngestError, match='choose --channel'):
+        look(cube, PLAIN)
+
+
+def test_a_colour_of_a_mosaic_has_half_the_size(tmp_path: Path) -> None:
+    mosaic = np.arange(80, dtype=np.uint16).reshape(8, 10)
+    path = tmp_path / 'a.png'
+    cv2.imwrite(str(path), mosaic)
+    for pattern, channel, first in (
+        ('rggb', 'red', 0),
+        ('rggb', 'green', 1),
+        ('grbg', 'blue', 10),
+    ):
+        options = ImageOptions(times={'a.png': 1}, channel=channel, bayer=pattern)
+        pixels = read(path, options)
+        assert pixels.shape == (4, 5) and pixels[0, 0] == first and pixels[1, 1] == first + 22
+
+
+MIDDLE = '2026-05-15T07:20:00.5'
+
+
+@pytest.mark.parametrize(
+    'header',
+    [
+        {'DATE-AVG': MIDDLE},
+        {'DATE-BEG': '2026-05-15T07:20:00', 'DATE-END': '2026-05-15T07:20:01'},
+        {'DATE-OBS': '2026-05-15T07:20:00', 'EXPTIME': 1.0},
+        {'DATE-OBS': '2026-05-15', 'TIME-OBS': '07:20:00', 'XPOSURE': 1.0},
+        {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'EXPTIME': 1.0},
+        {'DATE-OBS': '2026-05-15', 'UTSTART': '07:20:00', 'UT': '07:20:00.0', 'EXPTIME': 1.0},
+        {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'EXPTIME': 1.0, 'TIMESYS': 'TAI'},
+        {
+            'DATE-BEG': '2026-05-15',
+            'TIME-BEG': '07:20',
+            'DATE-END': '2026-05-15',
+            'TIME-END': '07:20:01',
+        },
+        {'DATE-OBS': '2026-05-15T07:20:00.375', 'EXPOSURE': (250, '[ms]')},
+        {'DATE-OBS': '2026-05-15T07:19:00.5', 'EXPTIME': (2, '[min] of the shutter')},
+        {'DATE-OBS': '2026-05-15T07:20:00', 'EXPTIME': (1.0, 'Exposure time in seconds')},
+        {'DATE-BEG': '2026-05-15T07:19:00.5', 'XPOSURE': 2, 'TIMEUNIT': 'min'},
+        {'DATE-BEG': '2026-05-15T07:20:37', 'XPOSURE': 1.0, 'TIMESYS': 'TAI'},
+        {'DATE-AVG': '2026-05-15T07:21:09.684', 'TIMESYS': 'TT'},
+        {'DATE-AVG': '2026-05-15T07:20:18.5', 'TIMESYS': 'GPS'},
+        {'MJD-AVG': 61175 + (7 * 3600 + 20 * 60 + 0.5) / 86400},
+    ],
+)
+def test_the_middle_of_the_exposure_is_found(tmp_path: Path, header: dict[str, object]) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
+    expected = look(write_fits(tmp_path / 'b.fits', IMAGE, **{'DATE-AVG': MIDDLE}), PLAIN).time_ns
+    # A Julian date in a double resolves 0.6 us.
+    assert abs(look(path, PLAIN).time_ns - expected) <= (1000 if 'MJD-AVG' in header else 0)
+
+
+@pytest.mark.parametrize(
+    ('header', 'words'),
+    [
+        ({'OBJECT': 'x'}, 'no time'),
+        ({'DATE-OBS': '2026-05-15T07:20:00'}, '--time-key DATE-OBS'),
+        ({'DATE-AVG': MIDDLE, 'TIMESYS': 'LOCAL'}, "'LOCAL' is not one of UTC"),
+        ({'DATE-AVG': 'yesterday'}, 'yesterday'),
+    ],
+)
+def test_a_time_that_is_not_known_is_one_line(tmp_path, header, words) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
+    with pytest.raises(IngestError, match=words) as error:
+        look(path, PLAIN)
+    assert str(path) in str(error.value) and '\n' not in str(error.value)
+
+
+START = {'DATE-OBS': '2026-05-15T07:20:00'}
+
+
+@pytest.mark.parametrize(
+    ('header', 'why'),
+    [
+        # Midnight would be a guess; so would be one of two times of day.
+        ({'DATE-OBS': '2026-05-15', 'EXPTIME': 1.0}, 'no time of day, and no keyword has one'),
+        ({'DATE-AVG': '2026-05-15'}, 'no time of day'),
+        (
+            {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'TIME-OBS': '09:20:00', 'EXPTIME': 1},
+            'TIME-OBS, UT differ: give --time-key or --times',
+        ),
+        ({'DATE-OBS': '2026-05-15', 'UT': 26400.0, 'EXPTIME': 1.0}, 'T26400.0. is not a date'),
+        ({**START, 'EXPTIME': -1}, 'EXPTIME = -1 is not the duration'),
+        ({**START, 'EXPTIME': 0.0}, 'EXPTIME = 0.0 is not the duration'),
+        ({**START, 'EXPTIME': 'long'}, 'EXPTIME = long is not the duration'),
+        # Free text may say anything: only brackets are a unit (FITS standard 4.0, 4.3.2).
+        ({**START, 'EXPTIME': (250, 'exposure in ms')}, "EXPTIME is in 'exposure in ms'"),
+        ({**START, 'EXPTIME': (250, '[adu]')}, "EXPTIME is in 'adu', expected a unit as"),
+        ({'DATE-BEG': MIDDLE, 'DATE-END': '2026-05-15T07:20:00'}, 'DATE-END is before DATE-BEG'),
+    ],
+)
+def test_a_time_that_would_be_a_guess_is_refused(tmp_path: Path, header: dict, why: str) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
+    with pytest.raises(IngestError, match=why):
+        look(path, PLAIN)
+
+
+@pytest.mark.parametrize('kind', ['uint16', 'tiled'])
+def test_a_card_that_nothing_needs_may_be_damaged(tmp_path: Path, kind: str) -> None:
+    header = {'DATE-OBS': MIDDLE, 'EXPTIME': 1.0, 'OBSERVER': 'x', 'SITELAT': 1.0}
+    path = write_fits(tmp_path / 'a.fits', IMAGE, kind, **header)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"'x       '", b'  M. Night'))
+    assert (read(path) == IMAGE.pixels).all()
+    path.write_bytes(content.replace(b"'2026-05-15T07:20:00.5'", b' 2026-05-15T07:20:00:5 '))
+    with pytest.raises(IngestError, match='is not a date and time') as error:
+        look(path, PLAIN)
+    assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('shape', [(10, 48, 64), (48, 64, 4), (2, 48, 64)])
+def test_a_cube_is_no_colour_image(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = tmp_path / 'a.fits'
+    fits.PrimaryHDU(np.zeros(shape, np.int16), fits.Header({'DATE-AVG': MIDDLE})).writeto(path)
+    for channel in ('', 'red'):
+        with pytest.raises(
+            IngestError, match=r'shape .*, neither an image nor three colour planes'
+        ):
+            look(path, ImageOptions(channel=channel))
+
+
+def test_a_time_key_is_taken_as_the_middle(tmp_path: Path) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **{'DATE-OBS': MIDDLE, 'EXPTIME': 9.0})
+    assert look(path, ImageOptions(time_key='DATE-OBS')).time_ns % 10**9 == 500_000_000
+    with pytest.raises(IngestError, match='no keyword T0'):
+        look(path, ImageOptions(time_key='T0'))
+
+
+def test_temperature_and_saturation_come_from_the_header(tmp_path: Path) -> None:
+    header = {'DATE-AVG': MIDDLE, 'CCD-TEMP': -21.5, 'SATURATE': 60000}
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
+    found = look(path, ImageOptions(temperature_key='CCD-TEMP'))
+    assert (found.temperature_degc, found.saturation) == (-21.5, 60000.0)
+
+
+def test_damaged_and_strange_files_are_one_line(tmp_path: Path) -> None:
+    good = write_fits(tmp_path / 'a.fits', IMAGE)
+    cases = {'cut.fits': good.read_bytes()[:4000], 'text.fits': b'hello', 'empty.png': b''}
+    for name, content in cases.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(IngestError, match=name) as error:
+            look(path, PLAIN)
+        assert '\n' not in str(error.value)
+    for path in (tmp_path / 'pipe.png', tmp_path / 'pipe.fits'):
+        os.mkfifo(path)
+        with pytest.raises(IngestError, match='not a regular file'):
+            look(path, PLAIN)
+    table = tmp_path / 'table.fits'
+    fits.BinTableHDU.from_columns([fits.Column('x', 'D', array=[1.0])]).writeto(table)
+    with pytest.raises(IngestError, match='no image'):
+        look(table, PLAIN)
+
+
+def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path: Path) -> None:
+    _, png = cv2.imencode('.png', np.zeros((9, 9), np.uint8))
+    content = bytearray(png.tobytes())
+    content[16:24] = struct.pack('>II', 60000, 60000)  # width and height of its header
+    content[29:33] = struct.pack('>I', zlib.crc32(content[12:29]))
+    (tmp_path / 'a.png').write_bytes(content)
+    with pytest.raises(IngestError, match=r'a\.png: its header claims 60000 x 60000 pixels'):
+        look(tmp_path / 'a.png', PLAIN)
+    tiled = fits.CompImageHDU(np.zeros((9, 9), np.uint8))
+    tiled.writeto(tmp_path / 'a.fits')
+    content = bytearray((tmp_path / 'a.fits').read_bytes())
+    for card in (b'ZNAXIS1 =                    9', b'ZNAXIS2 =                    9'):
+        at = content.index(card)
+        content[at : at + len(card)] = card[:-5] + b'60000'
+    (tmp_path / 'a.fits').write_bytes(content)
+    with pytest.raises(IngestError, match=r'a\.fits: no image of up to'):
+        look(tmp_path / 'a.fits', PLAIN)
+
+
+def test_a_png_that_inflates_to_far_more_is_not_decoded(tmp_path: Path) -> None:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack('>I', len(data)) + name + data + struct.pack('>I', zlib.crc32(name + data))
+        )
+
+    size = struct.pack('>IIBBBBB', 64, 64, 8, 0, 0, 0, 0)
+    surplus = zlib.compress(bytes(1 << 26))
+    content = chunk(b'IHDR', size) + chunk(b'IDAT', surplus) + chunk(b'IEND', b'')
+    (tmp_path / 'a.png').write_bytes(b'\x89PNG\r\n\x1a\n' + content)
+    with pytest.raises(IngestError, match=r'a\.png: inflates to far more than its pixels'):
+        look(tmp_path / 'a.png', ImageOptions(times={'a.png': 1}))
+
+
+def test_images_of_two_sizes_or_one_time_are_refused(tmp_path: Path) -> None:
+    a = look(write_fits(tmp_path / 'a.fits', IMAGE), PLAIN)
+    b = look(write_fits(tmp_path / 'b.fits', IMAGE), PLAIN)
+    with pytest.raises(IngestError, match=r'b\.fits: has the time of .*a\.fits'):
+        check_alike([a, b])
+    cut = type(IMAGE)(IMAGE.time_ns + 1, IMAGE.pixels[:-2])
+    c = look(write_fits(tmp_path / 'c.fits', cut), PLAIN)
+    with pytest.raises(IngestError, match=r'c\.fits: 640 x 510 pixels, .*a\.fits has 640 x 512'):
+        check_alike([a, c])

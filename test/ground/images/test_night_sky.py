@@ -1,0 +1,322 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Calibration from images alone, against the truth of the simulated bag in the repository."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+from astropy.io import fits
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bench.night_sky import calibrated, camera_of, off_arcsec
+from starcal_ground.cli.main import main
+from starcal_ground.images.from_stars import from_stars
+from starcal_ground.images.night_sky import calibrate_images, photographs_of
+from starcal_ground.simulation.rendering import images
+import starcal_ros
+from starcal_ros.arrays import Pixels
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import NotFromStars
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.records import Image
+from starcal_ros.sky.catalog import load_catalog
+
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
+TOPIC = '/camera/image_raw'
+
+
+def tiny_images() -> list[Image]:
+    topic = next(t.name for t in reader.topics([TINY]) if t.type_name.endswith('/Image'))
+    return [one for one in reader.read_images([TINY], topic) if isinstance(one, Image)]
+
+
+def write_pngs(images: Sequence[Pixels], folder: Path) -> Path:
+    folder.mkdir()
+    for k, pixels in enumerate(images):
+        cv2.imwrite(str(folder / f'{k:02}.png'), pixels)
+    return folder
+
+
+def difference_and_sigma_arcsec(calibration: starcal_ros.Calibration) -> tuple[float, float]:
+    """RMS difference of lines of sight from the truth, common rotation removed, and 1-sigma."""
+    truth = json.loads((TINY / 'truth.json').read_text())
+    camera = calibration.geometry.camera
+    parameters = np.array([*truth['k_true'], *truth['d_true']])
+    true = CameraModel(camera.width, camera.height, parameters)
+    pixels = pixel_grid(camera, 15, 15)
+    a, b = line_of_sight(camera, pixels), line_of_sight(true, pixels)
+    turn, _ = Rotation.align_vectors(b, a)
+    assert calibration.maps is not None
+    sigma = float(np.sqrt(np.mean(calibration.maps.shape_sigma_arcsec**2)))
+    difference = np.linalg.norm(turn.apply(a) - b, axis=1)
+    return float(np.sqrt(np.mean(difference**2))) / ARCSECOND_RAD, sigma
+
+
+@pytest.mark.slow
+def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / 'bag.mcap'
+    with BagWriter(bag) as writer:
+        for image in tiny_images():
+            writer.write_image(TOPIC, image, 'camera')
+    assert main(['calibrate', str(bag), '-o', str(tmp_path / 'out')]) in (0, 3)
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    difference, sigma = difference_and_sigma_arcsec(calibration)
+    assert difference < 2 * sigma
+    assert not calibration.has_alignment
+    said = capsys.readouterr().out
+    assert 'none: attitudes from the stars' in said
+    # No star tracker is a cause of its sigma, and no column is of an alignment.
+    assert 'star tracker' not in said and 'with alignment' not in said
+    page = (tmp_path / 'out' / 'report.html').read_text()
+    assert 'No alignment' in page and 'star tracker slow error' not in page
+
+
+@pytest.mark.slow
+def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_clock(
+    tmp_path: Path,
+) -> None:
+    mirrored = [one.pixels[:, ::-1].copy() for one in tiny_images()]
+    calibration = calibrate_images(write_pngs(mirrored, tmp_path / 'night'))
+    difference, sigma = difference_and_sigma_arcsec(calibration)
+    assert not calibration.has_alignment
+    assert difference < 2 * sigma
+
+
+@pytest.mark.slow
+def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
+    given, half_deg = camera_of(59)
+    frames = images(dataclasses.replace(given, image_count=4))
+    found = from_stars(frames, load_catalog())
+    true = given.truth.camera
+    assert half_deg > 50 and found.camera.model == true.model == 'equidistant'
+    assert len(found.icrf_from_camera) == 4
+    assert found.camera.parameters[0] == pytest.approx(true.parameters[0], rel=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('camera', [44, 109, 137])
+def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(camera: int) -> None:
+    """
+    As a pinhole, the corners of 44 without stars were off by 22 of their sigmas, and accepted.
+
+    The images of 109 looked like several lenses: their focal length traded with their distortion.
+    The stars of 137 hardly separate the coefficients of its lens, nor without a prior anything.
+    """
+    given, _ = camera_of(camera)
+    found = calibrated(given)
+    error_arcsec, sigma_arcsec = off_arcsec(found, given.truth.camera)
+    assert found.accepted and found.geometry.camera.model == given.truth.camera.model
+    assert error_arcsec < 5.0 * sigma_arcsec
+
+
+def zoomed(pixels: Pixels, factor: float) -> Pixels:
+    height, width = pixels.shape
+    middle = (np.array([width, height]) - 1) / 2
+    turn = np.column_stack([np.eye(2) * factor, (1 - factor) * middle])
+    size = (width, height)
+    found = cv2.warpAffine(pixels, turn, size, flags=cv2.INTER_CUBIC)
+    return found.astype(np.uint16)
+
+
+def lights(seed: int) -> Pixels:
+    """Lights in random places: a city, or a hall."""
+    rng = np.random.default_rng(seed)
+    light = np.zeros((512, 640))
+    light[rng.integers(5, 500, 60), rng.integers(5, 630, 60)] = rng.uniform(1e3, 2e4, 60)
+    seen = cv2.GaussianBlur(light, (0, 0), 1.0) + rng.normal(200.0, 5.0, light.shape)
+    return seen.clip(0, 65535).astype(np.uint16)
+
+
+def test_two_images_are_too_few(tmp_path: Path) -> None:
+    folder = write_pngs([one.pixels for one in tiny_images()[:2]], tmp_path / 'night')
+    with pytest.raises(NotFromStars, match='2 different images, 3 are needed: take 20 frames'):
+        calibrate_images(folder)
+
+
+def test_one_frame_many_times_is_too_few(tmp_path: Path) -> None:
+    pixels = tiny_images()[0].pixels
+    folder = write_pngs([pixels] * 4, tmp_path / 'night')
+    said = r'1 different images \(3 more are copies\), 3 are needed: take 20 frames'
+    with pytest.raises(NotFromStars, match=said):
+        calibrate_images(folder)
+
+
+@pytest.mark.slow
+def test_frames_that_are_no_sky_are_counted(tmp_path: Path) -> None:
+    frames = [*(one.pixels for one in tiny_images()[:2]), lights(0), lights(1)]
+    folder = write_pngs(frames, tmp_path / 'night')
+    said = '2 of 4 images match the sky, 3 are needed: take 20 frames.*no frames of anything else'
+    with pytest.raises(NotFromStars, match=said):
+        calibrate_images(folder)
+
+
+@pytest.mark.slow
+def test_a_zoom_between_the_frames_is_named(tmp_path: Path) -> None:
+    frames = [one.pixels for one in tiny_images()[:6]]
+    frames[3:] = [zoomed(pixels, 1.1) for pixels in frames[3:]]
+    folder = write_pngs(frames, tmp_path / 'night')
+    with pytest.raises(NotFromStars, match='focal lengths of 180. to 198. px: .* zoom .*take 20'):
+        calibrate_images(folder)
+
+
+@pytest.mark.slow
+def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
+    """As a picture of a planetarium on a screen among images of the sky."""
+    frames = tiny_images()
+    frames[4] = Image(frames[4].time_ns, zoomed(frames[4].pixels, 1.1))
+    found = from_stars(frames, load_catalog())
+    assert found.icrf_from_camera.keys() == {one.time_ns for one in frames} - {frames[4].time_ns}
+    (focal_px,) = found.other_focal_px
+    assert focal_px == pytest.approx(1.1 * found.camera.parameters[0], rel=5e-3)
+    assert f'left out, with another focal length: {focal_px:.0f} px' in found.in_a_sentence()
+
+
+@pytest.mark.slow
+def test_a_change_of_focus_is_refused_by_the_gate(tmp_path: Path) -> None:
+    frames = [one.pixels for one in tiny_images()[:6]]
+    frames[3:] = [zoomed(pixels, 1.005) for pixels in frames[3:]]
+    calibration = calibrate_images(write_pngs(frames, tmp_path / 'night'))
+    assert not calibration.accepted
+    assert 'focal length or lens changes between images' in ' '.join(calibration.reasons)
+
+
+def test_pictures_without_stars_are_refused_with_the_frames_to_take(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    flat = [rng.normal(100, 3, (300, 400)).astype(np.uint8) for _ in range(3)]
+    with pytest.raises(NotFromStars, match=r'no stars: .* take 20 frames'):
+        calibrate_images(write_pngs(flat, tmp_path / 'night'))
+
+
+@pytest.mark.parametrize('side', [3, 8, 17])
+def test_pictures_smaller_than_a_star_are_pictures_without_stars(
+    tmp_path: Path, side: int
+) -> None:
+    rng = np.random.default_rng(side)
+    pixels = [rng.integers(0, 255, (side, side + 3), np.uint8) for _ in range(4)]
+    with pytest.raises(NotFromStars, match='no stars'):
+        calibrate_images(write_pngs(pixels, tmp_path / 'night'))
+
+
+@pytest.mark.slow
+def test_bad_files_among_photographs_cost_a_line_for_each_reason(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    frames = [*(one.pixels for one in tiny_images()), lights(0)]
+    folder = write_pngs(frames, tmp_path / 'night')
+    os.mkfifo(folder / 'pipe.png')
+    (folder / 'zero.png').symlink_to('/dev/zero')
+    (folder / 'loop.png').symlink_to('loop.png')
+    (folder / 'folder.png').mkdir()
+    whole = (folder / '00.png').read_bytes()
+    for k in range(50):  # the header is sound, the pixels are not
+        (folder / f'half{k}.png').write_bytes(whole[:9000])
+        (folder / f'a{k}.jpg').write_bytes(b'\xff\xd8\xff' + bytes(200))
+    cut = cv2.imencode('.jpg', (tiny_images()[0].pixels / 256).astype(np.uint8))[1].tobytes()
+    (folder / 'cut.jpg').write_bytes(cut[: len(cut) // 2])
+    assert main(['calibrate', str(folder), '-o', str(tmp_path / 'out')]) in (0, 3)
+    said = capfd.readouterr().err
+    assert 'left out: 50 files (half0.png, half1.png, half10.png, ...): a PNG, not r' in said
+    assert 'left out: 50 files (a0.jpg, a1.jpg, a10.jpg, ...): a JPEG, not readable' in said
+    assert 'left out: 2 files (pipe.png, zero.png): not a regular file' in said
+    assert 'left out: 1 file (cut.jpg): damaged' in said
+    assert len(said.splitlines()) < 12
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert calibration.images_used == len(tiny_images())
+    # In the words of photographs, which have no attitudes.
+    assert calibration.images_refused == {'no_match': 1}
+
+
+def daylight(seed: int, size: tuple[int, int] = (512, 640)) -> Pixels:
+    """A picture with detail of all sizes, evenly lit: leaves, clouds, walls."""
+    rng = np.random.default_rng(seed)
+    light = np.full(size, 9000.0)
+    for blur_px in (1.0, 3.0, 9.0, 30.0):
+        noise = cv2.GaussianBlur(rng.normal(size=size), (0, 0), blur_px)
+        light += 2000.0 * noise / noise.std()
+    return light.clip(0, 65535).astype(np.uint16)
+
+
+def dark(seed: int) -> Pixels:
+    """A dark frame with hot pixels."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.normal(200.0, 5.0, (512, 640))
+    pixels[rng.integers(0, 512, 300), rng.integers(0, 640, 300)] += rng.uniform(200, 9000, 300)
+    return pixels.astype(np.uint16)
+
+
+def jpeg(pixels: Pixels, quality: int) -> Pixels:
+    """An image in 8 bit, compressed and read again."""
+    eight = (pixels / 8.0).clip(0, 255).astype(np.uint8)
+    coded = cv2.imencode('.jpg', eight, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED))
+
+
+def test_the_group_with_stars_is_taken_not_the_largest(tmp_path: Path) -> None:
+    folder = write_pngs([daylight(k, (400, 500)) for k in range(8)], tmp_path / 'card')
+    for k, image in enumerate(tiny_images()[:3]):
+        cv2.imwrite(str(folder / f'night{k}.png'), image.pixels)
+    chosen, notes = photographs_of([folder])
+    assert [one.path.name for one in chosen] == ['night0.png', 'night1.png', 'night2.png']
+    assert notes == [
+        '3 images of 640 x 512 are used; left out: 8 of 500 x 400, which show no stars'
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('other', [daylight, dark])
+def test_many_images_of_no_stars_do_not_hide_a_few_of_stars(
+    other: Callable[[int], Pixels],
+) -> None:
+    nights = tiny_images()[:4]
+    others = [Image(nights[0].time_ns - 10**9 * (k + 1), other(k)) for k in range(16)]
+    found = from_stars([*others, *nights], load_catalog())
+    assert found.icrf_from_camera.keys() == {one.time_ns for one in nights}
+
+
+@pytest.mark.parametrize('kind', ['Dark Frame', 'FLAT', 'Bias Frame', 'Master Dark'])
+def test_frames_of_the_detector_are_left_out_by_their_headers(tmp_path: Path, kind: str) -> None:
+    for name, value in (('light', 'Light Frame'), ('other', kind)):
+        hdu = fits.PrimaryHDU(np.ones((30, 40), np.float32))
+        hdu.header['IMAGETYP'] = value
+        hdu.writeto(tmp_path / f'{name}.fits')
+    chosen, notes = photographs_of([tmp_path])
+    assert [one.path.name for one in chosen] == ['light.fits']
+    assert notes == [
+        'left out: 1 file (other.fits): no image of the sky: IMAGETYP is ' + repr(kind.lower())
+    ]
+
+
+def test_copies_that_were_compressed_again_are_one_image(tmp_path: Path) -> None:
+    noise = np.random.default_rng(2).normal(0.0, 40.0, (512, 640))
+    pixels = (tiny_images()[0].pixels + 200.0 + noise).clip(0).astype(np.uint16)
+    copies = [jpeg(pixels, quality) for quality in (95, 90, 80, 70)]
+    folder = write_pngs(copies, tmp_path / 'night')
+    with pytest.raises(NotFromStars, match=r'1 different images \(3 more are copies\)'):
+        calibrate_images(folder)
+
+
+def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
+    """Also with a pattern that the sensor adds to each."""
+    pixels = tiny_images()[0].pixels.astype(np.float64)
+    sky = cv2.medianBlur(tiny_images()[0].pixels, 5)
+    stars = np.where(pixels > sky + 60.0, pixels, sky)
+    rng = np.random.default_rng(3)
+    pattern = rng.normal(0.0, 3.0, pixels.shape)
+    frames = [
+        jpeg((stars + pattern + rng.normal(0.0, 6.0, pixels.shape)).clip(0).astype(np.uint16), 90)
+        for _ in range(2)
+    ]
+    with pytest.raises(NotFromStars, match='^2 different images, 3 are needed'):
+        calibrate_images(write_pngs(frames, tmp_path / 'night'))

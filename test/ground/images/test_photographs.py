@@ -1,0 +1,209 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Facts of photographs by their EXIF tags and FITS headers, written by Pillow and Astropy."""
+
+from __future__ import annotations
+
+import calendar
+from collections.abc import Mapping
+import math
+import os
+from pathlib import Path
+import struct
+import time
+
+from astropy.io import fits
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, TiffImagePlugin
+import pytest
+
+from starcal_ground.images.photographs import (
+    by_camera,
+    image_paths,
+    in_order,
+    look_at,
+    pixels_of_photograph,
+    Refusals,
+    without_copies,
+)
+from starcal_ros.errors import IngestError
+
+TIME_S = calendar.timegm((2024, 3, 9, 22, 10, 4))
+EXIF, GPS = 0x8769, 0x8825
+CANON: Mapping[int, object] = {0x010F: 'Canon', 0x0110: 'EOS'}
+DATE: Mapping[int, object] = {0x9003: '2024:03:09 23:10:00', 0x9011: '+01:00', 0x829A: 8.0}
+
+
+def jpeg(
+    path: Path,
+    tags: Mapping[int, object],
+    of_exif: Mapping[int, object],
+    gps: Mapping[int, object] | None = None,
+    size: tuple[int, int] = (60, 40),
+) -> Path:
+    exif = Image.Exif()
+    exif.update({**tags, EXIF: dict(of_exif), GPS: dict(gps or {})})
+    Image.new('RGB', size, (10, 60, 110)).save(path, exif=exif, quality=95)
+    return path
+
+
+def test_focal_length_of_35_mm_film_is_by_the_diagonal(tmp_path: Path) -> None:
+    one = look_at(jpeg(tmp_path / 'a.jpg', CANON, {0xA405: 24}))
+    assert one.focal_px == pytest.approx(24 / math.hypot(36, 24) * math.hypot(60, 40), rel=1e-4)
+    assert math.isnan(look_at(jpeg(tmp_path / 'b.jpg', CANON, {0xA405: 0})).focal_px)
+
+
+def test_focal_length_by_the_pixels_of_the_sensor_goes_before_it(tmp_path: Path) -> None:
+    # 6000 pixels at 2540 a centimetre, in inches; this image is at a hundredth of that.
+    tags: dict[int, object] = {0x920A: 50.0, 0xA20E: 6451.6, 0xA210: 2, 0xA002: 6000, 0xA405: 80}
+    one = look_at(jpeg(tmp_path / 'a.jpg', CANON, tags))
+    assert one.focal_px == pytest.approx(50.0 / (25.4 / 6451.6 * 100), rel=1e-4)
+    given = look_at(tmp_path / 'a.jpg', focal_length_mm=20.0, pixel_um=4.0)
+    assert given.focal_px == pytest.approx(5000.0)
+
+
+def test_the_stamp_is_the_middle_of_the_exposure_in_utc(tmp_path: Path) -> None:
+    one = look_at(jpeg(tmp_path / 'a.jpg', CANON, DATE))
+    assert (one.time_ns, one.dated, one.utc) == (TIME_S * 10**9, True, True)
+    local = look_at(jpeg(tmp_path / 'b.jpg', CANON, {**DATE, 0x9011: ''}))
+    assert (local.time_ns, local.utc) == ((TIME_S + 3600) * 10**9, False)
+    never_set = jpeg(tmp_path / 'c.jpg', CANON, {0x9003: '1980:01:01 00:00:00'})
+    os.utime(never_set, (TIME_S, TIME_S))
+    assert look_at(never_set).time_ns == TIME_S * 10**9
+    assert not look_at(never_set).dated
+
+
+def test_gps_tags_are_the_site(tmp_path: Path) -> None:
+    gps: dict[int, object] = {
+        1: 'S', 2: (33.0, 27.0, 30.0), 3: 'W', 4: (70.0, 40.0, 12.0), 5: b'\0', 6: 520.0,
+    }  # fmt: skip
+    site = look_at(jpeg(tmp_path / 'a.jpg', CANON, DATE, gps)).site
+    assert site == pytest.approx((-(33 + 27.5 / 60), -(70 + 40.2 / 60), 520.0))
+    assert (
+        look_at(jpeg(tmp_path / 'b.jpg', CANON, DATE, {1: 'S', 2: (95.0, 0.0, 0.0)})).site is None
+    )
+
+
+def test_portrait_is_the_image_of_the_sensor_and_cameras_are_told_apart(tmp_path: Path) -> None:
+    flat = look_at(jpeg(tmp_path / 'a.jpg', CANON, {0x920A: 50.0}))
+    upright = look_at(jpeg(tmp_path / 'b.jpg', {**CANON, 0x0112: 6}, {0x920A: 50.0}))
+    zoomed = look_at(jpeg(tmp_path / 'c.jpg', CANON, {0x920A: 35.0}))
+    other = look_at(jpeg(tmp_path / 'd.jpg', CANON, {0x920A: 50.0, 0xA431: '0815'}))
+    groups = by_camera([flat, zoomed, upright, other])
+    assert list(groups) == [
+        'Canon EOS 50 mm 60 x 40',
+        'Canon EOS 35 mm 60 x 40',
+        'Canon EOS 0815 50 mm 60 x 40',
+    ]
+    assert pixels_of_photograph(upright.path).shape == (40, 60)
+
+
+def test_green_light_of_a_colour_image_without_the_curve(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / 'a.png'), np.full((4, 5, 3), (0, 188, 255), np.uint8))
+    pixels = pixels_of_photograph(tmp_path / 'a.png')
+    # 188 of sRGB is half of the light of white, to 1 %.
+    assert pixels.dtype == np.uint16
+    assert pixels[0, 0] / 65535 == pytest.approx(0.5, abs=0.005)
+
+
+def test_fits_header_with_wcs_and_date(tmp_path: Path) -> None:
+    hdu = fits.PrimaryHDU(np.ones((30, 40), np.float32))
+    hdu.header.update(
+        {'CD1_1': 0.01, 'CD2_1': 0.0, 'DATE-OBS': '2024-03-09T22:10:00', 'EXPTIME': 8.0}
+    )
+    hdu.header['INSTRUME'] = 'ASI'
+    hdu.writeto(tmp_path / 'a.fits')
+    one = look_at(tmp_path / 'a.fits')
+    assert one.focal_px == pytest.approx(math.degrees(100.0))
+    assert (one.time_ns, one.dated, one.camera) == (TIME_S * 10**9, True, 'ASI')
+
+
+def test_equal_stamps_are_set_apart(tmp_path: Path) -> None:
+    for name in 'ab':
+        jpeg(tmp_path / f'{name}.jpg', CANON, DATE)
+    paths = image_paths([tmp_path])
+    first, second = in_order([look_at(path) for path in paths])
+    assert second.time_ns - first.time_ns == 10**9
+
+
+def test_of_files_with_one_time_of_exposure_the_largest_is_kept(tmp_path: Path) -> None:
+    for name, part, quality in (('a', '25', 50), ('b', '25', 95), ('c', '75', 95)):
+        exif = Image.Exif()
+        exif.update({**CANON, EXIF: {**DATE, 0x9291: part}})
+        pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f'{name}.jpg', exif=exif, quality=quality)
+    refusals = Refusals()
+    kept = without_copies([look_at(path) for path in image_paths([tmp_path])], refusals)
+    assert sorted(one.path.name for one in kept) == ['b.jpg', 'c.jpg']
+    assert refusals.lines() == [
+        'left out: 1 file (a.jpg): a copy: another file has its time of exposure'
+    ]
+
+
+def dng(path: Path, mosaic: NDArray[np.uint16]) -> Path:
+    """Write a mosaic with red at the top left as DNG 1.4: a TIFF by Pillow, its kind changed."""
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    one = TiffImagePlugin.IFDRational(1, 1)
+    short, byte, text, long_, ratio, signed = 3, 1, 2, 4, 5, 10
+    values: dict[int, tuple[int, object]] = {
+        306: (text, '2024:03:09 23:10:00'),
+        33421: (short, (2, 2)),  # size and colours of the pattern
+        33422: (byte, bytes([0, 1, 1, 2])),
+        33434: (ratio, TiffImagePlugin.IFDRational(8, 1)),  # s of exposure
+        37386: (ratio, TiffImagePlugin.IFDRational(50, 1)),  # mm
+        50706: (byte, bytes([1, 4, 0, 0])),
+        50708: (text, 'Canon EOS R6'),
+        50714: (short, 512),  # black and white level
+        50717: (long_, 16383),
+        50721: (signed, tuple(one * int(i % 4 == 0) for i in range(9))),
+    }
+    for tag, (kind, value) in values.items():
+        tags.tagtype[tag], tags[tag] = kind, value
+    Image.fromarray(mosaic).save(path, format='TIFF', tiffinfo=tags)
+    kind_of_picture = struct.Struct('<HHII')
+    gray, mosaic_of_colours = (kind_of_picture.pack(262, 3, 1, k) for k in (1, 32803))
+    path.write_bytes(path.read_bytes().replace(gray, mosaic_of_colours))
+    return path
+
+
+@pytest.mark.parametrize('zone', ['UTC', 'America/New_York'])
+def test_camera_raw_has_the_facts_of_its_tags(
+    tmp_path: Path, zone: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock of the camera has no zone, and that of this machine does not count."""
+    pytest.importorskip('rawpy')
+    monkeypatch.setenv('TZ', zone)
+    time.tzset()
+    one = look_at(dng(tmp_path / 'a.DNG', np.full((80, 120), 600, np.uint16)), pixel_um=5.0)
+    monkeypatch.undo()
+    time.tzset()
+    assert (one.width, one.height) == (120, 80)
+    assert one.focal_px == pytest.approx(10000.0)
+    assert one.time_ns == (calendar.timegm((2024, 3, 9, 23, 10, 0)) + 4) * 10**9
+    assert one.dated and not one.utc
+
+
+def test_green_of_camera_raw_is_linear_in_light(tmp_path: Path) -> None:
+    pytest.importorskip('rawpy')
+    mosaic = np.full((80, 120), 612, np.uint16)
+    mosaic[::2, ::2] = mosaic[1::2, 1::2] = 9000  # red and blue
+    mosaic[40, 61] = 4612
+    light = pixels_of_photograph(dng(tmp_path / 'a.dng', mosaic)).astype(float)
+    # LibRaw rounds each value to an integer before it scales it, and once more.
+    unit = 65535 / (16383 - 512)
+    assert light[40, 61] == pytest.approx(4100 * unit, abs=2 * unit)
+    assert light[10, 10] == light[11, 10] == pytest.approx(100 * unit, abs=2 * unit)
+    assert light[40, 62] == pytest.approx((3 * 100 + 4100) / 4 * unit, abs=2 * unit)
+
+
+def test_a_damaged_raw_file_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip('rawpy')
+    path = tmp_path / 'a.nef'
+    path.write_bytes(b'II*\0' + b'x' * 5000)
+    with pytest.raises(IngestError, match='a.nef: camera raw, not readable: Unsupported file'):
+        look_at(path)
+    whole = dng(tmp_path / 'b.dng', np.full((80, 120), 600, np.uint16))
+    whole.write_bytes(whole.read_bytes()[:-5000])
+    with pytest.raises(IngestError, match='b.dng: camera raw, not readable: '):
+        pixels_of_photograph(whole)

@@ -1,0 +1,184 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Refraction found by the stars alone, against the chain of ERFA with a known site and clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import erfa
+import numpy as np
+import pytest
+from random_pointings import honesty  # type: ignore[import-not-found]
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.images.from_stars import options_of, pinhole
+from starcal_ground.images.unknown_air import with_air
+from starcal_ground.simulation.scenario import scenario
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import project
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.unknowns import Refraction
+from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
+from starcal_ros.sky.astrometry import (
+    apparent_directions,
+    refracted,
+    SiteOptions,
+    standard_pressure_hpa,
+    through_the_air,
+    zenith_of,
+)
+from starcal_ros.sky.catalog import load_catalog
+
+SITE = SiteOptions(observer='ground', latitude_deg=47.0, longitude_deg=11.0, height_m=500.0)
+CAMERA = pinhole((1200, 900), 2000.0).replace(k1=-0.05, cx=611.0, p1=4e-4)
+START_NS = 1_700_000_000_000_000_000
+NOISE_PX = 0.08
+
+
+def seen_from(site: SiteOptions, seed: int, wrong_clock: bool = False) -> list[StarObservations]:
+    """Images of one night, at elevations above 35 degrees of the site, with apparent places."""
+    rng = np.random.default_rng(seed)
+    catalog = load_catalog(None, 6.5)
+    found: list[StarObservations] = []
+    while len(found) < 10:
+        time_ns = START_NS + len(found) * 600 * 10**9
+        attitude = Rotation.random(random_state=int(rng.integers(2**31)))
+        near = np.flatnonzero(attitude.apply(catalog.direction_icrs)[:, 2] > math.cos(0.45))
+        stars = catalog.select(near)
+        apparent = apparent_directions(stars, time_ns)
+        air, elevation = through_the_air(apparent, time_ns, SITE)
+        if np.median(elevation) < math.radians(35.0):
+            continue
+        true = air if site.observer == 'ground' else apparent
+        pixels = project(CAMERA, attitude.apply(true))
+        inside = (pixels > 0).all(axis=1) & (pixels < [1199, 899]).all(axis=1)
+        n = int(inside.sum())
+        stamp_ns = START_NS + int(rng.integers(10**15)) if wrong_clock else time_ns
+        found.append(
+            dataclasses.replace(
+                StarObservations.of_image(stamp_ns, (1200, 900)),
+                icrf_from_star_tracker_xyzw=attitude.inv().as_quat(),
+                catalog_id=stars.id[inside],
+                direction_icrf=apparent[inside],
+                magnitude=stars.magnitude[inside].astype(np.float32),
+                measured_px=pixels[inside] + rng.normal(0.0, NOISE_PX, (n, 2)),
+                covariance_px2=np.tile([NOISE_PX**2, 0.0, NOISE_PX**2], (n, 1)),
+                flux_dn=np.full(n, np.nan, np.float32),
+                snr=np.full(n, 20.0, np.float32),
+            )
+        )
+    return found
+
+
+def estimate(images: list[StarObservations]) -> Estimate:
+    known = {f.name for f in dataclasses.fields(CalibrationOptions)}
+    options = CalibrationOptions(
+        **{k: v for k, v in options_of({}).items() if k in known}  # type: ignore[arg-type]
+    )
+    used = tuple(one for one in images if not one.refusal)
+    prior = CameraGeometry(CAMERA, np.array([0.0, 0.0, 0.0, 1.0]))
+    return estimate_calibration(Ensemble(used), prior, options)
+
+
+def unmoved(pixels: Floats) -> Floats:
+    return np.zeros_like(pixels)
+
+
+@pytest.mark.parametrize('wrong_clock', [False, True])
+def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: bool) -> None:
+    errors = []
+    for seed in range(4):
+        images, text = with_air(seen_from(SITE, seed, wrong_clock), CAMERA)
+        assert text.startswith('observer: ground: ')
+        declination = math.degrees(math.asin(images[0].zenith_icrf[2]))
+        assert abs(declination - SITE.latitude_deg) < 8.0
+        given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
+        errors.append(honesty(given, estimate(images), unmoved)[0])
+    assert np.sqrt(np.mean(np.square(errors))) < 1.3
+
+
+def test_in_space_no_ground_is_found_and_the_sigma_is_honest() -> None:
+    for seed in range(4):
+        images, text = with_air(seen_from(SiteOptions(), seed), CAMERA)
+        assert not text.startswith('observer: ground: ')
+        given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
+        assert honesty(given, estimate(images), unmoved)[0] < 2.0
+
+
+def test_an_image_of_another_shape_is_refused() -> None:
+    images = seen_from(SITE, 3)
+    middle = np.array([600.0, 450.0])
+    off = images[4].measured_px - middle
+    sheared = images[4].measured_px + 0.004 * off[:, 1:] * [1.0, 0.0]
+    images[4] = dataclasses.replace(images[4], measured_px=sheared)
+    after, _ = with_air(images, CAMERA)
+    assert [one.refusal for one in after] == [''] * 4 + ['no_match'] + [''] * 5
+    assert 'stretched by ' in after[4].detail
+
+
+def test_refraction_by_the_zenith_is_that_of_erfa_to_an_arcsecond() -> None:
+    time_ns, dry = START_NS, dataclasses.replace(SITE, air_pressure_hpa=1e-6)
+    catalog = load_catalog(None, 5.0)
+    apparent = apparent_directions(catalog, time_ns)
+    without, height = through_the_air(apparent, time_ns, dry)
+    with_air_icrf, _ = through_the_air(apparent, time_ns, SITE)
+    # The zenith itself, from the heights of the stars about it.
+    high = height > 0.5
+    zenith = np.linalg.lstsq(without[high], np.sin(height[high]), rcond=None)[0]
+    zenith /= np.linalg.norm(zenith)
+    pressure_hpa = standard_pressure_hpa(SITE.height_m, SITE.air_temperature_degc)
+    sized = math.degrees(erfa.refco(pressure_hpa, 10.0, 0.5, 0.55)[0]) * 3600.0
+    high = height > math.radians(20.0)
+    off = refracted(without[high], zenith, sized) - with_air_icrf[high]
+    arcsec = np.degrees(np.linalg.norm(off, axis=1)) * 3600.0
+    assert np.median(arcsec) < 1.0
+    assert arcsec.max() < 3.0
+
+
+def test_derivatives_of_refraction_are_those_of_differences() -> None:
+    rng = np.random.default_rng(4)
+    times: Floats = np.array([0.17, 0.24])
+    zenith = zenith_of(0.7, times)
+    stamps = np.array([0, 10**12], np.int64)
+    air = Refraction(stamps, zenith, 54.0, 6.0)
+    assert air.labels == ('latitude_rad', 'sidereal_time_1_rad', 'sidereal_time_2_rad')
+    e = zenith[1] + rng.normal(0, 0.2, (50, 3))
+    e /= np.linalg.norm(e, axis=1, keepdims=True)
+    image, axes = np.ones(50, np.int64), np.tile(np.eye(3), (2, 1, 1))
+    turns = air.by_site(axes, np.empty((2, 50)), e.T, image)
+    for row, other in (
+        (0, zenith_of(0.7 + 1e-3, times)),
+        (2, zenith_of(0.7, times + 1e-3)),
+    ):
+        before = refracted(e, zenith[1], 54.0)
+        moved = (refracted(e, other[1], 54.0) - before) / 1e-3
+        by_turn = -np.cross(turns[:, row].T, e)
+        # The cubic term and the length of the step are 1 % of it.
+        assert np.abs(by_turn - moved).max() < 0.02 * np.abs(moved).max()
+    size = -np.cross(air.by_size(axes, np.empty((2, 50)), e.T, image)[:, 0].T, e)
+    moved = refracted(e, zenith[1], 55.0) - refracted(e, zenith[1], 54.0)
+    assert np.abs(size - moved).max() < 0.01 * np.abs(moved).max()
+    assert (turns[:, 1] == 0).all()
+
+
+def test_one_clock_has_one_time() -> None:
+    stamps = np.arange(5, dtype=np.int64) * 10**12
+    times: Floats = np.asarray(1.0 + 7.292115e-14 * stamps, np.float64)
+    zenith = zenith_of(0.3, times)
+    assert Refraction(stamps, zenith, 54.0, 6.0).labels == ('latitude_rad', 'sidereal_time_1_rad')
+
+
+def test_no_velocity_of_a_star_is_blamed_for_what_stands_before_the_sky() -> None:
+    """Of images with a tree, space was found, and then a velocity of 570 km/s."""
+    shift = np.array([0.0, 570.0, 0.0]) / 299792.458
+    images = []
+    for one in seen_from(SiteOptions(observer='space'), 5):
+        camera_from_icrf = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).inv()
+        moved = one.direction_icrf + shift
+        moved /= np.linalg.norm(moved, axis=1)[:, None]
+        shifted_px = project(CAMERA, camera_from_icrf.apply(moved))
+        images.append(dataclasses.replace(one, measured_px=shifted_px))
+    _, text = with_air(images, CAMERA)
+    assert 'something else than air shifts the stars' in text and ' km/s' in text

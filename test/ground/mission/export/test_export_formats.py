@@ -1,0 +1,318 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Exported files, read back by OpenCV, yaml and the published equations of their readers."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+import dataclasses
+import json
+import math
+from pathlib import Path
+import subprocess
+
+import cv2
+from export_calibrations import calibration  # type: ignore[import-not-found]
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+import spiceypy
+import yaml
+
+from starcal_ground.mission.export.export_formats import export, Exported, FORMATS
+from starcal_ground.mission.export.spice import SpiceNames
+from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.camera.conversion import nearest_camera
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.records import Calibration, SigmaPart
+
+GRID = 25  # the grid over which an export states its error
+# OpenCV projects in double precision: some ten roundings of 1e-13 px each.
+SAME_PX = 1e-9
+
+
+def grid_of(made: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    camera = made.geometry.camera
+    pixels = pixel_grid(camera, GRID, GRID)
+    return pixels, line_of_sight(camera, pixels)
+
+
+def worst_px(seen: np.ndarray, pixels: np.ndarray) -> float:
+    return float(np.linalg.norm(seen - pixels, axis=1).max())
+
+
+def opencv_pixels(
+    directions: np.ndarray, K: np.ndarray, D: np.ndarray, fisheye: bool
+) -> np.ndarray:
+    module = cv2.fisheye if fisheye else cv2
+    zero = np.zeros((3, 1))
+    points = directions.reshape(1, -1, 3) if fisheye else directions
+    arguments = (points, zero, zero, K, D)
+    seen, _ = module.projectPoints(*arguments)
+    return np.asarray(seen.reshape(-1, 2))
+
+
+@pytest.mark.parametrize('with_field', [False, True])
+@pytest.mark.parametrize('skew', [0.0, -0.74])
+@pytest.mark.parametrize(
+    'model', ['plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidistant']
+)
+def test_opencv_sees_a_star_where_the_calibration_does(tmp_path, model, skew, with_field) -> None:
+    made = calibration(model, skew, with_field)
+    done = export(made, 'opencv', tmp_path, None)
+    storage = cv2.FileStorage(str(done.files[0]), cv2.FILE_STORAGE_READ)
+    K = storage.getNode('camera_matrix').mat()
+    D = storage.getNode('distortion_coefficients').mat()
+    size = [int(storage.getNode(f'image_{side}').real()) for side in ('width', 'height')]
+    assert size == [1296, 1024] and K[0, 1] == 0.0
+    pixels, directions = grid_of(made)
+    fisheye = storage.getNode('lens_model').string() == 'fisheye'
+    assert fisheye == (model == 'equidistant')
+    found_px = worst_px(opencv_pixels(directions, K, D, fisheye), pixels)
+    assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
+    assert storage.getNode('largest_error_px').real() == pytest.approx(done.worst_px)
+    rotation = storage.getNode('rotation').mat()
+    tracker_from_camera = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw)
+    assert np.abs(rotation.T - tracker_from_camera.as_matrix()).max() < 1e-15
+    if not (skew or with_field):
+        assert found_px < SAME_PX and done.losses == ()
+    assert ('skew' in parts(done)) == bool(skew)
+    assert any('field' in part for part in parts(done)) == with_field
+
+
+def parts(done: Exported) -> list[str]:
+    return [loss.part for loss in done.losses]
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'tilted', 'equidistant'])
+def test_a_camchain_of_kalibr_has_the_error_it_states(tmp_path: Path, model: str) -> None:
+    made = calibration(model)
+    done = export(made, 'kalibr', tmp_path, None, topic='/opnav/image_raw')
+    cam = yaml.safe_load(done.files[0].read_text())['cam0']
+    assert cam['resolution'] == [1296, 1024] and cam['rostopic'] == '/opnav/image_raw'
+    fx, fy, cx, cy = cam['intrinsics']
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    # kalibr's models are those of OpenCV with four coefficients.
+    fisheye = cam['distortion_model'] == 'equidistant'
+    assert fisheye or cam['distortion_model'] == 'radtan'
+    pixels, directions = grid_of(made)
+    D = np.array(cam['distortion_coeffs'])
+    assert len(D) == 4
+    found_px = worst_px(opencv_pixels(directions, K, D, fisheye), pixels)
+    assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
+    T = np.array(cam['T_cam_imu'])
+    tracker_from_camera = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw)
+    assert np.abs(T[:3, :3].T - tracker_from_camera.as_matrix()).max() < 1e-15
+    assert (T[:3, 3] == 0).all()
+
+
+def test_kalibr_without_k3_costs_more_than_the_skew_alone(tmp_path: Path) -> None:
+    made = calibration('plumb_bob')
+    strong = made.geometry.camera.replace(k3=40.0)
+    made = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=strong))
+    opencv, kalibr = (export(made, kind, tmp_path, None) for kind in ('opencv', 'kalibr'))
+    assert kalibr.worst_px > opencv.worst_px > 0
+
+
+def test_ros_files_are_the_camera_without_skew_and_the_transform(tmp_path: Path) -> None:
+    made = calibration(with_field=True)
+    done = export(made, 'ros', tmp_path, None)
+    camera_path, alignment = done.files
+    pixels, directions = grid_of(made)
+    seen = project(read_camera_info(camera_path), directions)
+    assert worst_px(seen, pixels) == pytest.approx(done.worst_px, abs=SAME_PX)
+    rotation = yaml.safe_load(alignment.read_text())['transform']['rotation']
+    found = [rotation[axis] for axis in 'xyzw']
+    assert found == made.geometry.star_tracker_from_camera_xyzw.tolist()
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'thin_prism', 'tilted'])
+def test_giant_has_the_skew_and_the_focal_change(tmp_path: Path, model: str) -> None:
+    """By the equations that GIANT publishes: it is on no package registry."""
+    made = calibration(model, temperature=True)
+    done = export(made, 'giant', tmp_path, None)
+    content = json.loads(done.files[0].read_text())
+    named = content['OpenCVModel']
+    assert (named['a1'], named['a2']) == (4e-5, -6e-7)
+    assert (named['n_rows'], named['n_cols']) == (1024, 1296)
+    pixels, directions = grid_of(made)
+    x, y = directions[:, 0] / directions[:, 2], directions[:, 1] / directions[:, 2]
+    r2 = x**2 + y**2
+
+    def term(name: str) -> float:
+        return float(named.get(name, 0.0))
+
+    radial = (1 + term('k1') * r2 + term('k2') * r2**2 + term('k3') * r2**3) / (
+        1 + term('k4') * r2 + term('k5') * r2**2 + term('k6') * r2**3
+    )
+    p1, p2 = named['p1'], named['p2']
+    xd = radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    yd = radial * y + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    xd += term('s1') * r2 + term('s2') * r2**2
+    yd += term('s3') * r2 + term('s4') * r2**2
+    u = named['fx'] * xd + named['alpha'] * yd + named['px']
+    v = named['fy'] * yd + named['py']
+    assert worst_px(np.c_[u, v], pixels) == pytest.approx(done.worst_px, abs=SAME_PX)
+    if model != 'tilted':
+        assert done.worst_px < SAME_PX
+    assert not any('focal' in part for part in parts(done))
+    assert any('alignment' in part for part in parts(done))
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted'])
+def test_a_model_of_mrcal_has_the_error_it_states(tmp_path: Path, model: str) -> None:
+    """By OpenCV, whose model and order mrcal documents for LENSMODEL_OPENCVn."""
+    made = calibration(model)
+    done = export(made, 'mrcal', tmp_path, None)
+    lines = done.files[0].read_text().splitlines()
+    content = ast.literal_eval('\n'.join(line for line in lines if not line.startswith('#')))
+    fx, fy, cx, cy, *D = content['intrinsics']
+    assert content['lensmodel'] == f'LENSMODEL_OPENCV{len(D)}'
+    assert content['imagersize'] == [1296, 1024]
+    pixels, directions = grid_of(made)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    found_px = worst_px(opencv_pixels(directions, K, np.array(D), fisheye=False), pixels)
+    assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
+    assert 'skew' in parts(done)
+    camera_from_tracker = Rotation.from_rotvec(content['extrinsics'][:3])
+    tracker_from_camera = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw)
+    assert (camera_from_tracker * tracker_from_camera).magnitude() < 1e-15
+    assert content['extrinsics'][3:] == [0.0, 0.0, 0.0]
+
+
+def test_csv_is_the_table_of_lines_of_sight(tmp_path: Path) -> None:
+    made = calibration(with_field=True)
+    done = export(made, 'csv', tmp_path, None)
+    table = np.genfromtxt(done.files[0], delimiter=',', names=True)
+    assert len(table) == 65 * 65
+    pixels = np.c_[table['u_px'], table['v_px']]
+    expected = line_of_sight(made.geometry.camera, pixels)
+    assert (np.c_[table['x'], table['y'], table['z']] == expected).all()
+
+
+def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path: Path) -> None:
+    done = export(calibration(skew=0.0, temperature=True), 'opencv', tmp_path, None)
+    cost = {loss.part: loss.cost_px for loss in done.losses}
+    # 4e-5 per degree at the corner farthest from the principal point (651.25, 505.75).
+    corner_px = math.hypot(651.25, 1023 - 505.75)
+    assert cost['change of the focal length per degC'] == pytest.approx(4e-5 * corner_px)
+    # 1, 2, 3 urad about x, y, z: sqrt(5) urad across the axis, more in a corner by the roll.
+    across_px = 3642 * math.sqrt(5) * 1e-6
+    assert across_px < cost['change of the alignment per degC'] < across_px + 3e-6 * 900
+
+
+# As foreign names may be: an escape sequence, line ends, comments and blocks of other formats.
+HOSTILE = '\x1b[31m\x00\x7f\x85\u2028\r\n...\n*/ #error /* // ??/ \\ \\begindata @TABLE@ "\' %s µ'
+READERS: dict[str, Callable[[str], object]] = {
+    '.yaml': lambda text: list(yaml.parse(text)),
+    '.json': json.loads,
+    '.cameramodel': lambda text: ast.literal_eval(text[text.index('{') :]),
+}
+
+
+@pytest.mark.parametrize('kind', [kind for kind in FORMATS if kind != 'ck'])
+def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> None:
+    made = dataclasses.replace(
+        calibration('plumb_bob'),
+        parent_frame=f'tracker {HOSTILE}',
+        child_frame=f'camera {HOSTILE}',
+        provenance={'software': HOSTILE, HOSTILE: HOSTILE},
+        accepted=False,
+        reasons=(HOSTILE,),
+        sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
+    )
+    names = SpiceNames(-999, camera_frame='CAMERA', star_tracker_frame='TRACKER')
+    for path in export(made, kind, tmp_path, names, topic=HOSTILE).files:
+        text = path.read_text('ascii')
+        assert all(line.isprintable() for line in text.split('\n')), path
+        READERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
+        if kind == 'spice':
+            assert text.count('\\begindata') == 1
+    if kind == 'c':
+        command = ['gcc', '-std=c99', '-Wall', '-Wextra', '-Werror', '-c', 'starcal_camera.c']
+        subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r'did you mean opencv'):
+        export(calibration(), 'opencvv', tmp_path, None)
+    with pytest.raises(OptionError, match=r'--spacecraft-id'):
+        export(calibration(), 'spice', tmp_path, None)
+    assert len(FORMATS) == 10
+
+
+def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
+    camera = calibration(skew=0.0).geometry.camera
+    found, cost_px = nearest_camera(camera, camera.model, ('skew',))
+    assert cost_px == 0.0 and (found.parameters == camera.parameters).all()
+
+
+@pytest.mark.parametrize('kind', ['ros', 'spice'])
+def test_a_camera_without_alignment_is_not_exported_with_one(kind: str, tmp_path: Path) -> None:
+    alone = dataclasses.replace(calibration('plumb_bob'), parent_frame='')
+    with pytest.raises(OptionError, match=f'--to {kind}: the calibration is of the camera alone'):
+        export(alone, kind, tmp_path, None)
+    assert export(alone, 'opencv', tmp_path, None).files
+
+
+CENTER = ('BORESIGHT_SAMPLE', 'BORESIGHT_LINE')
+
+
+def usgs_pixels(isd: dict, directions: np.ndarray) -> np.ndarray:
+    """Pixels of directions by the equations of usgscsm's frame camera, radtan as in OpenCV."""
+    x = directions[:, :2] / directions[:, 2:]
+    focal = isd['focal_length_model']['focal_length']
+    D = np.array(isd['optical_distortion']['radtan']['coefficients'])
+    flat = np.c_[x, np.ones(len(x))]
+    distorted = opencv_pixels(flat, np.eye(3), D, fisheye=False) * focal
+    affine = [isd['focal2pixel_samples'], isd['focal2pixel_lines']]
+    center = [isd['detector_center'][side] for side in ('sample', 'line')]
+    at = [c + a[0] + distorted @ a[1:] for c, a in zip(center, affine, strict=True)]
+    return np.stack(at, axis=-1) - 0.5  # (0.5, 0.5) is the centre of the first pixel
+
+
+@pytest.mark.parametrize('pixel_size_um', [0.0, 5.5])
+@pytest.mark.parametrize('with_field', [False, True])
+@pytest.mark.parametrize('model', ['plumb_bob', 'thin_prism', 'equidistant'])
+def test_isd_and_isis_keywords_have_the_errors_they_state(
+    tmp_path: Path, model: str, with_field: bool, pixel_size_um: float
+) -> None:
+    made = calibration(model, with_field=with_field)
+    names = SpiceNames(-999, pixel_size_um=pixel_size_um)
+    done = export(made, 'isd', tmp_path, names)
+    pixels, directions = grid_of(made)
+    isd = json.loads(done.files[0].read_text())
+    found_px = worst_px(usgs_pixels(isd, directions), pixels)
+    assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
+    if model == 'plumb_bob' and not with_field:
+        assert found_px < SAME_PX
+    spiceypy.kclear()
+    spiceypy.furnsh(str(done.files[1]))
+    key = {
+        name: np.array(spiceypy.gdpool(f'INS-999001_{name}', 0, 9))
+        for name in ('FOCAL_LENGTH', *CENTER, 'TRANSX', 'TRANSY', 'OD_K')
+    }
+    spiceypy.kclear()
+    # ISIS: pixel to focal plane, radial distortion removed, then the direction.
+    center = np.concatenate([key[name] for name in CENTER]) - 1.0
+    at = np.c_[np.ones(len(pixels)), pixels - center]
+    x, y = at @ key['TRANSX'], at @ key['TRANSY']
+    r2 = x**2 + y**2
+    k = key['OD_K']
+    scale = 1 - (k[0] + r2 * (k[1] + r2 * k[2]))
+    sights = np.c_[x * scale, y * scale, np.full(len(x), key['FOCAL_LENGTH'][0])]
+    isis_px = worst_px(project(made.geometry.camera, sights), pixels)
+    assert isis_px == pytest.approx(done.losses[-1].cost_px, abs=1e-6)  # digits of a text kernel
+    assert isis_px < 1.0
+
+
+@pytest.mark.parametrize('form', ['opencv', 'kalibr', 'ros'])
+@pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
+def test_an_exported_camera_is_read_as_a_prior_camera(
+    tmp_path: Path, form: str, model: str
+) -> None:
+    made = export(calibration(model, 0.0, False), form, tmp_path, None)
+    camera = read_camera_info(made.files[0])
+    pixels, directions = grid_of(calibration(model, 0.0, False))
+    assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6

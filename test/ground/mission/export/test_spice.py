@@ -1,0 +1,223 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""SPICE kernels: loaded by spiceypy, they give the lines of sight of the calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+import numpy as np
+from numpy.polynomial import legendre
+import pytest
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+import spiceypy
+
+from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.spice import SpiceNames
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import line_of_sight, pixel_grid
+from starcal_ros.camera.detector_field import cosine_terms, DetectorField
+from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.errors import OptionError
+from starcal_ros.records import Calibration
+
+NAMES = SpiceNames(-999, star_tracker_id=-999100)
+MODELS = ('plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidistant')
+# The rounding of double precision over some ten operations, at 1e-16 each; the bar is 1e-9.
+SAME_RAD = 1e-12
+
+
+@pytest.fixture
+def load(tmp_path: Path):
+    """Load the kernels of a calibration into a clean kernel pool."""
+
+    def loaded(made: Calibration, names: SpiceNames = NAMES) -> tuple[str, str]:
+        done = export(made, 'spice', tmp_path, names)
+        for path in done.files:
+            spiceypy.furnsh(str(path))
+        fk, ik = (path.read_text('ascii') for path in done.files)
+        return fk, ik
+
+    spiceypy.kclear()
+    yield loaded
+    spiceypy.kclear()
+
+
+def pool(name: str) -> np.ndarray:
+    return np.asarray(spiceypy.gdpool(f'INS-999001_{name}', 0, 1000))
+
+
+def seen_at(direction: np.ndarray) -> np.ndarray:
+    """Pixel of a direction by the numbers and the equations of the IK alone."""
+    model = spiceypy.gcpool('INS-999001_LENS_MODEL', 0, 1)[0]
+    terms = spiceypy.gcpool('INS-999001_LENS_TERMS', 0, 20)
+    term = dict.fromkeys(COEFFICIENTS['tilted'], 0.0)
+    term |= dict(zip(terms, pool('LENS_COEFFICIENTS'), strict=True))
+    k1, k2, k3, p1, p2, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = term.values()
+    X, Y, Z = direction
+    x, y = X / Z, Y / Z
+    if model == 'equidistant':
+        theta = np.arctan2(np.hypot(X, Y), Z)
+        x, y = theta * np.array([X, Y]) / np.hypot(X, Y)
+        r2 = x * x + y * y
+        xd, yd = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4) * np.array([x, y])
+    else:
+        r2 = x * x + y * y
+        g = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+        xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2**2
+        yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2
+        # OpenCV's tilted sensor: R(tau) and the projection that keeps its plane.
+        R = Rotation.from_euler('xy', [-tau_x, -tau_y]).as_matrix()
+        P = np.array([[R[2, 2], 0, -R[0, 2]], [0, R[2, 2], -R[1, 2]], [0, 0, 1]])
+        tilted = P @ R @ [xd, yd, 1.0]
+        xd, yd = tilted[:2] / tilted[2]
+    fx, fy = pool('FOCAL_LENGTH_PX')
+    cx, cy = pool('CCD_CENTER')
+    return np.array([fx * xd + pool('SKEW_PX')[0] * yd + cx, fy * yd + cy])
+
+
+def field_at(pixel: np.ndarray) -> np.ndarray:
+    """The field of the IK by its comment, with numpy's Legendre polynomials."""
+    a = (2 * pixel[0] + 1) / pool('PIXEL_SAMPLES')[0] - 1
+    b = (2 * pixel[1] + 1) / pool('PIXEL_LINES')[0] - 1
+    family = spiceypy.gcpool('INS-999001_FIELD_FAMILY', 0, 1)[0]
+
+    def P(n: int, x: float) -> float:
+        if family == 'cosine':
+            return float(np.sqrt(2.0) * np.cos(np.pi * n * (x / 2.4 + 0.5))) if n else 1.0
+        return float(np.sqrt(2 * n + 1) * legendre.legval(x, [0.0] * n + [1.0]))
+
+    orders = zip(pool('FIELD_ORDERS_U'), pool('FIELD_ORDERS_V'), strict=True)
+    terms = [P(int(i), a) * P(int(j), b) for i, j in orders]
+    return np.array([pool('FIELD_U_PX') @ terms, pool('FIELD_V_PX') @ terms])
+
+
+def test_the_cosines_of_a_field_are_those_of_the_instrument_kernel(load) -> None:
+    made = calibration(with_field=True)
+    terms, _ = cosine_terms(1296, 1024, 2)
+    values = np.linspace(-0.2, 0.3, 2 * len(terms)).reshape(2, -1)
+    coefficients: Floats = np.asarray(values, np.float64)
+    field = DetectorField(1296, 1024, 2, coefficients, 'cosine')
+    camera = dataclasses.replace(made.geometry.camera, field=field)
+    load(dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=camera)))
+    pixels = pixel_grid(camera, 5, 4)
+    found = np.array([field_at(pixel) for pixel in pixels])
+    assert found == pytest.approx(field.displacement_px(pixels), abs=1e-12)
+
+
+@pytest.mark.parametrize('with_field', [False, True])
+@pytest.mark.parametrize('model', MODELS)
+def test_a_direction_is_seen_at_its_pixel_by_the_kernels_alone(load, model, with_field) -> None:
+    made = calibration(model, with_field=with_field)
+    load(made)
+    camera = made.geometry.camera
+    pixels = pixel_grid(camera, 5, 4)
+    tracker_from_camera = spiceypy.pxform('CAMERA_OPTICAL_FRAME', 'STAR_TRACKER', 0.0)
+    expected = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw)
+    assert np.abs(tracker_from_camera - expected.as_matrix()).max() < SAME_RAD
+    for pixel, direction in zip(pixels, line_of_sight(camera, pixels), strict=True):
+        in_tracker = expected.apply(direction)
+        in_camera = tracker_from_camera.T @ in_tracker
+        seen = seen_at(in_camera)
+        if with_field:
+            seen = seen + field_at(pixel)
+        assert np.abs(seen - pixel).max() / camera.parameters[0] < 1e-9
+
+
+def test_the_field_of_view_is_the_edge_of_the_detector(load) -> None:
+    made = calibration(with_field=True)
+    load(made)
+    shape, frame, boresight, count, corners = spiceypy.getfov(-999001, 100)
+    assert (shape, frame, count) == ('POLYGON', 'CAMERA_OPTICAL_FRAME', 16)
+    camera = made.geometry.camera
+    middle = line_of_sight(camera, np.array([647.5, 511.5]))
+    assert np.abs(boresight - middle).max() < SAME_RAD
+    of_corners = line_of_sight(camera, np.array([[-0.5, -0.5], [1295.5, -0.5], [1295.5, 1023.5]]))
+    assert np.abs(corners[[0, 4, 8]] - of_corners).max() < SAME_RAD
+    # SPICE finds the instrument by its name, and what it sees.
+    assert spiceypy.bodn2c('CAMERA_OPTICAL_FRAME') == -999001
+
+
+# SPICE's own reader of decimals may be off by two in the last bit of a double.
+LAST_BITS = 4.5e-16
+
+
+def test_numbers_read_back_but_for_two_last_bits(load) -> None:
+    made = calibration(temperature=True)
+    load(made, dataclasses.replace(NAMES, pixel_size_um=5.5))
+    camera = made.geometry.camera
+    np.testing.assert_allclose(pool('LENS_COEFFICIENTS'), camera.distortion, LAST_BITS, 0)
+    np.testing.assert_allclose(pool('PARAMETER_SIGMAS'), made.sigma, LAST_BITS, 0)
+    np.testing.assert_allclose(pool('FOCAL_PER_DEGC'), [4e-5, -6e-7], LAST_BITS, 0)
+    assert pool('FOCAL_LENGTH')[0] == pytest.approx(3641.9 * 5.5e-3, rel=1e-6)
+    q = spiceypy.gdpool('TKFRAME_-999001_Q', 0, 4)
+    xyzw = made.geometry.star_tracker_from_camera_xyzw
+    np.testing.assert_allclose(q[[1, 2, 3, 0]], xyzw, LAST_BITS, 0)
+
+
+def test_the_kernel_of_the_mission_may_define_the_star_tracker(load, tmp_path: Path) -> None:
+    made = calibration()
+    names = SpiceNames(-123, -123400, 0, 'ABC_NAC', 'ABC_ST1')
+    fk, _ = load(made, names)
+    assert 'FRAME_ABC_ST1' not in fk
+    mission = tmp_path / 'mission.tf'
+    mission.write_text(
+        "KPL/FK\n\\begindata\nFRAME_ABC_ST1 = -123001\nFRAME_-123001_NAME = 'ABC_ST1'\n"
+        'FRAME_-123001_CLASS = 3\nFRAME_-123001_CLASS_ID = -123001\n'
+        'FRAME_-123001_CENTER = -123\nCK_-123001_SCLK = -123\nCK_-123001_SPK = -123\n\\begintext\n'
+    )
+    spiceypy.furnsh(str(mission))
+    matrix = spiceypy.pxform('ABC_NAC', 'ABC_ST1', 0.0)
+    expected = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw).as_matrix()
+    assert np.abs(matrix - expected).max() < SAME_RAD
+
+
+def test_kernels_are_ascii_with_lines_that_spice_reads(load) -> None:
+    made = dataclasses.replace(
+        calibration(), provenance={'note': "a \\begindata quote ' and µ", 'long': 'x' * 300}
+    )
+    for text in load(made):
+        assert text.isascii() and text.count('\\begindata') == 1
+        assert max(map(len, text.splitlines())) <= 132  # SPICE reads no longer line
+
+
+@pytest.mark.parametrize(
+    ('names', 'words'),
+    [
+        (SpiceNames(999), '--spacecraft-id: 999 is not a negative'),
+        (SpiceNames(-999, instrument_id=5), '--instrument-id'),
+        (SpiceNames(-999, star_tracker_id=-999001), '--star-tracker-id'),
+        (SpiceNames(-999, camera_frame='µ'), '--camera-frame'),
+        (SpiceNames(-999, camera_frame='star tracker'), 'is the star tracker frame too'),
+        (SpiceNames(-999, pixel_size_um=-1.0), '--pixel-size-um'),
+        (SpiceNames(-99999999), 'shorter NAIF ID'),
+    ],
+)
+def test_names_that_spice_does_not_take_are_refused(
+    names: SpiceNames, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=words):
+        export(calibration(), 'spice', tmp_path, names)
+
+
+def test_a_field_of_view_wider_than_a_half_space_is_left_out(tmp_path: Path) -> None:
+    made = calibration('equidistant')
+    camera = made.geometry.camera.replace(fx=400.0, fy=400.0)
+    wide = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=camera))
+    done = export(wide, 'spice', tmp_path, NAMES)
+    assert '_FOV_' not in done.files[1].read_text().split('begindata')[1]
+    assert 'half space' in done.losses[-1].part
+
+
+def test_fsolve_agrees_with_the_inverse(load) -> None:
+    """The line of sight solved from the kernel's own equations, by SciPy's solver."""
+    made = calibration('plumb_bob', with_field=True)
+    load(made)
+    pixel = np.array([37.0, 981.0])
+    target = pixel - field_at(pixel)
+    xy = fsolve(lambda p: seen_at(np.array([*p, 1.0])) - target, [0.0, 0.0], xtol=1e-14)
+    direction = np.array([*xy, 1.0]) / np.linalg.norm([*xy, 1.0])
+    angle = np.linalg.norm(direction - line_of_sight(made.geometry.camera, pixel))
+    assert angle < 1e-11  # fsolve ends at 1e-14 of the scaled step, 4e-11 px

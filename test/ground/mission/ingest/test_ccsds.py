@@ -1,0 +1,313 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+AEM and OEM of the kinds that other projects have among their test data, read or refused.
+
+Each case is written here from the standards: CCSDS 504.0-B-1 and B-2, 502.0-B-1 to B-3, 505.0-B.
+Its name states the project whose files have the feature, its comment the reason of the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import erfa
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.images.time_systems import from_text
+from starcal_ground.mission.ingest import sources
+from starcal_ros.errors import IngestError
+
+# Orientation of the star tracker in the ICRF; as a transformation of coordinates, ICRF to tracker.
+XYZW = (0.1825741858350554, 0.3651483716701107, 0.5477225575051661, 0.7302967433402214)
+T = ('2026-05-15T07:20:00.0', '2026-05-15T07:20:10.0')
+AT_NS = [from_text(T[0], 'UTC') + 4 * 10**9]
+VELOCITY_KM_S = (1.0, -28.5, 5.25)
+
+FORWARD = ' '.join(map(repr, XYZW))
+BACKWARD = ' '.join(map(repr, (*(-part for part in XYZW[:3]), XYZW[3])))
+FIRST = ' '.join(map(repr, (XYZW[3], *XYZW[:3])))
+
+
+def frame_rotation(axes: str, angles_deg: Sequence[float]) -> np.ndarray:
+    """Matrix of frames turned about their own axes in turn, by ERFA's elementary rotations."""
+    matrix = np.eye(3)
+    for axis, angle in zip(axes, np.radians(angles_deg), strict=True):
+        matrix = {'1': erfa.rx, '2': erfa.ry, '3': erfa.rz}[axis](angle, matrix)
+    return matrix
+
+
+def angles_of(axes: str, matrix: np.ndarray) -> str:
+    """Angles, deg, whose `frame_rotation` is a matrix."""
+    found = least_squares(lambda a: (frame_rotation(axes, a) - matrix).ravel(), [10.0, 20.0, 30.0],
+                        xtol=1e-15, ftol=1e-15, gtol=1e-15).x  # fmt: skip
+    assert np.abs(frame_rotation(axes, found) - matrix).max() < 1e-9
+    return ' '.join(map(repr, found.tolist()))
+
+
+TRACKER_FROM_ICRF = Rotation.from_quat(XYZW).as_matrix().T
+EULER_321 = angles_of('321', TRACKER_FROM_ICRF)
+EULER_BACK_123 = angles_of('123', TRACKER_FROM_ICRF.T)
+OLD = {'ATTITUDE_DIR': 'A2B', 'QUATERNION_TYPE': 'LAST'}
+
+
+def aem(
+    version: str,
+    changes: Mapping[str, str | None],
+    line: str = FORWARD,
+    head: str = 'CREATION_DATE = 2026-05-15T07:00:00\nORIGINATOR = TEST\n',
+    times: tuple[str, str] = T,
+) -> str:
+    """An AEM in KVN with one attitude at two times; a change to None removes a keyword."""
+    keywords: dict[str, str | None] = {
+        'OBJECT_NAME': 'SAT',
+        'OBJECT_ID': '2026-001A',
+        'CENTER_NAME': 'EARTH',
+        'REF_FRAME_A': 'ICRF',
+        'REF_FRAME_B': 'STARTRACKER_1',
+        'TIME_SYSTEM': 'UTC',
+        'START_TIME': times[0],
+        'STOP_TIME': times[1],
+        'ATTITUDE_TYPE': 'QUATERNION',
+        **(OLD if version == '1.0' else {}),
+        **changes,
+    }
+    metadata = ''.join(f'{key} = {value}\n' for key, value in keywords.items() if value)
+    data = ''.join(f'{time} {line}\n' for time in times)
+    return (
+        f'CCSDS_AEM_VERS = {version}\n{head}META_START\n{metadata}META_STOP\n'
+        f'DATA_START\n{data}DATA_STOP\n'
+    )
+
+
+def aem_xml(version: str, keywords: str, element: str, numbers: str, start: str = '') -> str:
+    names = zip(('Q1', 'Q2', 'Q3', 'QC'), numbers.split(), strict=True)
+    quaternion = ''.join(f'<{name}>{value}</{name}>' for name, value in names)
+    states = ''.join(
+        f'<attitudeState><{element}><EPOCH>{time}</EPOCH><quaternion>{quaternion}</quaternion>'
+        f'<angVel><ANGVEL_X>0.1</ANGVEL_X></angVel></{element}></attitudeState>'
+        for time in T
+    )
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{start}<aem id="CCSDS_AEM_VERS" '
+        f'version="{version}"><header><ORIGINATOR>TEST</ORIGINATOR></header><body><segment>'
+        '<metadata><COMMENT>one</COMMENT><COMMENT>two</COMMENT><REF_FRAME_A>ICRF</REF_FRAME_A>'
+        '<REF_FRAME_B>ST_1</REF_FRAME_B><TIME_SYSTEM>UTC</TIME_SYSTEM>'
+        f'{keywords}</metadata><data>{states}</data></segment></body></aem>\n'
+    )
+
+
+XML_2 = '<ATTITUDE_TYPE>QUATERNION/ANGVEL</ATTITUDE_TYPE><ANGVEL_FRAME>ST_1</ANGVEL_FRAME>'
+XML_1 = (
+    '<ATTITUDE_DIR>B2A</ATTITUDE_DIR><ATTITUDE_TYPE>QUATERNION/DERIVATIVE</ATTITUDE_TYPE>'
+    '<QUATERNION_TYPE>FIRST</QUATERNION_TYPE>'
+)
+APM = '<apm id="CCSDS_APM_VERS" version="2.0"><body><segment/></body></apm>'
+GMAT = {'CENTER_NAME': 'Earth', 'INTERPOLATION_METHOD': 'Linear', 'INTERPOLATION_DEGREE': '7'}
+TO_ICRF = {'REF_FRAME_A': 'SC_BODY_1', 'REF_FRAME_B': 'J2000', 'ANGVEL_FRAME': 'REF_FRAME_B'}
+
+ATTITUDES = {
+    # 1.0 of an exporter without OBJECT_ID: nothing here needs it.
+    'gmat': aem('1.0', {**GMAT, 'OBJECT_ID': None}).replace(' = ', '          = '),
+    # Values are all upper or all lower case (504.0-B-2, 6.8), and 2.0 is scalar last.
+    'lower case': aem('2.0', {'ATTITUDE_TYPE': 'quaternion', 'TIME_SYSTEM': 'utc'}),
+    # Table 4-4 of B-2: three numbers more; frames from tracker to J2000.
+    'brahe angvel': aem('2.0', {**TO_ICRF, 'ATTITUDE_TYPE': 'QUATERNION/ANGVEL'},
+                        f'{BACKWARD} 0.1 0.2 0.3', 'MESSAGE_ID = A7015Z3\n'),
+    # Table 4-4 of B-1: the rates follow the quaternion, whose order QUATERNION_TYPE states.
+    'orekit derivative': aem('1.0', {'ATTITUDE_TYPE': 'QUATERNION/DERIVATIVE',
+                                     'QUATERNION_TYPE': 'FIRST'}, f'{FIRST} 0 0.1 0.1 0.1'),
+    'orekit rate': aem('1.0', {'ATTITUDE_TYPE': 'QUATERNION/RATE', 'RATE_FRAME': 'REF_FRAME_B',
+                               'ATTITUDE_DIR': 'B2A'}, f'{BACKWARD} 0.001 0.002 0.003'),
+    # Day of the year and Z (6.8.9); comments begin sections, and a space may begin a line.
+    'orekit times': aem('1.0', {}, times=('2026-135T07:20:00.0Z', '2026-135T07:20:10Z'),
+                        head='COMMENT one\nCREATION_DATE = 2026-135T00:00:00\n')
+    .replace('DATA_START\n', 'DATA_START\nCOMMENT from a filter\n   '),
+    # B-1 writes axes as digits; angles turn frame A about its own axes in turn.
+    'euler 1.0': aem('1.0', {'ATTITUDE_TYPE': 'EULER_ANGLE', 'QUATERNION_TYPE': None,
+                             'EULER_ROT_SEQ': '321'}, EULER_321),
+    'euler 2.0': aem('2.0', {**TO_ICRF, 'ATTITUDE_TYPE': 'EULER_ANGLE/ANGVEL',
+                             'EULER_ROT_SEQ': 'XYZ'}, f'{EULER_BACK_123} 0.1 0.2 0.3'),
+    # 505.0-B: numbers are named, so QUATERNION_TYPE does not order them.
+    'orekit xml': aem_xml('1.0', XML_1, 'quaternionDerivative', BACKWARD),
+    'blue book xml': aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD),
+    'long comment': aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD, f'<!-- {"x" * 5000} -->'),
+    # A combined instantiation holds several messages.
+    'ndm': aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD, f'<ndm>{APM}') + f'{APM}</ndm>',
+    # Tests of gmat-run have both: a byte-order mark and CR LF are no part of the text.
+    'byte-order mark': '\ufeff' + aem('1.0', {}).replace('\n', '\r\n'),
+}  # fmt: skip
+
+REFUSED_ATTITUDES = {
+    # B-1 makes it conditional: with quaternions there is no default.
+    'gmat without order': (aem('1.0', {'QUATERNION_TYPE': None}), 'QUATERNION_TYPE is missing'),
+    'euler axes': (aem('1.0', {'ATTITUDE_TYPE': 'EULER_ANGLE', 'EULER_ROT_SEQ': '332'},
+                       '1 2 3'), 'EULER_ROT_SEQ = ZZY is not a sequence'),
+    'order': (aem('1.0', {'QUATERNION_TYPE': 'SCALAR'}), 'requires it FIRST or LAST'),
+    'ccsds-ndm without direction': (aem('1.0', {'ATTITUDE_DIR': None}), 'ATTITUDE_DIR is missing'),
+    # Only the keywords of the table (B-2, 4.2.3): the direction is always A to B there.
+    'orekit direction': (aem('2.0', {'ATTITUDE_DIR': 'B2A'}), '2.0 has no keyword ATTITUDE_DIR'),
+    'direction first': (
+        aem('2.0', {'ATTITUDE_TYPE': None, 'ATTITUDE_DIR': 'B2A'}).replace(
+            'META_STOP', 'ATTITUDE_TYPE = QUATERNION\nMETA_STOP'
+        ),
+        '2.0 has no keyword ATTITUDE_DIR',
+    ),
+    'orekit order': (aem('2.0', {'QUATERNION_TYPE': 'FIRST'}), 'no keyword QUATERNION_TYPE'),
+    'orekit keyword': (aem('1.0', {'WRONG_KEYWORD': '123'}), '1.0 has no keyword WRONG_KEYWORD'),
+    'xml direction': (
+        aem_xml('2.0', f'<ATTITUDE_DIR>B2A</ATTITUDE_DIR>{XML_2}', 'quaternionAngVel', FORWARD),
+        'no keyword ATTITUDE_DIR',
+    ),
+    'orekit no type': (aem('1.0', {'ATTITUDE_TYPE': None}), 'ATTITUDE_TYPE is missing'),
+    'orekit spin': (aem('1.0', {'ATTITUDE_TYPE': 'SPIN'}), 'SPIN, not QUATERNION or EULER_ANGLE'),
+    'rate of 1.0': (aem('2.0', {'ATTITUDE_TYPE': 'QUATERNION/RATE'}), 'type QUATERNION/RATE'),
+    'orekit number': (aem('1.0', {}, '0.4 nothing 0.2 0.7'), 'line 18, in the data: .*nothing'),
+    'orekit keyword in data': (
+        aem('1.0', {}).replace('DATA_STOP', 'USER = bad\nDATA_STOP'), 'line 20, in the data'
+    ),
+    'orekit second metadata': (
+        aem('1.0', {}).replace('DATA_START', 'META_START'), "'META_START' is out of place"
+    ),
+    'twice': (aem('1.0', {}).replace('META_STOP', 'TIME_SYSTEM = TAI\nMETA_STOP'), 'given twice'),
+    # The type alone gives the meaning of a number.
+    'astro width': (aem('2.0', {}, f'{FORWARD} 0.1 0.2 0.3'), '7 numbers at .*, expected 4'),
+    'not finite': (aem('2.0', {}, '0 0 nan 1'), 'is not finite'),
+    'no data': (aem('2.0', {}, 'x').replace(f'{T[0]} x\n{T[1]} x\n', ''), 'without data'),
+    'another message': ('CCSDS_APM_VERS = 2.0\n', 'not with CCSDS_AEM_VERS'),
+    'another in xml': ('<omm id="CCSDS_OMM_VERS" version="2.0"/>', 'the message is OMM'),
+    'version 3': (aem('3.0', {}), "version '3.0' is not 1.0 or 2.0"),
+    'xml cut': (aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD)[:-40], 'not XML'),
+}  # fmt: skip
+
+
+def written(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_bytes(text.encode())
+    return path
+
+
+@pytest.mark.parametrize('text', ATTITUDES.values(), ids=ATTITUDES)
+def test_an_aem_that_is_valid_is_read(tmp_path: Path, text: str) -> None:
+    found = sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
+    assert found.time_ns.tolist() == [from_text(time, 'UTC') for time in T]
+    np.testing.assert_allclose(found.icrf_from_star_tracker_xyzw, [XYZW, XYZW], atol=1e-15)
+
+
+@pytest.mark.parametrize(('text', 'why'), REFUSED_ATTITUDES.values(), ids=REFUSED_ATTITUDES)
+def test_an_aem_that_is_ambiguous_is_refused(tmp_path: Path, text: str, why: str) -> None:
+    with pytest.raises(IngestError, match=why) as error:
+        sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
+    assert 'a.aem' in str(error.value) and '\n' not in str(error.value)
+
+
+def test_an_aem_cut_at_any_byte_is_refused_or_whole(tmp_path: Path) -> None:
+    text = aem('1.0', {})
+    for count in range(len('CCSDS_AEM_VERS ='), len(text) - 1):
+        with pytest.raises(IngestError) as error:
+            sources.attitudes([written(tmp_path, 'a.aem', text[:count])], '', AT_NS)
+        assert '\n' not in str(error.value)
+
+
+def test_attitudes_outside_the_useable_span_are_left_out(tmp_path: Path) -> None:
+    text = aem('2.0', {'USEABLE_STOP_TIME': '2026-05-15T07:20:05'})
+    found = sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
+    assert found.time_ns.tolist() == [from_text(T[0], 'UTC')]
+
+
+def oem(
+    version: str,
+    changes: Mapping[str, str | None],
+    more: str = '',
+    end: str = '',
+    head: str = 'CREATION_DATE = 2026-05-15T07:00:00\nORIGINATOR = TEST\n',
+) -> str:
+    """An OEM in KVN of an even motion about the barycentre."""
+    keywords: dict[str, str | None] = {
+        'OBJECT_NAME': 'SAT',
+        'OBJECT_ID': '2026-001A',
+        'CENTER_NAME': 'SOLAR SYSTEM BARYCENTER',
+        'REF_FRAME': 'ICRF',
+        'TIME_SYSTEM': 'UTC',
+        'START_TIME': T[0],
+        'STOP_TIME': T[1],
+        **changes,
+    }
+    metadata = ''.join(f'{key} = {value}\n' for key, value in keywords.items() if value)
+    data = ''.join(
+        f'{time} {state(seconds)}{more}\n' for time, seconds in zip(T, (0, 10), strict=True)
+    )
+    return f'CCSDS_OEM_VERS = {version}\n{head}META_START\n{metadata}META_STOP\n{data}{end}'
+
+
+def state(seconds: float) -> str:
+    """Position and velocity at a time."""
+    position = [1.5e8 + VELOCITY_KM_S[0] * seconds, *np.multiply(VELOCITY_KM_S[1:], seconds)]
+    return ' '.join(map(repr, map(float, (*position, *VELOCITY_KM_S))))
+
+
+def oem_xml(unit: str = '') -> str:
+    names = ('X', 'Y', 'Z', 'X_DOT', 'Y_DOT', 'Z_DOT')
+    states = ''
+    for time, seconds in zip(T, (0, 10), strict=True):
+        numbers = zip(names, state(seconds).split(), strict=True)
+        values = ''.join(f'<{name}{unit}>{value}</{name}>' for name, value in numbers)
+        states += f'<stateVector><EPOCH>{time}</EPOCH>{values}<X_DDOT>0</X_DDOT></stateVector>'
+    return (
+        '<oem id="CCSDS_OEM_VERS" version="3.0"><header/><body><segment><metadata>'
+        '<CENTER_NAME>SSB</CENTER_NAME><REF_FRAME>ICRF</REF_FRAME><TIME_SYSTEM>UTC</TIME_SYSTEM>'
+        f'</metadata><data>{states}</data></segment></body></oem>'
+    )
+
+
+COVARIANCE = (
+    'COVARIANCE_START\nEPOCH = 2026-05-15T07:20:00\nCOV_REF_FRAME = RTN\n0.1\n0.1 0.2\n'
+    'COVARIANCE_STOP\n'
+)
+STK = {'OBJECT_ID': '2000-000A', 'INTERPOLATION': 'LAGRANGE', 'INTERPOLATION_DEGREE': '5',
+       'USEABLE_START_TIME': T[0], 'USEABLE_STOP_TIME': T[1]}  # fmt: skip
+
+VELOCITIES = {
+    # 502.0-B-1 differs from B-2 by its version alone in these keywords.
+    'stk 1.0': oem('1.0', STK),
+    # Comments and empty lines between the sections.
+    'oem real': oem('2.0', STK, head='\nCOMMENT DE-430\n\nCREATION_DATE = 2026-05-15T00:00:00\n'),
+    'orekit lower case': oem('2.0', {'REF_FRAME': 'icrf', 'TIME_SYSTEM': 'utc'}),
+    # B-2, 5.2.5: a covariance follows the states of a segment.
+    'oem covariance': oem('2.0', {}, end=COVARIANCE),
+    # B-2, table 5-3: accelerations are optional.
+    'spacetools acceleration': oem('3.0', {}, ' 0 0 0', head='CLASSIFICATION = PUBLIC\n'),
+    'ccsds-ndm xml': oem_xml(),
+}
+
+REFUSED_VELOCITIES = {
+    'frame of date': (oem('2.0', {'REF_FRAME': 'TOD'}), 'neither ICRF nor EME2000'),
+    'orekit keyword': (oem('2.0', {'WRONG_KEYWORD': '1'}), '2.0 has no keyword WRONG_KEYWORD'),
+    'orekit keyword in data': (oem('2.0', {}, end='KEY = 1\n'), 'line 15, in the data'),
+    'oem no time system': (oem('2.0', {'TIME_SYSTEM': None}), 'TIME_SYSTEM is missing'),
+    'oem columns': (oem('2.0', {}, ' 0'), '7 numbers at .*, expected 6 or 9'),
+    'position alone': (
+        oem('2.0', {}).replace(state(10), '1 2 3'), '3 numbers at 2026-05-15T07:20:10.0'
+    ),
+    'covariance cut': (oem('2.0', {}, end=COVARIANCE[:60]), 'ends in the covariance: truncated'),
+    'metres': (oem_xml(' units="m"'), 'X in m, not in km'),
+    'unusable': (oem('2.0', {**STK, 'USEABLE_STOP_TIME': T[0]}), 'no velocity for 1 of 1'),
+    'aem': (aem('2.0', {}), 'not with CCSDS_OEM_VERS'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('text', VELOCITIES.values(), ids=VELOCITIES)
+def test_an_oem_that_is_valid_is_read(tmp_path: Path, text: str) -> None:
+    found = sources.velocities([written(tmp_path, 'a.oem', text)], '', AT_NS)
+    # Positions of 1.5e8 km have a resolution of 3e-8 km, over 10 s 3e-6 m/s.
+    np.testing.assert_allclose(found.velocity_m_s, [np.multiply(VELOCITY_KM_S, 1e3)], atol=2e-5)
+
+
+@pytest.mark.parametrize(('text', 'why'), REFUSED_VELOCITIES.values(), ids=REFUSED_VELOCITIES)
+def test_an_oem_that_is_invalid_is_refused(tmp_path: Path, text: str, why: str) -> None:
+    with pytest.raises(IngestError, match=why) as error:
+        sources.velocities([written(tmp_path, 'a.oem', text)], '', AT_NS)
+    assert 'a.oem' in str(error.value) and '\n' not in str(error.value)

@@ -1,0 +1,119 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Files that would take gigabytes, minutes or the process end their reader, in one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import gzip
+import os
+from pathlib import Path
+
+from astropy.io import fits
+import numpy as np
+import pytest
+
+from starcal_ground.images.image_series import ImageOptions, look
+from starcal_ground.mission.ingest import sources
+from starcal_ground.mission.ingest.guard import Guard
+from starcal_ros.errors import IngestError
+
+pytestmark = pytest.mark.slow
+
+TIMED = ImageOptions(times={'a.fits': 1, 'a.fits.gz': 1})
+
+
+@pytest.fixture
+def guard() -> Iterator[Guard]:
+    with Guard(processor_s=1.5, wall_s=20.0) as made:
+        yield made
+
+
+def write_tiled(path: Path, side: int) -> None:
+    """Write a compressed image of zeros whose tiles, one row each, all have the same bytes."""
+    small = fits.CompImageHDU(np.zeros((1, side), np.int32), compression_type='RICE_1')
+    small.writeto(path)
+    with fits.open(path, disable_image_compression=True) as units:
+        header, tile = units[1].header.copy(), np.array(units[1].data['COMPRESSED_DATA'][0])
+    tiles = np.empty(side, object)
+    tiles[:] = [tile] * side
+    column = fits.Column('COMPRESSED_DATA', 'PB()', array=tiles)
+    table = fits.BinTableHDU.from_columns([column])
+    kept = [card for card in header.cards if card.keyword.startswith('Z')]
+    table.header.extend([*kept], update=True)
+    table.header['ZNAXIS2'] = side
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
+
+
+def test_a_small_tiled_image_may_not_take_gigabytes(tmp_path: Path, guard: Guard) -> None:
+    write_tiled(tmp_path / 'a.fits', 11500)  # 529 MB of pixels, and twice that on the way
+    assert (tmp_path / 'a.fits').stat().st_size < 2**22
+    with pytest.raises(IngestError, match=r'a\.fits: .*(memory|processor)') as error:
+        guard.call(tmp_path / 'a.fits', look, tmp_path / 'a.fits', TIMED)
+    assert '\n' not in str(error.value)
+
+
+def test_a_tiled_image_of_ordinary_size_is_read(tmp_path: Path, guard: Guard) -> None:
+    write_tiled(tmp_path / 'a.fits', 600)
+    found = guard.call(tmp_path / 'a.fits', look, tmp_path / 'a.fits', TIMED)
+    assert (found.width, found.height, found.high) == (600, 600, 0.0)
+
+
+def test_a_header_without_end_may_not_take_minutes(tmp_path: Path, guard: Guard) -> None:
+    path = tmp_path / 'a.fits.gz'
+    with gzip.open(path, 'wb', 1) as file:
+        file.write(b'SIMPLE  =                    T'.ljust(80))
+        for _ in range(100):
+            file.write(b' ' * 2**24)
+    with pytest.raises(IngestError, match=r'a\.fits\.gz: takes more than 1.5 s of processor time'):
+        guard.call(path, look, path, TIMED)
+
+
+def test_many_empty_extensions_may_not_take_minutes(tmp_path: Path, guard: Guard) -> None:
+    path = tmp_path / 'a.fits'
+    empty = fits.ImageHDU().header.tostring().encode()
+    path.write_bytes(fits.PrimaryHDU().header.tostring().encode() + empty * 20_000)
+    with pytest.raises(IngestError, match='takes more than 1.5 s of processor time'):
+        guard.call(path, look, path, TIMED)
+
+
+def test_a_meta_kernel_may_not_wait_for_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    kernel = tmp_path / 'meta.tm'
+    kernel.write_text(
+        "KPL/MK\n\\begindata\nPATH_VALUES = ( '.' )\nPATH_SYMBOLS = ( 'HERE' )\n"
+        "KERNELS_TO_LOAD = ( '$HERE/pipe' )\n\\begintext\n"
+    )
+    before = Path.cwd()
+    os.chdir(tmp_path)  # texts of kernels are at most 80 characters long
+    try:
+        with Guard(wall_s=1.0) as guard:
+            with pytest.raises(IngestError, match='^pipe: not a regular file'):
+                guard.call(kernel, sources.attitudes, [kernel], 'ST1', [10**18])
+            with pytest.raises(IngestError, match='takes more than 1 s .* name a pipe'):
+                guard.call('pipe', os.open, tmp_path / 'pipe', os.O_RDONLY)
+    finally:
+        os.chdir(before)
+
+
+def test_a_reader_that_ends_costs_its_call_only(guard: Guard) -> None:
+    for function, args, why in (
+        (bytearray, (2**31,), 'x: needs more than 1 GB of memory'),
+        (os.abort, (), 'x: ends its reader with status -6'),
+        (int, ('one',), 'x: cannot be read: ValueError invalid literal'),
+        (sum, (range(10**11),), 'x: takes more than 1.5 s of processor time'),
+    ):
+        with pytest.raises(IngestError, match=why):
+            guard.call('x', function, *args)
+        assert guard.call('x', abs, -3) == 3
+
+
+def test_what_a_library_prints_is_no_answer(guard: Guard) -> None:
+    assert guard.call('x', os.write, 1, b'printed') == 7
+    assert guard.call('x', print, 'printed') is None
+
+
+def test_the_reader_ends_with_its_guard() -> None:
+    with Guard() as guard:
+        number = guard.call('x', os.getpid)
+    with pytest.raises(ProcessLookupError):
+        os.kill(number, 0)

@@ -1,0 +1,261 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""From FITS and an attitude ephemeris to the calibration of the original bag."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import shutil
+
+from astropy.io import fits
+from mission_files import (  # type: ignore[import-not-found]
+    attitudes,
+    FRAME_ID,
+    images,
+    TINY,
+    write_aem,
+    write_ck,
+    write_fits,
+    write_velocities,
+)
+import numpy as np
+import pytest
+import yaml
+
+from starcal_ground.cli.main import main
+import starcal_ros
+from starcal_ros.constants import utc_text
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.frames import read_telemetry
+from starcal_ros.formats.bag.reader import Topics
+from starcal_ros.records import Image
+
+pytestmark = pytest.mark.slow
+
+ALIGNMENT = yaml.safe_load((TINY / 'params.yaml').read_text())['/**']['ros__parameters'][
+    'prior_alignment'
+]
+
+
+@pytest.fixture(scope='module')
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The images of the small bag as FITS, in names whose order is not that of time."""
+    folder = tmp_path_factory.mktemp('night')
+    for number, image in enumerate(images()):
+        write_fits(folder / f'{9 - number}.fits', image, 'tiled')
+    return folder
+
+
+def words(text: str, **values: object) -> list[str]:
+    return [word.format(**values) for word in text.split()]
+
+
+def test_the_imported_bag_gives_the_calibration_of_the_original(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    aem, bag = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag'
+    line = words(
+        'import --images {night}/*.fits --attitude {aem} -o {bag} --camera {camera}',
+        night=night, aem=aem, bag=bag, camera=TINY / 'camera.yaml',
+    )  # fmt: skip
+    velocities = str(write_velocities(tmp_path / 'velocity.csv'))
+    assert main([*line, '--velocity', velocities, '--alignment', *map(repr, ALIGNMENT)]) == 0
+    out = capsys.readouterr().out
+    assert '10 images' in out and 'params.yaml -o DIR' in out
+    found = list(reader.read_images([bag], '/camera/image_raw'))
+    for a, b in zip(found, images(), strict=True):
+        assert isinstance(a, Image) and a.time_ns == b.time_ns and (a.pixels == b.pixels).all()
+    # The file of the original: it has the sigma of the star tracker too.
+    imported = starcal_ros.calibrate_bag(bag, TINY / 'params.yaml')
+    original = starcal_ros.calibrate_bag(TINY, TINY / 'params.yaml')
+    # Quaternions are scaled to unit length on the way: a rounding of 1e-16.
+    change = np.abs(imported.geometry.camera.parameters - original.geometry.camera.parameters)
+    assert (change <= 1e-6 * original.sigma[:-3]).all()
+    assert starcal_ros.calibrate_bag(bag, bag / 'params.yaml').accepted
+    record = json.loads((bag / 'import.json').read_text())
+    assert record['scale'] == {'offset': 0.0, 'step': 1.0, 'dtype': images()[0].pixels.dtype.name}
+
+
+def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, capsys) -> None:
+    kernels = write_ck(tmp_path)
+    bag = tmp_path / 'bag.mcap'
+    line = words('import --images {night}/*.fits -o {bag} --attitude', night=night, bag=bag)
+    assert main([*line, *map(str, kernels), '--star-tracker', str(FRAME_ID)]) == 0
+    topics = Topics('/camera/image_raw', '/star_tracker/attitude')
+    held = read_telemetry([bag], topics).attitudes
+    for image in images()[1:-1]:
+        assert held.at(image.time_ns, 0.1)[1] == 0.0
+    assert (tmp_path / 'bag_import.json').exists()
+
+
+def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    start = aem.read_text().index('META_START')
+    second = aem.read_text()[start:].replace('STARTRACKER_1', 'ST-2')
+    aem.write_text(aem.read_text() + second)
+    bag = tmp_path / 'bag'
+    line = words('import --images {n}/*.fits --attitude {a} -o {b} --camera {c}', n=night, a=aem,
+                 b=bag, c=TINY / 'camera.yaml')  # fmt: skip
+    line += ['--star-tracker', 'STARTRACKER_1', '--more-star-trackers', 'ST-2', '--alignment']
+    assert main([*line, *map(repr, ALIGNMENT)]) == 2
+    assert '--alignment: 4 numbers, 8 are needed' in capsys.readouterr().err
+    assert main([*line, *map(repr, [*ALIGNMENT, *ALIGNMENT])]) == 0
+    first, other = (
+        [raw.data for raw in reader.read_raw([bag], [topic])]
+        for topic in ('/star_tracker/attitude', '/ST_2/attitude')
+    )
+    assert first == other and len(first) == len(attitudes())
+    found = starcal_ros.calibrate_bag(bag, bag / 'params.yaml')
+    assert found.accepted
+    values = yaml.safe_load((bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    assert values['more_star_trackers'] == ['ST_2']
+    assert values['more_alignments'] == list(ALIGNMENT)
+
+
+def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    lines = aem.read_text().splitlines()
+    start = lines.index('DATA_START') + 1
+    count = len(attitudes())
+    # The middle third is missing: a gap, and what is after the end.
+    kept = lines[: start + count // 3] + lines[start + 2 * count // 3 : -4] + ['DATA_STOP']
+    aem.write_text('\n'.join(kept) + '\n')
+    line = words('import --images {n}/*.fits --attitude {a} -o {b}', n=night, a=aem,
+                 b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 0
+    out = capsys.readouterr().out
+    assert 'images are in gaps of up to' in out and 'have no attitude about them' in out
+
+
+def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    aem.write_text(aem.read_text().replace('2026-05-15T07:', '2027-05-15T07:'))
+    line = words('import --images {n}/*.fits --attitude {a} -o {b}', n=night, a=aem,
+                 b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 2
+    error = capsys.readouterr().err
+    spans = [
+        f'{utc_text(times[0])} to {utc_text(times[-1])}'
+        for times in ([image.time_ns for image in images()], [time for time, _ in attitudes()])
+    ]
+    assert f'the images are from {spans[0]}, the attitudes of another time, from 2027' in error
+    assert spans[1].replace('2026', '2027') in error and error.count('\n') == 1
+
+
+def test_each_bad_file_is_one_line(night: Path, tmp_path: Path, capsys) -> None:
+    for name in ('a.fits', 'b.fits'):
+        (tmp_path / name).write_bytes(b'nothing')
+    aem = write_aem(tmp_path / 'a.aem')
+    line = words('import --images {n}/*.fits {t}/*.fits --attitude {a} -o {b}', n=night,
+                 t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 2
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 2 and 'a.fits' in error[0] and 'b.fits' in error[1]
+    assert not (tmp_path / 'bag').exists()
+
+
+@pytest.mark.parametrize(
+    ('line', 'found'),
+    [
+        ('--images {night}/*.nothing --attitude {aem}', 'no file matches'),
+        ('--images {night}/0.fits --attitude {night}/none.aem', 'cannot be read'),
+        (
+            '--images {night}/0.fits --attitude {aem} {night}/0.fits',
+            'one file, unless all are SPICE',
+        ),
+        ('--images {night}/0.fits --attitude {aem} --camera {aem}', 'a.aem'),
+        ('--images {night}/0.fits --attitude {aem} --star-tracker ST7', 'choose one with'),
+        ('--images {night}/0.fits --attitude {aem} --value-range 5 1', 'is empty'),
+        (
+            '--images {night}/0.fits --attitude {aem} --camera {camera} --more-star-trackers ST-2',
+            '--alignment: 0 numbers, 8 are needed: x y z w for each star tracker; only that of a ',
+        ),
+    ],
+)
+def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, found: str) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    given = words(line, night=night, aem=aem, camera=TINY / 'camera.yaml')
+    assert main(['import', *given, '-o', str(tmp_path / 'bag')]) == 2
+    error = capsys.readouterr().err
+    assert found in error and error.count('\n') == 1
+
+
+def test_no_input_is_replaced(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'import.json')
+    before = aem.read_bytes()
+    line = words('import --images {n}/0.fits --attitude {a} -o {b}', n=night, a=aem,
+                 b=tmp_path)  # fmt: skip
+    assert main(line) == 2
+    assert 'would be replaced' in capsys.readouterr().err and aem.read_bytes() == before
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ('bag', 'name'),
+    [
+        ('there', 'metadata.yaml'),
+        ('there', 'params.yaml'),
+        ('there', 'camera.yaml'),
+        ('there', 'tiny_0.mcap'),
+        ('there/bag.mcap', 'bag_params.yaml'),
+        ('there/bag.mcap', 'bag_camera.yaml'),
+        ('there/bag.mcap', 'bag.mcap'),
+    ],
+)
+def test_no_file_of_another_origin_is_replaced(
+    night: Path, tmp_path: Path, capsys, bag: str, name: str
+) -> None:
+    folder = tmp_path / 'there'
+    folder.mkdir()
+    (folder / name).write_bytes(b'of another program')
+    before = tree(folder)
+    aem = write_aem(tmp_path / 'a.aem')
+    line = words('import --images {n}/[0-3].fits --attitude {a} -o {b} --camera {c}', n=night,
+                 a=aem, b=tmp_path / bag, c=TINY / 'camera.yaml')  # fmt: skip
+    assert main(line) == 2
+    error = capsys.readouterr().err
+    assert 'was not written by starcal' in error and error.count('\n') == 1
+    assert tree(folder) == before
+
+
+def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
+    night: Path, tmp_path: Path, capsys
+) -> None:
+    (tmp_path / 'bag').mkdir()
+    camera = shutil.copy(TINY / 'camera.yaml', tmp_path / 'bag/camera.yaml')
+    for images_of in ('[0-3].fits', '*.fits'):
+        line = words('import --images {n}/{i} --attitude {a} -o {b} --camera {c}', n=night,
+                     i=images_of, a=write_aem(tmp_path / 'a.aem'), b=tmp_path / 'bag',
+                     c=camera)  # fmt: skip
+        assert main(line) == 0, capsys.readouterr().err
+    assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
+
+
+def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / 'cut.fits').write_bytes(b'nothing')
+    with (tmp_path / 'huge.fits').open('wb') as file:
+        file.write(fits.PrimaryHDU(np.zeros((2, 2))).header.tostring().encode())
+        file.seek(80 * 3)  # NAXIS1 and NAXIS2: 968 MB, all of them a hole in the file
+        for axis in (1, 2):
+            file.write(f'NAXIS{axis}  = {11000:20}'.ljust(80).encode())
+        file.truncate(2880 * (2 + 11000 * 11000 * 8 // 2880))
+    aem = write_aem(tmp_path / 'a.aem')
+    line = words('import --images {n}/0.fits {t}/*.fits --attitude {a} -o {b}', n=night,
+                 t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert 'cut.fits: not an image in FITS, TIFF or PNG' in first
+    assert 'huge.fits: needs more than 1 GB of memory to be read' in second
+
+
+def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:
+    for number, image in enumerate(images()[:3]):
+        write_fits(tmp_path / f'{number}.fits', image, 'float32')
+    aem = write_aem(tmp_path / 'a.aem')
+    line = 'import --images {t}/*.fits --attitude {a} -o {t}/bag --value-range 0 2e6'
+    assert main(words(line, t=tmp_path, a=aem)) == 0
+    out = capsys.readouterr().out
+    assert 'a step of 16 bit is' in out and 'pixel values are 0 + 30.7692308 DN' in out

@@ -1,0 +1,92 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Spacecraft, camera and parameters from a pattern or a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+import shutil
+
+from mission_files import TINY  # type: ignore[import-not-found]
+import pytest
+from trend_missions import write  # type: ignore[import-not-found]
+
+from starcal_ground.cli.main import main
+from starcal_ground.mission.trend.fleet import Cameras, read_cameras
+from starcal_ground.mission.trend.series import groups
+from starcal_ground.mission.trend.trend_table import Table
+from starcal_ros.errors import StarcalError
+
+
+@pytest.mark.parametrize(
+    ('pattern', 'name', 'expected'),
+    [
+        ('{spacecraft}/{camera}/*.mcap', 'A/nav/bag.mcap', ('A', 'nav')),
+        ('{spacecraft}/{camera}/*.mcap', 'A/nav/2026/calibration.json', ('A', 'nav')),
+        ('{spacecraft}/{camera}/*.mcap', 'A/bag.mcap', ('A', 'bag.mcap')),
+        ('{spacecraft}/{camera}/*.mcap', 'bag.mcap', ('', '')),
+        ('data/{spacecraft}_{camera}.*', 'data/A_nav.mcap', ('A', 'nav')),
+        ('*/{camera}', '2026/nav', ('', 'nav')),
+        ('', 'A/nav/bag.mcap', ('', '')),
+    ],
+)
+def test_a_pattern_names_spacecraft_and_camera(pattern, name, expected) -> None:
+    assert read_cameras(pattern, '').of(name) == expected
+
+
+def test_a_table_names_them_and_their_parameters(tmp_path: Path) -> None:
+    table = tmp_path / 'cameras.csv'
+    table.write_text('path,spacecraft,camera,params\nA/*,A,nav,a.yaml\n*,B,nav,\n')
+    cameras = read_cameras(str(table), str(tmp_path / '{spacecraft}.yaml'))
+    assert cameras.of('A/x/y.mcap') == ('A', 'nav') and cameras.of('C/y.mcap') == ('B', 'nav')
+    assert cameras.params_of('A/x/y.mcap') == str(tmp_path / 'a.yaml')
+    assert cameras.params_of('C/y.mcap') == str(tmp_path / 'B.yaml')
+    assert Cameras().params_of('x') == ''
+
+
+@pytest.mark.parametrize(
+    'text', ['{camera', '{other}/x', '{camera}/{camera}', '{spacecraft}/{camera}}']
+)
+def test_a_bad_pattern_is_one_line(text: str) -> None:
+    with pytest.raises(StarcalError, match='not a pattern with') as caught:
+        read_cameras(text, '')
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text', ['', 'a,b\n', 'path,camera\n,x\n', 'path,camera\na,b,c\n'])
+def test_a_bad_table_is_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / 'cameras.csv').write_text(text)
+    with pytest.raises(StarcalError, match=r'cameras\.csv') as caught:
+        read_cameras(str(tmp_path / 'cameras.csv'), '')
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path: Path) -> None:
+    for day in range(4):
+        for name in ('A', 'B'):
+            write(tmp_path / f'fleet/{name}/nav/{day}', day, stars_used=100 + ord(name))
+    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
+    assert main(line) == 0
+    assert len(groups(Table(tmp_path / 'out').rows())) == 1
+    # The names apply to what is in the table as well.
+    assert main([*line, '--cameras', '{spacecraft}/{camera}/*']) == 0
+    rows = Table(tmp_path / 'out').rows()
+    assert {(row.spacecraft, row.camera) for row in rows} == {('A', 'nav'), ('B', 'nav')}
+    assert sorted(map(len, groups(rows).values())) == [4, 4]
+    page = (tmp_path / 'out/trend.html').read_text()
+    assert re.findall('<h2>([AB])', page) == ['A', 'B']
+
+
+@pytest.mark.slow
+def test_the_metadata_of_a_bag_names_them(tmp_path: Path) -> None:
+    shutil.copytree(TINY, tmp_path / 'fleet/one')
+    metadata = tmp_path / 'fleet/one/metadata.yaml'
+    text = metadata.read_text()
+    named = re.sub('custom_data: .*', 'custom_data: {spacecraft: A, camera: nav, x: 1}', text)
+    assert named != text
+    metadata.write_text(named)
+    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
+    assert main([*line, '--params', str(TINY / 'params.yaml')]) == 0
+    (row,) = Table(tmp_path / 'out').rows()
+    assert (row.error, row.spacecraft, row.camera) == ('', 'A', 'nav')

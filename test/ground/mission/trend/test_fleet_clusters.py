@@ -1,0 +1,99 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The example for Kubernetes in docs/mission.md, as far as it runs without a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import importlib.util
+import os
+from pathlib import Path
+import re
+import socket
+import subprocess
+import sys
+from typing import Any
+
+from distributed import Client
+import pytest
+import yaml
+
+pytestmark = pytest.mark.slow
+
+_DOCUMENT = (Path(__file__).parents[4] / 'docs/mission.md').read_text()
+_PLACE = Path(sys.executable).parent
+_START_S = 90.0
+
+
+def example(language: str, word: str) -> str:
+    fences = re.findall(rf'```{language}\n(.*?)```', _DOCUMENT, re.DOTALL)
+    (found,) = (text for text in fences if word in text)
+    return str(found)
+
+
+def needs(*names: str) -> pytest.MarkDecorator:
+    missing = [name for name in names if importlib.util.find_spec(name) is None]
+    return pytest.mark.skipif(bool(missing), reason=f'needs pip install {" ".join(missing)}')
+
+
+@contextlib.contextmanager
+def container(
+    cluster: dict[str, Any], part: str, *more: str, **environment: str
+) -> Iterator[None]:
+    """The process of a container, with the variables that the operator gives it."""
+    (found,) = cluster['spec'][part]['spec']['containers']
+    line = [re.sub(r'\$\((\w+)\)', lambda name: environment[name[1]], a) for a in found['args']]
+    process = subprocess.Popen(
+        [_PLACE / line[0], *line[1:], *more],
+        env={**os.environ, **environment},
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def test_the_containers_of_kubernetes_find_each_other() -> None:
+    cluster = yaml.safe_load(example('yaml', 'DaskCluster'))
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    address, name = f'tcp://127.0.0.1:{port}', 'starcal-default-worker-1'
+    with (
+        container(cluster, 'scheduler', '--port', str(port), '--dashboard-address', ':0'),
+        container(cluster, 'worker', DASK_SCHEDULER_ADDRESS=address, DASK_WORKER_NAME=name),
+        Client(address, timeout=_START_S) as client,
+    ):
+        client.wait_for_workers(1, timeout=_START_S)
+        (worker,) = client.scheduler_info()['workers'].values()
+        assert (worker['name'], worker['nthreads']) == (name, 1)
+
+
+@needs('jsonschema', 'dask_kubernetes')
+def test_the_manifest_fits_the_schema_of_the_operator() -> None:
+    import dask_kubernetes  # type: ignore[import-not-found,import-untyped,unused-ignore]
+    import jsonschema  # type: ignore[import-not-found,import-untyped,unused-ignore]
+
+    (path,) = Path(dask_kubernetes.__file__).parent.rglob('crds/daskcluster.yaml')
+    versions = yaml.safe_load(path.read_text())['spec']['versions']
+    (schema,) = (v['schema']['openAPIV3Schema'] for v in versions if v['name'] == 'v1')
+    spec = yaml.safe_load(example('yaml', 'DaskCluster'))['spec']
+    validator = jsonschema.Draft202012Validator(refusing_unknown(schema['properties']['spec']))
+    assert list(validator.iter_errors(spec)) == []
+    spec['worker']['spec']['containers'][0]['argument'] = 1
+    assert len(list(validator.iter_errors(spec))) == 1
+
+
+def refusing_unknown(schema: Any) -> Any:
+    """A schema of Kubernetes as JSON schema, in which a name that is not listed is an error."""
+    if isinstance(schema, list):
+        return [refusing_unknown(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    made = {name: refusing_unknown(value) for name, value in schema.items()}
+    if isinstance(schema.get('properties'), dict) and 'additionalProperties' not in schema:
+        made['additionalProperties'] = schema.get('x-kubernetes-preserve-unknown-fields', False)
+    if schema.get('x-kubernetes-int-or-string'):
+        made['type'] = ['integer', 'string']
+    return made

@@ -1,0 +1,239 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The command on bags in a store: the client of S3 against a server that answers, or does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import hashlib
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+import re
+import threading
+import urllib.parse
+from xml.sax.saxutils import escape
+
+from mission_files import TINY  # type: ignore[import-not-found]
+import pytest
+
+from starcal_ground.cli.main import main
+from starcal_ground.mission.trend import fleet, places
+from starcal_ground.mission.trend.trend_table import Table
+
+s3fs = pytest.importorskip('s3fs')  # of requirements/dev.txt; not in the oldest versions
+pytestmark = pytest.mark.slow
+
+_FLEET = 's3://archive/fleet'
+_ANSWER_S = 3.0  # a sound answer takes milliseconds
+_CODES = {403: 'AccessDenied', 404: 'NoSuchKey', 503: 'SlowDown'}
+_TIME = '2026-01-01T00:00:00.000Z'
+
+
+class Store(ThreadingHTTPServer):
+    """
+    A server with objects in the bucket `archive`, which notes requests.
+
+    A request whose line has a pattern of ``faults`` is refused with that status of HTTP; 0 drops
+    its connection, -1 never answers, -2 sends half of the content.
+    """
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(('127.0.0.1', 0), Handler)
+        self.url = f'http://127.0.0.1:{self.server_port}'
+        self.objects: dict[str, bytes] = {}
+        self.faults: dict[str, int] = {}
+        self.requests: list[str] = []
+        self.is_closing = threading.Event()
+
+    def reset(self) -> None:
+        """Two bags, and no fault."""
+        self.objects, self.faults, self.requests = {}, {}, []
+        content = (TINY / 'tiny_0.mcap').read_bytes()
+        for k in range(2):
+            changed = content.replace(b'starcal', b'%07d' % k, 1)  # in the header, not read
+            self.objects[f'fleet/{k}/tiny_0.mcap'] = changed
+            self.objects[f'fleet/{k}/metadata.yaml'] = (TINY / 'metadata.yaml').read_bytes()
+
+    def handle_error(self, *_: object) -> None:
+        """Say nothing where a client has left."""
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Lists, sizes and contents of objects as S3 answers; all else is an error."""
+
+    protocol_version = 'HTTP/1.1'
+    server: Store
+
+    def do_HEAD(self) -> None:
+        """Answer without a content."""
+        self.do_GET()
+
+    def do_GET(self) -> None:
+        """Answer, or fail as the store is told to."""
+        store, line = self.server, urllib.parse.unquote(f'{self.command} {self.path}')
+        store.requests.append(line)
+        fault = next((n for pattern, n in store.faults.items() if re.search(pattern, line)), 200)
+        if fault == -1:
+            store.is_closing.wait()
+        if fault < 1 and fault != -2:
+            self.close_connection = True
+            return
+        url = urllib.parse.urlsplit(self.path)
+        bucket, _, key = urllib.parse.unquote(url.path).lstrip('/').partition('/')
+        query = dict(urllib.parse.parse_qsl(url.query))
+        if fault >= 300:
+            self._answer(fault, f'<Error><Code>{_CODES[fault]}</Code></Error>'.encode())
+        elif bucket != 'archive':
+            self._answer(404, b'<Error><Code>NoSuchBucket</Code></Error>')
+        elif query.get('list-type') == '2':
+            self._answer(200, self._list(query.get('prefix', ''), query.get('delimiter', '')))
+        elif key in store.objects:
+            self._answer(200, store.objects[key], is_cut=fault == -2)
+        else:
+            self._answer(404, b'<Error><Code>NoSuchKey</Code></Error>')
+
+    def _list(self, prefix: str, delimiter: str) -> bytes:
+        """ListObjectsV2: objects below a prefix, and folders up to the next delimiter."""
+        folders, lines = set(), []
+        for key, content in self.server.objects.items():
+            head, found, _ = key.removeprefix(prefix).partition(delimiter or '\n')
+            if key.startswith(prefix) and found:
+                folders.add(f'{prefix}{head}{delimiter}')
+            elif key.startswith(prefix):
+                lines.append(
+                    f'<Contents><Key>{escape(key)}</Key><LastModified>{_TIME}</LastModified>'
+                    f'<ETag>"{hashlib.md5(content).hexdigest()}"</ETag>'
+                    f'<Size>{len(content)}</Size></Contents>'
+                )
+        lines += [f'<CommonPrefixes><Prefix>{f}</Prefix></CommonPrefixes>' for f in folders]
+        count = f'<KeyCount>{len(lines)}</KeyCount><IsTruncated>false</IsTruncated>'
+        return f'<ListBucketResult>{count}{"".join(lines)}</ListBucketResult>'.encode()
+
+    def _answer(self, status: int, content: bytes, is_cut: bool = False) -> None:
+        self.send_response(status)
+        self.send_header('Content-Length', str(len(content)))
+        self.send_header('Content-Type', 'application/xml')
+        self.send_header('ETag', f'"{hashlib.md5(content).hexdigest()}"')
+        self.end_headers()
+        if self.command == 'GET':
+            self.wfile.write(content[: len(content) // 2] if is_cut else content)
+        self.close_connection = is_cut
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
+
+@pytest.fixture(scope='module')
+def server() -> Iterator[Store]:
+    made = Store()
+    threading.Thread(target=made.serve_forever, daemon=True).start()
+    with pytest.MonkeyPatch.context() as patch:
+        settings = {'ACCESS_KEY_ID': 'a', 'SECRET_ACCESS_KEY': 'b', 'ENDPOINT_URL': made.url}
+        for name, value in {**settings, 'DEFAULT_REGION': 'us-east-1'}.items():
+            patch.setenv(f'AWS_{name}', value)
+        yield made
+    made.is_closing.set()
+    made.shutdown()
+    made.server_close()
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def store(server: Store, monkeypatch: pytest.MonkeyPatch) -> Store:
+    server.reset()
+    monkeypatch.setattr(places, 'ANSWER_S', _ANSWER_S)
+    monkeypatch.setattr(places, 'LIST_S', _ANSWER_S)
+    monkeypatch.setattr(places, '_SLOWEST', 2**30)
+    return server
+
+
+def trend(folder: Path, *more: str, root: str = _FLEET) -> int:
+    return main(['trend', root, '-o', str(folder), '--params', str(TINY / 'params.yaml'), *more])
+
+
+def test_bags_are_fetched_by_workers_and_read_once(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert trend(tmp_path, '--workers', '2') == 0
+    assert '2 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert sum('GET' in line and 'mcap' in line for line in store.requests) == 2
+    paths = sorted(row.path for row in Table(tmp_path).rows())
+    assert paths == [f'{_FLEET}/{k}' for k in range(2)]
+    store.requests.clear()
+    assert trend(tmp_path) == 0
+    assert '0 new, 2 known, 0 failed' in capsys.readouterr().out
+    assert not any('mcap' in line for line in store.requests)
+
+
+PLACES = {  # faults of requests, root, what the one line names
+    'no bucket': ({}, 's3://none/fleet', 's3://none/fleet: no such folder'),
+    'no folder': ({}, 's3://archive/other', 's3://archive/other: no such folder'),
+    'no rights': ({'': 403}, _FLEET, 'cannot be read: PermissionError: '),
+    'drops each connection': ({'': 0}, _FLEET, f'{_FLEET}: cannot be read: no answer in time'),
+    'never answers': ({'': -1}, _FLEET, f'{_FLEET}: cannot be read: no answer in time'),
+    'never lists': ({'list-type': -1}, _FLEET, f'{_FLEET}: cannot be read: no answer in time'),
+}
+
+
+@pytest.mark.parametrize('case', PLACES)
+def test_a_store_that_cannot_be_listed_is_one_line(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
+) -> None:
+    store.faults, root, words = PLACES[case]
+    assert trend(tmp_path, root=root) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count('\n') == 1
+
+
+FAULTS = {  # of requests of one bag, and the reason of its row
+    'dropped': ({'GET /archive/fleet/0/.*mcap': 0}, 'no answer in time'),
+    'never answered': ({'GET /archive/fleet/0/.*mcap': -1}, 'no answer in time'),
+    'cut off': ({'GET /archive/fleet/0/.*mcap': -2}, ''),
+    'forbidden': ({'/archive/fleet/0/.*mcap': 403}, 'PermissionError: '),
+    'overloaded': ({'GET /archive/fleet/0/.*mcap': 503}, 'no answer in time'),
+    'gone': ({'/archive/fleet/0/.*mcap': 404}, ''),
+}
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_a_bag_that_cannot_be_fetched_fails_and_passes(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: str
+) -> None:
+    store.faults, reason = FAULTS[fault]
+    assert trend(tmp_path) == 0
+    out = capsys.readouterr().out
+    assert '1 new, 0 known, 1 failed' in out
+    (line,) = [line for line in out.splitlines() if line.startswith('failed: ')]
+    assert f'{_FLEET}/0: ' in line and 'cannot be read: ' in line and reason in line
+    store.faults = {}
+    assert trend(tmp_path) == 0
+    assert '1 new, 1 known, 0 failed' in capsys.readouterr().out
+    assert [row.error for row in Table(tmp_path).rows()] == ['', '']
+
+
+def test_a_store_that_falls_silent_ends_the_run(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    """The files that it did not answer for come last in the next run, which ends too."""
+    monkeypatch.setattr(fleet, 'MOST_SILENT', 1)
+    store.faults = {'GET /archive/fleet/0/.*mcap': -1}
+    assert trend(tmp_path) == 3
+    said = capsys.readouterr()
+    assert '0 new, 0 known, 1 failed' in said.out
+    assert 'no answer for 1 files; run again' in said.err and said.err.count('\n') == 1
+    assert trend(tmp_path) == 3
+    assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
+    store.faults = {}
+    assert trend(tmp_path) == 0
+    assert '1 new, 1 known, 0 failed' in capsys.readouterr().out
+
+
+def test_a_bucket_is_listed_by_folders_with_a_request_each(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(places, '_TOGETHER', 1)
+    assert [len(found) for found in places.listings('s3://archive')] == [0, 2, 2]
+    # The bucket, its one folder, a probe of the first folder below it; then each of these.
+    assert len(store.requests) == 5
+    assert all('list-type=2' in line for line in store.requests)

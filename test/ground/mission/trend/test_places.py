@@ -1,0 +1,155 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Files by path and by URL, their identities, and failures that pass."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from pathlib import Path
+import shutil
+import time
+
+import fsspec
+from mission_files import TINY  # type: ignore[import-not-found]
+import pytest
+from trend_missions import make_mission, trend, write  # type: ignore[import-not-found]
+
+from starcal_ground.cli.main import main
+from starcal_ground.mission.trend import fleet, places
+from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
+from starcal_ground.mission.trend.trend_table import Table
+
+
+@pytest.fixture
+def mission(tmp_path: Path) -> Path:
+    path: Path = make_mission(tmp_path)
+    return path
+
+
+def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
+    shutil.copytree(mission / '1', mission / 'copy')
+    assert trend(mission) == 0
+    capsys.readouterr()
+
+    def unread(*_: object) -> None:
+        raise AssertionError('a file is read')
+
+    monkeypatch.setattr(fleet, 'digest', unread)
+    monkeypatch.setattr(fleet, 'compute', unread)
+    assert trend(mission) == 0
+    assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypatch) -> None:
+    shutil.copytree(TINY, tmp_path / 'fleet/one')
+    cameras = Cameras(params=str(TINY / 'params.yaml'))
+    fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
+    os.utime(tmp_path / 'fleet/one/tiny_0.mcap', (5, 5))
+    monkeypatch.setattr(fleet, 'calibrate_bags', lambda *_: pytest.fail('calibrated again'))
+    done = fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
+    assert done == fleet.Done(known=1)
+
+
+@pytest.mark.slow
+def test_three_thousand_known_files_are_passed_over_in_6_s(tmp_path: Path) -> None:
+    """The limit of the bench of fleets is 20 s for ten thousand; this one takes a second."""
+    write(tmp_path / 'one', 1)
+    content = (tmp_path / 'one/calibration.json').read_bytes()
+    for k in range(3_000):
+        (tmp_path / f'fleet/{k:05d}').mkdir(parents=True)
+        (tmp_path / f'fleet/{k:05d}/calibration.json').write_bytes(content)
+    found = list(fleet.find(str(tmp_path / 'fleet'), Cameras()))
+    (task,) = fleet.find(str(tmp_path / 'one'), Cameras())
+    first = fleet.compute(task).row
+    assert first
+    (tmp_path / 'out').mkdir()
+    table = Table(tmp_path / 'out')
+    with table.transaction():
+        for k, task in enumerate(found):
+            table.add(dataclasses.replace(first, key=f'{k:064d}'[::-1], stamp=task.stamp))
+    start_s = time.process_time()
+    again = list(fleet.find(str(tmp_path / 'fleet'), Cameras()))
+    done = fleet.update(Table(tmp_path / 'out'), again)
+    assert done == fleet.Done(known=3_000)
+    assert time.process_time() - start_s < 6.0
+
+
+def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(
+    mission: Path, monkeypatch
+) -> None:
+    found = list(fleet.find(str(mission), Cameras()))
+    away = mission.rename(mission.parent / 'unmounted')
+    assert fleet.update(Table(mission.parent), found) == fleet.Done(failed=8)
+    row = Table(mission.parent).rows()[0]
+    assert row.is_passing and 'not seen by this worker; mount it' in row.error
+    away.rename(mission)
+    # After the files that were not tried before: those that never answer hold up no others.
+    new = dataclasses.replace(found.pop(), stamp='new')
+    computed: list[Task] = []
+    compute = fleet.compute
+
+    def noted(task: Task) -> Answer:
+        computed.append(task)
+        return compute(task)
+
+    monkeypatch.setattr(fleet, 'compute', noted)
+    assert fleet.update(Table(mission.parent), [*found, new]) == fleet.Done(computed=8)
+    assert [task.url for task in computed] == [new.url, *(task.url for task in found)]
+    assert [row.error for row in Table(mission.parent).rows()] == [''] * 8
+
+
+def test_relative_paths_are_made_absolute(mission: Path, monkeypatch) -> None:
+    monkeypatch.chdir(mission.parent)
+    assert main(['trend', 'mission', '-o', 'out']) == 0
+    assert all(Path(row.path).is_absolute() for row in Table('out').rows())
+    assert places.absolute(f'file://{mission}') == str(mission)
+
+
+@pytest.mark.slow
+def test_bags_and_products_by_url(tmp_path: Path, capsys) -> None:
+    memory = fsspec.filesystem('memory')
+    memory.rm('/fleet', recursive=True) if memory.exists('/fleet') else None
+    memory.put(str(TINY), '/fleet/bag', recursive=True)
+    write(tmp_path / 'one', 3)
+    memory.put(str(tmp_path / 'one'), '/fleet/one', recursive=True)
+    line = ['trend', 'memory://fleet', '-o', str(tmp_path)]
+    line += ['--params', str(TINY / 'params.yaml')]
+    assert main(line) == 0
+    assert '2 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert main(line) == 0
+    assert '0 new, 2 known, 0 failed' in capsys.readouterr().out
+    paths = sorted(row.path for row in Table(tmp_path).rows())
+    assert paths == ['memory://fleet/bag', 'memory://fleet/one/calibration.json']
+    assert main([*line[:3], 'memory://fleet/out']) == 2
+    assert 'results are written to a local folder, no URL' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('together', 'lists'), [(100, [13]), (5, [1, 4, 4, 4])])
+def test_a_store_is_listed_by_folders_where_it_has_many_files(
+    monkeypatch: pytest.MonkeyPatch, together: int, lists: list[int]
+) -> None:
+    memory = fsspec.filesystem('memory')
+    for camera, day in itertools.product(range(3), range(4)):
+        memory.pipe(f'/years/fleet/{camera}/{day}/calibration.json', b'1')
+    memory.pipe('/years/fleet/readme', b'1')
+    monkeypatch.setattr(places, '_TOGETHER', together)
+    found = list(places.listings('memory://years'))
+    assert [len(one) for one in found] == lists
+    names = sorted(entry.name for entry in itertools.chain(*found))
+    assert names == sorted(path.removeprefix('/years/') for path in memory.find('/years'))
+
+
+def test_an_unknown_protocol_is_one_line(tmp_path: Path, capsys) -> None:
+    assert main(['trend', 'nowhere://fleet', '-o', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert 'nowhere' in error and error.count('\n') == 1
+
+
+def test_content_that_the_table_has_is_no_new_row(mission: Path) -> None:
+    first, *_ = fleet.find(str(mission), Cameras())
+    answer = fleet.compute(first)
+    assert answer.row and answer.row.stamp == first.stamp and answer.row.key == answer.key
+    known = dataclasses.replace(first, known=(answer.key,))
+    assert fleet.compute(known) == Answer(answer.key)

@@ -1,0 +1,82 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Series, activations and changes of calibrations whose differences are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from trend_rows import DAY_NS, made  # type: ignore[import-not-found]
+
+from starcal_ground.mission.trend.rows import COMPUTED, FAILED, Row
+from starcal_ground.mission.trend.series import (
+    activations,
+    changes,
+    groups,
+    newest_of_each,
+    series_of,
+    versions,
+)
+from starcal_ros.constants import ARCSECOND_RAD
+
+
+def test_boresight_and_alignment_turn_as_the_camera_does() -> None:
+    rows = [made(1), made(2, (10.0, -20.0, 30.0))]
+    found = {series.name: series.value for series in series_of(rows)}
+    for axis, expected in zip('xyz', (10.0, -20.0, 30.0), strict=True):
+        np.testing.assert_allclose(found[f'alignment_{axis}'], [0, expected], atol=1e-6)
+    # The middle is 0.06 degrees off the axis: a roll of 30 arcsec moves it by 0.03.
+    np.testing.assert_allclose(found['boresight about x'], [0, 10.0], atol=0.05)
+    np.testing.assert_allclose(found['boresight about y'], [0, -20.0], atol=0.05)
+
+
+def test_a_change_is_the_rotation_in_pixels() -> None:
+    rows = [made(1, active_since_ns=1 * DAY_NS), made(2, (10.0, 0, 0)), made(3, (0, 0, 0))]
+    active = activations(rows)
+    assert [(one.row, one.until_ns, one.assumed) for one in active] == [(0, 0, False)]
+    first, second = changes(rows, active)
+    pixels = 10 * ARCSECOND_RAD * rows[0].values[0]
+    assert first.line_of_sight_px == pytest.approx(pixels, rel=0.05)  # less far off the axis
+    assert first.shape_px < 1e-6
+    assert (second.row, second.against) == (2, 0) and second.line_of_sight_px < 1e-6
+
+
+def test_activations_follow_one_another() -> None:
+    rows = [made(1, active_since_ns=5), made(2), made(3, active_since_ns=9)]
+    found = [(one.row, one.since_ns, one.until_ns) for one in activations(rows)]
+    assert found == [(0, 5, 9), (2, 9, 0)]
+
+
+def test_without_activations_each_accepted_one_is_taken_as_active() -> None:
+    rows = [made(1), made(2, accepted=False, reasons=('bad',)), made(3)]
+    found = [(one.row, one.assumed) for one in activations(rows)]
+    assert found == [(0, True), (2, True)]
+    assert [change.against for change in changes(rows, activations(rows))] == [0, 0]
+
+
+def test_refused_calibrations_alone_were_never_active() -> None:
+    rows = [made(day, accepted=False, reasons=('bad',)) for day in (1, 2)]
+    assert activations(rows) == [] and changes(rows, []) == []
+
+
+def test_a_newer_version_of_the_same_images_is_compared_and_counts_once() -> None:
+    old = made(1)
+    new = dataclasses.replace(made(1, (5.0, 0, 0)), kind=COMPUTED, key='new', software='starcal 9')
+    rows = [old, new, made(2)]
+    (pair,) = versions(rows)
+    assert (pair.against, pair.row) == (0, 1)
+    assert pair.line_of_sight_px == pytest.approx(5 * ARCSECOND_RAD * 3641.5, rel=0.05)
+    assert [row.key for row in newest_of_each(rows)] == ['new', '2']
+
+
+def test_a_calibration_that_was_activated_twice_counts_once_in_a_series() -> None:
+    rows = [made(1, active_since_ns=5), made(2, active_since_ns=8), made(1, active_since_ns=9)]
+    assert [row.key for row in newest_of_each(rows)] == ['1', '2']
+    assert [one.row for one in activations(rows)] == [0, 1, 2]
+
+
+def test_cameras_are_apart_and_failures_are_none() -> None:
+    other = dataclasses.replace(made(2), width=640)
+    rows = [made(1), other, made(3), Row('x', 'x', FAILED, error='bad')]
+    assert [len(group) for group in groups(rows).values()] == [2, 1]

@@ -1,0 +1,231 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The command over a folder tree: rows, increments, workers, poison and versions."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+from fleet_tasks import kill_on_poison, kill_once  # type: ignore[import-not-found]
+from mission_files import TINY  # type: ignore[import-not-found]
+import pytest
+from trend_missions import make_mission, trend, write  # type: ignore[import-not-found]
+
+from starcal_ground.cli.main import main
+from starcal_ground.mission.trend import fleet
+from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
+from starcal_ground.mission.trend.rows import COMPUTED
+from starcal_ground.mission.trend.trend_table import Table
+from starcal_ros.formats.products.calibration_json import write_calibration
+
+
+@pytest.fixture
+def mission(tmp_path: Path) -> Path:
+    path: Path = make_mission(tmp_path)
+    return path
+
+
+def test_copies_are_computed_once(mission: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(mission / '3', mission / 'copy/of/3')
+    assert trend(mission) == 0
+    assert '8 new, 1 known, 0 failed' in capsys.readouterr().out
+    rows = Table(mission.parent / 'out').rows()
+    assert len(rows) == 8 and 'copy' not in ' '.join(row.path for row in rows)
+
+
+def test_only_what_is_new_is_computed(mission: Path, capsys, monkeypatch) -> None:
+    assert trend(mission) == 0
+    assert '8 new, 0 known, 0 failed' in capsys.readouterr().out
+    write(mission / 'later/deep', 100)
+    called: list[Task] = []
+    compute = fleet.compute
+
+    def counted(task: Task) -> Answer:
+        called.append(task)
+        return compute(task)
+
+    monkeypatch.setattr(fleet, 'compute', counted)
+    assert trend(mission) == 0
+    assert '1 new, 8 known' in capsys.readouterr().out and len(called) == 1
+    page = (mission.parent / 'out/trend.html').read_text()
+    assert '9 calibrations' in page
+    assert not re.search(r'(src|href)="(?!data:|#)', page)  # it needs no network
+
+
+def test_a_copy_counts_once_and_the_tree_may_move(mission: Path, capsys) -> None:
+    assert trend(mission) == 0
+    capsys.readouterr()
+    moved = mission.rename(mission.parent / 'elsewhere')
+    shutil.copytree(moved / '1', moved / 'copy')
+    assert trend(moved) == 0
+    assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_bad_calibration_costs_itself(mission: Path, capsys) -> None:
+    (mission / '3/calibration.json').write_text('{"schema": 1}')
+    assert trend(mission) == 0
+    out = capsys.readouterr().out
+    assert '7 new' in out and '1 failed' in out and 'mission/3/calibration.json' in out
+    assert 'Not calibrated' in (mission.parent / 'out/trend.html').read_text()
+    write_calibration(calibration(), mission / '3/calibration.json')
+    assert trend(mission) == 0
+    assert '1 new, 7 known, 0 failed' in capsys.readouterr().out
+
+
+def test_a_repaired_file_has_not_failed(mission: Path, capsys) -> None:
+    (mission / '3/calibration.json').write_text('{"schema": 1}')
+    assert trend(mission) == 0
+    capsys.readouterr()
+    write(mission / '3', 3)
+    assert trend(mission) == 0
+    out = capsys.readouterr().out
+    assert '1 new, 7 known, 0 failed' in out and 'calibration.json' not in out
+    assert 'Not calibrated' not in (mission.parent / 'out/trend.html').read_text()
+
+
+@pytest.mark.slow
+def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(tmp_path: Path, capsys):
+    """The parameters name files that decide as well, and so does the metadata of a bag."""
+    shutil.copytree(TINY, tmp_path / 'fleet/one')
+    shutil.copytree(TINY, tmp_path / 'setup')
+    camera, params = tmp_path / 'setup/camera.yaml', tmp_path / 'setup/params.yaml'
+    good = camera.read_text()
+    camera.write_text(re.sub('image_width: [0-9]+', 'image_width: 500', good))
+    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out'), '--params', str(params)]
+    assert main(line) == 3 and '1 failed' in capsys.readouterr().out
+    assert main(line) == 3 and '0 failed' in capsys.readouterr().out
+    camera.write_text(good)
+    assert main(line) == 0 and '1 new, 0 known, 0 failed' in capsys.readouterr().out
+    camera.write_text('image_width: wide')
+    assert main(line) == 2 and capsys.readouterr().err.count('\n') == 1
+
+
+def test_refused_calibrations_alone_have_a_page(mission: Path, capsys) -> None:
+    for day in range(3):
+        folder = mission / f'refused/{day}'
+        write(folder, day, child_frame='other_camera', accepted=False, reasons=('bad',))
+    assert trend(mission) == 0
+    page = (mission.parent / 'out/trend.html').read_text()
+    assert 'other_camera' in page and '11 calibrations' in page
+
+
+def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, capsys) -> None:
+    (mission / '3').rename(os.fsdecode(os.fsencode(mission) + b'/caf\xe9'))
+    bad = write(Path(os.fsdecode(os.fsencode(mission) + b'/\xff')), 9)
+    (bad / 'calibration.json').write_text('')
+    moved = mission.rename(os.fsdecode(os.fsencode(mission) + b'\xe9'))
+    assert trend(moved) == 0
+    out = capsys.readouterr().out
+    assert '8 new, 0 known, 1 failed' in out and '\\udcff/calibration.json' in out
+    assert trend(moved) == 0 and '0 new, 9 known, 0 failed' in capsys.readouterr().out
+    assert trend(moved, '--cameras', '{spacecraft}/*') == 0  # which names a camera
+    assert '8 new, 0 known, 1 failed' in capsys.readouterr().out
+
+
+def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:
+    made = (('pipe', 'x.mcap'), ('pipe', 'calibration.json'), ('folder', 'calibration.json'))
+    links = ((target, 'x.mcap') for target in ('/dev/zero', '/dev/tty', 'nowhere', 'x.mcap'))
+    for k, (kind, name) in enumerate((*made, *links, ('folder', 'x.mcap'))):
+        (mission / f'odd{k}').mkdir()
+        path = mission / f'odd{k}' / name
+        if kind == 'pipe':
+            os.mkfifo(path)
+        elif kind == 'folder':
+            path.mkdir()
+        else:
+            path.symlink_to(kind)
+    assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
+    # A folder in place of a bag is one without a bag in it.
+    assert '8 new, 0 known, 7 failed' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_link_to_no_file_costs_itself_and_not_its_bag(mission: Path, capsys) -> None:
+    for k, target in enumerate(('/dev/zero', '/dev/tty', 'nowhere', 'x.mcap')):
+        (mission / f'odd{k}').mkdir()
+        (mission / f'odd{k}/x.mcap').symlink_to(target)
+        (mission / f'odd{k}/metadata.yaml').write_text('')
+        shutil.copy(TINY / 'tiny_0.mcap', mission / f'odd{k}/good.mcap')
+    assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
+    assert '9 new, 3 known, 0 failed' in capsys.readouterr().out
+
+
+def test_a_calibration_that_no_page_can_show_costs_itself(mission: Path, capsys) -> None:
+    path = mission / '3/calibration.json'
+    wild = json.loads(path.read_text())
+    wild['covariance'][0][0] = 1e300
+    path.write_text(json.dumps(wild))
+    assert trend(mission) == 0
+    assert '7 new, 0 known, 1 failed' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_bags_are_calibrated_with_parameters(tmp_path: Path, capsys) -> None:
+    shutil.copytree(TINY, tmp_path / 'fleet/one')
+    (tmp_path / 'fleet/two').mkdir()
+    (tmp_path / 'fleet/two/poison.mcap').write_bytes(b'\x89MCAP0\r\n' + bytes(1000))
+    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
+    assert main([*line, '--params', str(TINY / 'params.yaml')]) == 0
+    assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
+    good = [row for row in Table(tmp_path / 'out').rows() if not row.error]
+    assert [row.kind for row in good] == [COMPUTED] and good[0].accepted
+
+
+@pytest.mark.slow
+def test_observations_of_another_version_are_calibrated_again(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / 'mission/one'
+    params = str(TINY / 'params.yaml')
+    assert main(['calibrate', str(TINY), '--params', params, '-o', str(folder)]) == 0
+    text = (folder / 'calibration.json').read_text()
+    (folder / 'calibration.json').write_text(re.sub(r'"starcal [^"]*"', '"starcal 0.0.1"', text))
+    capsys.readouterr()
+    assert trend(tmp_path / 'mission') == 0
+    assert '2 new' in capsys.readouterr().out
+    page = (tmp_path / 'out/trend.html').read_text()
+    assert 'The same observations with this version' in page
+    # The same code again, from the observations and the options beside them.
+    assert '<td class="text">starcal 0.0.1</td>' in page and '<td>0.000</td>' in page
+
+
+@pytest.mark.parametrize(
+    ('line', 'words'),
+    [
+        ('trend {t}/none -o {t}/out', 'no such folder'),
+        ('trend {t} -o {t}/out', 'no calibration.json below it'),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path: Path, capsys, line: str, words: str) -> None:
+    assert main(line.format(t=tmp_path).split()) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count('\n') == 1
+
+
+@pytest.mark.slow
+def test_a_bag_that_kills_its_worker_costs_itself(mission: Path, monkeypatch) -> None:
+    poison = [Task(f'poison {k}', f'poison {k}', (), size=-1) for k in range(2)]
+    found = [poison[0], *fleet.find(str(mission), Cameras()), poison[1]]
+    monkeypatch.setattr(fleet, 'compute', kill_on_poison)
+    table = Table(mission.parent)
+    assert fleet.update(table, found, workers=2) == fleet.Done(computed=8, failed=2)
+    errors = [row.error for row in Table(mission.parent).rows() if row.error]
+    assert errors == ['ends its worker process, also alone: out of memory?'] * 2
+
+
+@pytest.mark.slow
+def test_a_worker_killed_in_the_run_loses_and_doubles_nothing(mission, monkeypatch) -> None:
+    marker = mission.parent / 'marker'
+    marker.touch()
+    found = [
+        dataclasses.replace(t, params=str(marker)) for t in fleet.find(str(mission), Cameras())
+    ]
+    monkeypatch.setattr(fleet, 'compute', kill_once)
+    done = fleet.update(Table(mission.parent), found, workers=2)
+    assert done == fleet.Done(computed=8) and not marker.exists()
+    stamps = [row.stamp for row in Table(mission.parent).rows()]
+    assert sorted(stamps) == sorted(task.stamp for task in found)

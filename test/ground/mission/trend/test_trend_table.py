@@ -1,0 +1,213 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The table grows, survives a kill at any instant and holds each row once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import dataclasses
+import math
+import os
+from pathlib import Path
+import signal
+import sqlite3
+import subprocess
+import sys
+from typing import Any
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from starcal_ground.mission.trend.rows import failure, RECORDED, Row, row_of
+from starcal_ground.mission.trend.trend_table import Table, TABLE_FILE
+from starcal_ros.errors import ProductError
+
+
+def row(key: str, time_ns: int = 5, **changed: Any) -> Row:
+    made = row_of(calibration(with_field=True), key, '/some/where.json', RECORDED, 21.5)
+    return dataclasses.replace(made, time_ns=time_ns, **changed)
+
+
+def failed(url: str, error: str, stamp: str) -> Row:
+    return dataclasses.replace(failure(url, error), stamp=stamp)
+
+
+def table_of(folder: Path, *rows: Row) -> Table:
+    table = Table(folder)
+    for one in rows:
+        table.add(one)
+    return table
+
+
+def test_rows_come_back_to_the_last_bit_in_order_of_time(tmp_path: Path) -> None:
+    rows = [row('a', 3), row('b', 9), row('c', 10, temperature_degc=math.nan)]
+    table_of(tmp_path, *rows[::-1])
+    assert str(Table(tmp_path).rows()) == str(rows)  # NaN differs from itself
+
+
+def test_parquet_has_the_columns_of_the_table(tmp_path: Path) -> None:
+    rows = [row('a', 3, camera='x'), row('b', 9, camera='y'), failure('/bad', 'no stars')]
+    path = table_of(tmp_path, *rows).write_parquet()
+    columns = [field.name for field in dataclasses.fields(Row)]
+    parquet = pq.read_table(path)
+    with contextlib.closing(sqlite3.connect(tmp_path / TABLE_FILE)) as other:
+        of_sqlite = [name for name, *_ in other.execute('select * from calibration').description]
+    assert parquet.column_names == columns == of_sqlite
+    assert parquet['values'].to_pylist()[1:] == [list(rows[0].values), list(rows[1].values)]
+    assert pq.ParquetFile(path).num_row_groups == 3
+    table_of(tmp_path, row('c')).write_parquet()  # replaces it
+    assert len(pq.read_table(path)) == 4
+
+
+def test_a_parquet_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / 'trend.parquet').mkdir()
+    with pytest.raises(ProductError, match=r'trend\.parquet: cannot be written: Is a directory'):
+        table_of(tmp_path, row('a')).write_parquet()
+
+
+ROWS = {  # what replaces what: rows that are added, keys and cameras that are left
+    'a camera has another name now': ([row('a', camera='x'), row('a', camera='y')], ['a y']),
+    'a key of another camera': ([row('a', camera='x'), row('b', camera='x')], ['a x', 'b x']),
+    'a failure is mended': (
+        [failed('/1', 'bad', '1'), row('a', stamp='1')],
+        ['a '],
+    ),
+    'a failure fails again': (
+        [failed('/1', 'bad', '1'), failed('/1', 'worse', '2')],
+        ['worse '],
+    ),
+    'no stamps': ([row('a'), row('b'), failure('/1', 'bad')], ['bad ', 'a ', 'b ']),
+}
+
+
+@pytest.mark.parametrize('case', ROWS)
+def test_a_row_replaces_what_it_mends(tmp_path: Path, case: str) -> None:
+    rows, expected = ROWS[case]
+    table_of(tmp_path, *rows)
+    left = Table(tmp_path).rows()
+    assert [f'{one.error or one.key} {one.camera}' for one in left] == expected
+
+
+def test_rows_come_one_camera_after_the_other(tmp_path: Path) -> None:
+    table = table_of(tmp_path, *(row(key, camera=key[0]) for key in ('x1', 'y1', 'x2')))
+    other = table_of(tmp_path, row('y2', camera='y'))  # another run, at the same time
+    for each in (table, other, Table(tmp_path)):
+        assert [[one.key for one in rows] for rows in each.cameras()] == [
+            ['x1', 'x2'],
+            ['y1', 'y2'],
+        ]
+    assert table.names() == [('', 'x'), ('', 'y')]
+
+
+def test_a_stamp_leads_to_its_row(tmp_path: Path) -> None:
+    table = table_of(tmp_path, row('a', stamp='1', size_bytes=7, spacecraft='A'))
+    table.add_seen('2', 'a')
+    table.add_seen('3', '')
+    table.add_seen('4', 'gone')
+    table.add_seen('', 'a')
+    assert [Table(tmp_path).key_of(stamp) for stamp in ('1', '2', '3', '4', '', '5')] == [
+        *('a', 'a', '', None, None, None)
+    ]
+    assert table.likely(7, '', '') == table.likely(7, 'A', '') == ('a',)
+    assert table.likely(8, '', '') == table.likely(7, 'B', '') == ()
+
+
+def test_failures_that_are_tried_again(tmp_path: Path) -> None:
+    before = dataclasses.replace(failed('/1', 'bad', '1'), software='starcal 0.0.1')
+    passing = dataclasses.replace(failed('/2', 'bad', '2'), is_passing=True)
+    table = table_of(tmp_path, before, passing, failed('/3', 'bad', '3'), row('a'))
+    assert table.failures() == {'1': True, '2': True, '3': False}
+    table.forget_failures(['1', '3', 'none'])
+    assert [one.error or one.key for one in Table(tmp_path).rows()] == ['bad', 'a']
+
+
+_KILLED = """
+import os, signal, sys
+sys.path[:0] = sys.argv[2:]
+from test_trend_table import row, Table
+table = Table(sys.argv[1])
+for k in range(5):
+    table.add(row(str(k), k))
+with table.transaction():
+    table.add(row('5', 5))
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_kill_loses_no_row_that_was_added(tmp_path: Path) -> None:
+    here = Path(__file__).parent
+    line = [sys.executable, '-c', _KILLED, str(tmp_path), str(here), str(here.parents[2])]
+    assert subprocess.run(line).returncode == -signal.SIGKILL
+    assert [one.key for one in Table(tmp_path).rows()] == list('01234')
+
+
+def changed_by(*statements: str) -> Callable[[Path], object]:
+    """Statements that another program runs on a table with a row."""
+
+    def change(path: Path) -> None:
+        path.unlink()
+        table_of(path.parent, row('a'))
+        other = sqlite3.connect(path)
+        for statement in statements:
+            other.execute(statement)
+        other.commit()
+        other.close()
+
+    return change
+
+
+def content(made: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(made(path.read_bytes()))
+
+
+def replaced_by(make: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda path: (path.rename(path.with_suffix('.old')), make(path))
+
+
+SET = 'update calibration set'
+HOSTILE = {
+    'binary': content(lambda _: np.random.default_rng(1).bytes(10_000)),
+    'text': content(lambda _: b'key,path\n1,2\n'),
+    'truncated': content(lambda sound: sound[: len(sound) // 2]),
+    'torn': content(lambda sound: sound[:5000] + bytes(15_000) + sound[20_000:]),
+    'another database': changed_by('drop table calibration', 'create table calibration (a)'),
+    'a view': changed_by(
+        'drop table seen',
+        'create view seen as with recursive n(k) as (select 1 union all select k + 1 from n) '
+        'select k as stamp, k as key from n',
+    ),
+    'a trigger': changed_by(
+        'create trigger t after insert on seen begin delete from calibration; end'
+    ),
+    'null': changed_by(f'{SET} "values" = \'[null]\''),
+    'no list': changed_by(f'{SET} "values" = \'7\''),
+    'no JSON': changed_by(f'{SET} "values" = \'[1\''),
+    'nested': changed_by(f"{SET} names = '{'[' * 100}{']' * 100}'"),
+    'too few': changed_by(f'{SET} "values" = \'[1.0]\''),
+    'no quaternion': changed_by(f"{SET} star_tracker_from_camera_xyzw = '[0, 0, 0, 0]'"),
+    'huge': changed_by(f'{SET} "values" = \'[{", ".join(["1e300"] * 10)}]\''),
+    'huge sigma': changed_by(f"{SET} sigmas = '[{', '.join(['1e200'] * 13)}]'"),
+    'negative size': changed_by(f'{SET} width = -1'),
+    'out of the calendar': changed_by(f'{SET} time_ns = {2**63 - 1}'),
+    'unknown lens': changed_by(f"{SET} lens_model = 'fish'"),
+    'long text': changed_by(f"{SET} path = '{'x' * 1_000_000}'"),
+    'no text': changed_by(f"{SET} path = cast(x'fffe' as text)"),
+    'a pipe': replaced_by(os.mkfifo),
+    'a device': replaced_by(lambda path: path.symlink_to('/dev/zero')),
+    'a link to nothing': replaced_by(lambda path: path.symlink_to('nowhere')),
+    'a folder': replaced_by(Path.mkdir),
+}
+
+
+@pytest.mark.parametrize('kind', HOSTILE)
+def test_a_damaged_table_is_named_and_left_alone(tmp_path: Path, kind: str) -> None:
+    table_of(tmp_path, *(row(str(k), k) for k in range(20)))
+    path = tmp_path / TABLE_FILE
+    HOSTILE[kind](path)
+    before = path.read_bytes() if path.is_file() and not path.is_symlink() else b''
+    with pytest.raises(ProductError, match=r'trend\.sqlite: ') as caught:
+        Table(tmp_path).rows()
+    assert len(str(caught.value)) < 300 + len(str(path)) and '\n' not in str(caught.value)
+    assert before == (path.read_bytes() if before else b'')

@@ -1,0 +1,225 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""What is said of a bag before it is calibrated, held against what a calibration then does."""
+
+from __future__ import annotations
+
+from collections import Counter
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from starcal_ground.cli import main
+from starcal_ground.cli.arguments import EXIT_REFUSED
+from starcal_ground.planning import inspect
+from starcal_ground.simulation import simulated_bag
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, make_header
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.pipeline import topics
+from starcal_ros.pipeline.setup import read_setup, Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import Image
+
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
+PARAMS = TINY / 'params.yaml'
+ASKED = Topics()
+IMAGE, ATTITUDE = simulated_bag.IMAGE_TOPIC, simulated_bag.ATTITUDE_TOPIC
+
+
+@pytest.fixture(scope='module')
+def setup() -> Setup:
+    return read_setup(PARAMS)
+
+
+@pytest.fixture(scope='module')
+def tiny_images() -> list[Image]:
+    return [i for i in reader.read_images([TINY], IMAGE) if isinstance(i, Image)]
+
+
+def write_spoilt(path: Path, images: list[Image]) -> None:
+    """
+    The tiny bag with an image of each fault: sky, stamp, size, attitude.
+
+    Image 0 has lost the samples about it, image 1 those after it; image 3 comes twice; image 4 is
+    dark; image 5 is cut; the samples about image 7 are no rotations; after image 9 the attitudes
+    end, and one more image comes.
+    """
+    samples = [
+        attitude_from_message(reader.decode(raw)) for raw in reader.read_raw([TINY], [ATTITUDE])
+    ]
+    stamps = [image.time_ns for image in images]
+
+    def near(k: int, time_ns: int) -> bool:
+        return abs(time_ns - stamps[k]) < 10**9
+
+    with BagWriter(path) as writer:
+        for time_ns, xyzw in samples:
+            if near(0, time_ns) or (near(1, time_ns) and time_ns > stamps[1]):
+                continue
+            broken = near(7, time_ns)
+            writer.write_attitude(ATTITUDE, time_ns, 0.5 * xyzw if broken else xyzw, 'icrf')
+        for k, image in enumerate(images):
+            pixels = image.pixels
+            if k == 4:
+                pixels = np.full_like(pixels, np.median(pixels))
+            if k == 5:
+                pixels = pixels[:-1]
+            for _ in range(2 if k == 3 else 1):
+                writer.write_image(IMAGE, Image(image.time_ns, pixels), 'camera')
+        writer.write_image(IMAGE, Image(stamps[-1] + 10**10, images[-1].pixels), 'camera')
+
+
+@pytest.mark.slow
+def test_verdicts_are_those_of_the_calibration(
+    tmp_path: Path, setup: Setup, tiny_images: list[Image]
+) -> None:
+    path = tmp_path / 'spoilt.mcap'
+    write_spoilt(path, tiny_images)
+    quick = inspect.inspect([path], ASKED)
+    assert {r.reason: r.count for r in quick.refused} == {
+        'no_attitude': 2,
+        'attitude_gap': 1,
+        'bad_attitude': 1,
+        'out_of_order': 1,
+    }
+    assert quick.images == 12 and not quick.problems and not quick.measured
+    seen = []
+    full = inspect.inspect([path], ASKED, setup, lambda: seen.append(1))
+    by_reason = {r.reason: r.count for r in full.refused}
+    # With the stars and the camera, two more: the dark image and the cut one.
+    expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
+    assert by_reason == expected
+    assert len(seen) == full.images == 12
+    observed = list(topics.read([path], Topics(IMAGE, ATTITUDE), setup))
+    assert by_reason == Counter(o.refusal for o in observed if o.refusal)
+    assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
+    gap = next(r for r in full.refused if r.reason == 'attitude_gap')
+    assert gap.first_ns == tiny_images[1].time_ns and 'over 2 s' in gap.detail
+    assert full.status is not None and full.status.images == 5
+    assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
+
+
+def test_an_attitude_gap_that_is_not_recorded_is_nan(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
+    path = tmp_path / 'images.mcap'
+    with BagWriter(path) as writer:
+        writer.write_image(IMAGE, tiny_images[0], 'camera')
+        writer.write_attitude(ATTITUDE, 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    assert math.isnan(inspect.inspect([path], ASKED).longest_attitude_gap_s)
+    assert main.main(['inspect', str(path), '--json']) == EXIT_REFUSED
+    assert json.loads(capsys.readouterr().out)['longest_attitude_gap_s'] is None
+    assert main.main(['inspect', str(path)]) == EXIT_REFUSED
+    assert 'longest attitude gap' not in capsys.readouterr().out
+
+
+def test_the_topics_are_told(tmp_path: Path, tiny_images: list[Image]) -> None:
+    path = tmp_path / 'spoilt.mcap'
+    write_spoilt(path, tiny_images)
+    attitude, image = sorted(inspect.inspect([path], ASKED).topics, key=lambda t: -t.bad)
+    assert (attitude.name, attitude.bad) == (ATTITUDE, 4)
+    assert attitude.rate_hz == pytest.approx(2.0) and attitude.count == 34
+    assert image.name == IMAGE and image.count == 12 and image.bad == 0
+    assert image.kinds == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
+    assert image.rate_hz == pytest.approx(0.25) and image.longest_gap_s == pytest.approx(10.0)
+    assert image.first_ns == tiny_images[0].time_ns
+    assert image.last_ns == tiny_images[-1].time_ns + 10**10
+
+
+def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path: Path) -> None:
+    path = tmp_path / 'more.mcap'
+    with BagWriter(path) as writer:
+        for k in (0, 2, 1):
+            writer.write_temperature('/lens', 10**18 + k * 10**9, 20.0, 'camera')
+            writer.write_velocity('/velocity', 10**18 + k * 10**9, np.zeros(3), 'icrf')
+    found = inspect.inspect([path], ASKED)
+    lens, velocity = found.topics
+    assert (lens.name, velocity.name) == ('/lens', '/velocity')
+    assert lens.backward == 1 and lens.rate_hz == pytest.approx(1.0)
+    assert found.problems and 'no topic of type sensor_msgs/msg/Image' in found.problems[0]
+    assert 'starcal import' in found.problems[0] and '/lens' in found.problems[0]
+
+
+def test_compressed_images_are_told_apart(tmp_path: Path, tiny_images: list[Image]) -> None:
+    path = tmp_path / 'png.mcap'
+    with BagWriter(path) as writer:
+        for k, ending in enumerate(('.png', '.jpg')):
+            pixels = tiny_images[k].pixels
+            coded = cv2.imencode(ending, pixels if ending == '.png' else pixels.astype(np.uint8))
+            message = make_message(
+                COMPRESSED_TYPE,
+                header=make_header(tiny_images[k].time_ns, 'camera', make_message),
+                format=ending[1:],
+                data=np.asarray(coded[1]).ravel(),
+            )
+            writer._write('/image', COMPRESSED_TYPE, tiny_images[k].time_ns, message)
+        for raw in reader.read_raw([TINY], [ATTITUDE]):
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
+    found = inspect.inspect([path], ASKED)
+    (image,) = (t for t in found.topics if t.name == '/image')
+    assert image.kinds == {'PNG 16 bit 640 x 512': 1, 'jpg, not a PNG of one channel': 1}
+    assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
+
+
+def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path, tiny_images: list[Image]) -> None:
+    cut = tmp_path / 'cut.mcap'
+    write_spoilt(cut, tiny_images)
+    cut.write_bytes(cut.read_bytes()[:-10_000])  # in the second chunk
+    found = inspect.inspect([cut], ASKED)
+    (damage,) = found.damage
+    assert 'truncated' in damage
+    (images,) = (t.count for t in found.topics if t.name == IMAGE)
+    assert 0 < images < 10 and found.images == images
+
+
+def test_recorded_observations_need_no_parameters(tiny_products: Path) -> None:
+    found = inspect.inspect([tiny_products / 'observations.mcap'], ASKED)
+    assert found.measured and found.images == 10 and not found.refused
+    assert found.chosen == Topics(observations='/observations')
+
+
+def test_the_tool_says_it_to_people_and_programs(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'spoilt.mcap'
+    write_spoilt(path, tiny_images)
+    assert main.main(['inspect', str(path)]) == 0
+    out = capsys.readouterr().out
+    assert '7 of 12 images' in out and 'attitude_gap' in out
+    assert 'over 2 s' in out and 'too far apart' in out  # this image's, and what it means
+    assert main.main(['inspect', str(path), '--json', '--params', str(PARAMS)]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made['images'] == 12 and made['measured'] is True
+    assert len(made['status']['predicted_sigma']) == len(made['status']['parameter_names'])
+    assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
+
+
+def test_a_bag_that_cannot_be_calibrated_ends_with_3(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'two.mcap'
+    with BagWriter(path) as writer:
+        for image in tiny_images[:2]:
+            writer.write_image(IMAGE, image, 'camera')
+        writer.write_attitude(ATTITUDE, 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    assert main.main(['inspect', str(path)]) == 3
+    out = capsys.readouterr().out
+    assert 'cannot be calibrated: no usable image' in out and 'no_attitude' in out
+    few = tmp_path / 'few.mcap'
+    with BagWriter(few) as writer:
+        for raw in reader.read_raw([TINY], [ATTITUDE]):
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
+        for image in tiny_images[:2]:
+            writer.write_image(IMAGE, image, 'camera')
+    assert main.main(['inspect', str(few)]) == 0  # as far as can be told without the stars
+    assert main.main(['inspect', str(few), '--params', str(PARAMS)]) == 3
+    assert 'only 2 usable images, 3 needed (min_images)' in capsys.readouterr().out

@@ -1,0 +1,101 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""What candidate images add to an estimate, against the estimator with these images."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from starcal_ground.planning.prospect import (
+    expected_noise_px2,
+    LINE_OF_SIGHT,
+    MAP,
+    prospect,
+    target,
+)
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import scenario
+from starcal_ros.errors import OptionError
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.records import Ensemble
+
+_OPTIONS = CalibrationOptions()
+
+
+@pytest.fixture(scope='module')
+def whole() -> Ensemble:
+    return true_observations(scenario('tiny'))
+
+
+def _estimate(images: Ensemble) -> Estimate:
+    return estimate_calibration(images, scenario('tiny').prior, _OPTIONS)
+
+
+@pytest.fixture(scope='module')
+def first(whole: Ensemble) -> Estimate:
+    return _estimate(dataclasses.replace(whole, images=whole.images[:8]))
+
+
+def test_added_images_lower_the_sigma_as_the_estimator_says(
+    whole: Ensemble, first: Estimate
+) -> None:
+    """Two more images of the same noise, but for amplitudes, which the estimator finds again."""
+    found = prospect(first, whole.images[8:], _OPTIONS)
+    after = _estimate(whole)
+    for name in ('fx', 'k1', 'p1'):
+        wanted = target(first, name)
+        sigma = np.sqrt(found.variances([0, 1], wanted.squares))
+        assert sigma[0] == pytest.approx(wanted.sigma(first.posterior.covariance))
+        assert (np.diff(sigma) < 0).all()
+        reported = target(after, name).sigma(after.posterior.covariance)
+        assert sigma[2] == pytest.approx(reported, rel=0.15)  # noise and amplitudes found again
+
+
+def test_the_best_candidate_is_the_one_whose_variance_is_least(
+    whole: Ensemble, first: Estimate
+) -> None:
+    found = prospect(first, whole.images, _OPTIONS)
+    wanted = target(first, MAP)
+    every = np.ones(10, bool)
+    each = [float(found.variances([k], wanted.squares)[-1]) for k in range(10)]
+    best = found.best([], every, wanted.squares)
+    assert best == int(np.argmin(each))
+    without = every.copy()
+    without[best] = False
+    assert found.best([], without, wanted.squares) == int(np.argsort(each)[1])
+
+
+def test_information_does_not_depend_on_the_order_of_the_candidates(
+    whole: Ensemble, first: Estimate
+) -> None:
+    """Also of images with other numbers of stars, which share chunks."""
+    ahead = prospect(first, whole.images, _OPTIONS).information
+    back = prospect(first, whole.images[::-1], _OPTIONS).information
+    np.testing.assert_allclose(ahead, back[::-1], atol=1e-9 * ahead.max())  # order of sums
+
+
+def test_sigmas_by_name(first: Estimate) -> None:
+    """Of the map below that of lines of sight, which has the alignment; of a parameter its own."""
+    covariance = first.posterior.covariance
+    of_map, of_sight = target(first, MAP), target(first, LINE_OF_SIGHT)
+    assert of_map.sigma(covariance) < of_sight.sigma(covariance)
+    names = first.geometry.camera.parameter_names
+    sigma = float(np.sqrt(first.covariance[names.index('k1'), names.index('k1')]))
+    assert target(first, 'k1').sigma(covariance) == pytest.approx(sigma, rel=1e-9)  # rounding
+    with pytest.raises(
+        OptionError, match=r"'k9' is not estimated.*one of: line_of_sight, map, fx"
+    ):
+        target(first, 'k9')
+
+
+def test_expected_noise_is_that_of_stars_of_about_the_magnitude(first: Estimate) -> None:
+    table = first.table
+    expected = expected_noise_px2(first, table.magnitude.astype(float))
+    real = first.covariance_px2[:, [0, 2]].mean(axis=1)
+    # Their information in all, which decides: to 5 %, of the steps between the groups.
+    assert (1.0 / expected).sum() == pytest.approx((1.0 / real).sum(), rel=0.05)
+    faint_first = expected_noise_px2(first, np.array([9.0, 6.0, 4.0]))
+    assert (np.diff(faint_first) < 0).all()

@@ -1,0 +1,74 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Numbers behind the figures of residuals."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from starcal_ground.report import figures
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.camera import CameraModel
+
+CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, 0, 0, 0, 0, 0]))
+STARS, IMAGES, SIGMA_PX = 20_000, 10, 0.1
+
+
+def noise(seed: int) -> Residuals:
+    """Independent residuals of 0.1 px on stars anywhere."""
+    rng = np.random.default_rng(seed)
+    return Residuals(
+        image_time_ns=np.arange(IMAGES) * 10**9,
+        image_misfit=np.zeros(IMAGES, bool),
+        attitude_error_arcsec=np.zeros((IMAGES, 3)),
+        attitude_sigma_arcsec=np.ones((IMAGES, 3)),
+        image=np.sort(rng.integers(0, IMAGES, STARS)),
+        catalog_id=np.arange(STARS),
+        magnitude=rng.uniform(3, 8, STARS),
+        colour_bp_rp=rng.uniform(0, 2, STARS),
+        measured_px=rng.uniform([-0.5, -0.5], [639.5, 511.5], (STARS, 2)),
+        residual_px=rng.normal(0, SIGMA_PX, (STARS, 2)),
+        covariance_px2=np.tile([SIGMA_PX**2, 0.0, SIGMA_PX**2], (STARS, 1)),
+        used=np.ones(STARS, bool),
+    )
+
+
+def test_the_spectrum_of_noise_is_that_of_noise() -> None:
+    """The mean over 20 draws of every wave number is within 15 % of the expectation."""
+    found = [figures.wave_amplitudes(noise(seed), CAMERA) for seed in range(20)]
+    power = np.mean([amplitude**2 for _, amplitude, _ in found], axis=0)
+    expected_px = 2 * SIGMA_PX / np.sqrt(STARS)
+    # The first ring has 8 coefficients, half of them conjugates, on 2 axes: 160 squares, 11 %.
+    assert np.sqrt(power) == pytest.approx(np.full(16, expected_px), rel=0.15)
+    assert found[0][2] == pytest.approx(expected_px, rel=0.02)
+
+
+def test_a_wave_is_found_at_its_frequency() -> None:
+    plain = noise(1)
+    waves = plain.residual_px.copy()
+    waves[:, 0] += 0.05 * np.sin(2 * np.pi * 6 * plain.measured_px[:, 0] / 640)
+    moved = dataclasses.replace(plain, residual_px=waves)
+    number, amplitude, noise_px = figures.wave_amplitudes(moved, CAMERA)
+    assert number[np.argmax(amplitude)] == 6
+    assert amplitude[5] > 3 * noise_px > amplitude[[0, 1, 2, 3, 7, 8, 9]].max()
+
+
+def test_means_in_bins_and_their_errors() -> None:
+    x = np.repeat([0.5, 1.5, 2.5], [100, 9, 25])
+    y = np.concatenate([np.tile([1.0, 3.0], 50), np.ones(9), np.full(25, -2.0)])
+    centre, mean, error = figures._in_bins(x, y, np.arange(4, dtype=np.float64))
+    assert centre.tolist() == [0.5, 2.5]  # nine values are too few
+    assert mean.tolist() == [2.0, -2.0]
+    assert error.tolist() == pytest.approx([0.1, 0.0])
+
+
+def test_the_three_axes_of_a_star_tracker_share_the_axis_of_time() -> None:
+    error = np.random.default_rng(1).normal(size=(IMAGES, 3)) * (2.0, 9.0, 90.0)
+    found = dataclasses.replace(noise(0), attitude_error_arcsec=error)
+    chart = figures.alignment_in_time(found, (1.0, 10.0, 100.0))
+    assert chart is not None
+    axes = re.findall(r'<path d="M([\d.]+),[\d.]+V[\d.]+H([\d.]+)"', chart.svg.body)
+    assert len(axes) == 3 and len(set(axes)) == 1

@@ -1,0 +1,328 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The report: what it says, that it needs nothing else, and how a real browser shows it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+from pathlib import Path
+import re
+import shutil
+import subprocess
+from typing import Any
+
+from browser import BROWSER  # type: ignore[import-not-found]
+from markupsafe import Markup
+import numpy as np
+import pytest
+
+from starcal_ground.cli import main
+from starcal_ground.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
+from starcal_ground.report import page as report
+from starcal_ros.formats.bag.reader import read_observations
+from starcal_ros.formats.products import product_folder
+from starcal_ros.formats.products.calibration_json import (
+    CALIBRATION_FILE,
+    prior_of,
+    read_calibration,
+    write_calibration,
+)
+from starcal_ros.formats.products.product_files import REPORT_FILE
+from starcal_ros.records import Ensemble
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.state import Activation
+from starcal_ros.text import significant
+
+FIGURES = (
+    'coverage',
+    'cells',
+    'vectors',
+    'contours',
+    'change',
+    'sky',
+    'before',
+    'images',
+    'histogram',
+    'lens_field',
+    'field',
+    'spectrum',
+    'magnitude',
+    'colour',
+    'phase',
+    'budget',
+    'causes',
+    'line_of_sight',
+    'shape',
+    'alignment',
+)
+
+
+@pytest.fixture(scope='module')
+def folder(tiny_products: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `starcal calibrate` writes of the small bag; this module writes into it."""
+    path = tmp_path_factory.mktemp('report') / 'out'
+    shutil.copytree(tiny_products, path)
+    return path
+
+
+@pytest.fixture(scope='module')
+def page(folder: Path) -> str:
+    return (folder / REPORT_FILE).read_text()
+
+
+def page_of(folder: Path) -> str:
+    return report.write_report(folder).read_text()
+
+
+def test_of_a_state_folder_the_last_calibration_and_its_images(
+    tiny_products: Path, tmp_path: Path
+) -> None:
+    calibration = read_calibration(tiny_products / CALIBRATION_FILE)
+    images = tuple(read_observations([tiny_products / 'observations.mcap'], '/observations'))
+    later = dataclasses.replace(images[-1], time_ns=images[-1].time_ns + 10**9)
+    older, last = (dataclasses.replace(calibration, number=number) for number in (1, 2))
+    with contextlib.closing(Archive(tmp_path, 'camera')) as archive:
+        events = (Activation(8, 0, older), Activation(9, 8, last))
+        archive.keep(Ensemble((*images, later)), events)
+        assert main.main(['report', str(tmp_path)]) == EXIT_ACCEPTED  # while it is in use
+    page = (tmp_path / REPORT_FILE).read_text()
+    assert 'by the gate: calibration 2' in page
+    assert len(report._read_folder(tmp_path).observations or ()) == len(images)
+    assert '<svg' in page and 'no residuals of single stars (residuals.npz)' in page
+
+
+def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    assert '✓ Accepted' in page
+    fx, sigma = calibration.geometry.camera.parameters[0], calibration.sigma[0]
+    assert f'<td>{fx:.3f}</td>' in page  # to a hundredth of the sigma of 0.05 px
+    assert f'<td>{sigma:.2g}</td>' in page
+    prior = prior_of(calibration)
+    assert prior is not None
+    change = fx - prior.camera.parameters[0]
+    assert f'<td>{change / sigma:+.1f}</td>' in page
+    assert f'{calibration.residual_rms_px:.3f} px' in page
+    assert f'{calibration.stars_used:,}' in page
+    assert calibration.weakest_direction in page
+    total, *causes = calibration.sigma_budget
+    assert f'<th scope="row">total</th><td>{total.map_arcsec:.3g}</td>' in page
+    for part in causes:
+        assert str(Markup.escape(part.assumption)) in page
+    for name in FIGURES:
+        assert page.count(f'id="figure-{name}"') == 1
+    assert calibration.provenance['observations_sha256'] in page
+    checks = calibration.model_checks
+    assert checks is not None and len(checks.amplitudes) >= 3
+    for one in checks.amplitudes:
+        assert f'<th scope="row">{one.name}</th><td>{significant(one.value, 2)}</td>' in page
+
+
+def test_the_page_needs_nothing_else(page: str) -> None:
+    links = re.findall(r'(?:src|href)="((?!data:|#)[^"]*)"', page)
+    products = ['calibration.json', 'camera_info.yaml', 'residuals.npz', 'observations.mcap']
+    assert links == products  # beside the page; it shows itself without them
+    assert not re.findall(r'url\((?!#|"?data:)[^)]*\)|@import', page)
+    assert "default-src 'none'" in page
+    identifiers = re.findall(r'\bid="([^"]+)"', page)
+    assert len(identifiers) == len(set(identifiers))
+    assert len(page) < 2_000_000
+
+
+def test_report_rebuilds_the_same_page(folder: Path, page: str) -> None:
+    """`starcal calibrate` draws what it holds, `starcal report` what it reads."""
+    assert main.main(['report', str(folder)]) == EXIT_ACCEPTED
+    assert (folder / REPORT_FILE).read_text() == page
+
+
+def test_a_folder_with_a_calibration_alone_says_what_is_missing(
+    folder: Path, tmp_path: Path
+) -> None:
+    shutil.copy(folder / CALIBRATION_FILE, tmp_path)
+    text = page_of(tmp_path)
+    assert 'no residuals of single stars (residuals.npz)' in text
+    assert 'without access to the images' in text
+    assert 'id="figure-vectors"' in text and 'id="figure-images"' not in text
+
+
+def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    reasons = ('residual 2 px & more is over the limit',)
+    refused = dataclasses.replace(calibration, accepted=False, reasons=reasons)
+    write_calibration(refused, tmp_path / CALIBRATION_FILE)
+    text = page_of(tmp_path)
+    assert '✕ Refused' in text and '✓ Accepted' not in text
+    assert 'residual 2 px &amp; more is over the limit' in text
+
+
+def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    assert len(calibration.gate) > 15
+    checks = {check.option: check for check in calibration.gate}
+    failed = dataclasses.replace(checks['max_residual_rms_px'], found=8.125, passed=False)
+    not_checked = dataclasses.replace(
+        checks['max_change_px'], found=math.nan, passed=None, note='nothing to compare with'
+    )
+    shown = dataclasses.replace(calibration, gate=(failed, not_checked))
+    write_calibration(shown, tmp_path / CALIBRATION_FILE)
+    table = re.findall(
+        r'<section id="gate">.*?<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL
+    )[0]
+    rows = [re.findall(r'<t[hd][^>]*>(.*?)</t[hd]>', row) for row in table.split('<tr>')[2:]]
+    limit = f'at most {not_checked.limit_text}'
+    names = [
+        f'{check.name} <code>{check.option.replace("_", "_<wbr>")}</code>' for check in shown.gate
+    ]
+    assert rows == [
+        [names[0], 'failed', '8.125 px', 'at most 1 px', ''],
+        [names[1], 'not checked', '', limit, not_checked.note],
+    ]
+
+
+def test_a_calibration_of_before_the_gate_told_says_so(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    write_calibration(dataclasses.replace(calibration, gate=()), tmp_path / CALIBRATION_FILE)
+    text = page_of(tmp_path)
+    assert 'does not record the gate checks' in text
+    assert 'The gate checks are not recorded' in text
+
+
+def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
+    evil = '</script><script>alert(1)</script><img src=x onerror=alert(1)>'
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    calibration = dataclasses.replace(
+        calibration,
+        child_frame=evil,
+        weakest_direction=evil,
+        provenance={**calibration.provenance, evil: evil, 'options': 'no JSON', 'prior': '[1]'},
+        images_refused={evil: 1},
+    )
+    write_calibration(calibration, tmp_path / CALIBRATION_FILE)
+    shutil.copy(folder / product_folder.RESIDUALS_FILE, tmp_path)
+    text = page_of(tmp_path)
+    assert '<script>alert' not in text and '<img src=x' not in text
+
+
+def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
+    """A calibration with nothing finite in it, and residuals of which none was used."""
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    calibration = dataclasses.replace(
+        calibration,
+        covariance=np.full((13, 13), np.nan),
+        residual_rms_px=np.nan,
+        variance_factor=np.nan,
+        maps=None,
+        correlation=None,
+        time_ns=0,
+    )
+    write_calibration(calibration, tmp_path / CALIBRATION_FILE)
+    left = product_folder.read_residuals(folder / product_folder.RESIDUALS_FILE)
+    nothing = dataclasses.replace(
+        left,
+        used=np.zeros_like(left.used),
+        attitude_error_arcsec=np.full_like(left.attitude_error_arcsec, np.nan),
+    )
+    product_folder.write_residuals(nothing, tmp_path / product_folder.RESIDUALS_FILE)
+    assert '<html' in page_of(tmp_path)
+
+
+@pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])
+def test_damaged_files_are_named_in_one_line(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str
+) -> None:
+    broken = tmp_path / 'broken'
+    shutil.copytree(folder, broken)
+    (broken / damage).write_bytes(b'no such thing')
+    assert main.main(['report', str(broken)]) == EXIT_BAD_INPUT
+    complaint = capsys.readouterr().err
+    assert complaint.count('\n') == 1 and damage in complaint
+
+
+# Put first in the page: what goes wrong is kept from the start.
+_WATCH = """<script>
+window.wrong = [];
+addEventListener('error', (e) => wrong.push(e.message || 'a resource did not load'), true);
+document.addEventListener('securitypolicyviolation', (e) => wrong.push(e.blockedURI));
+</script>"""
+# Put last: moves the slider as a person would, and writes down what the page looks like.
+_MEASURE = """<script>
+addEventListener('load', () => {
+  const drawn = () => document.querySelectorAll('#one-image svg line').length;
+  const output = document.querySelector('#one-image output');
+  const [which] = document.querySelectorAll('#one-image input');
+  const before = [output.textContent, drawn()];
+  which.value = 2;
+  which.dispatchEvent(new Event('input'));
+  const figures = {};
+  for (const figure of document.querySelectorAll('figure[id]')) {
+    const svg = figure.querySelector('svg'), box = svg.getBoundingClientRect();
+    const words = [...figure.querySelectorAll('text')];
+    const texts = words.map((t) => t.getBoundingClientRect());
+    const letters = words.map((t) => parseFloat(getComputedStyle(t).fontSize));
+    figures[figure.id] = [
+      box.width, box.height, Math.max(...texts.map((t) => t.right)),
+      Math.min(...letters) * box.width / svg.viewBox.baseVal.width,
+    ];
+  }
+  const result = {
+    wrong, figures, before, after: [output.textContent, drawn()],
+    inner: innerWidth, scroll: document.documentElement.scrollWidth,
+    paper: getComputedStyle(document.body).backgroundColor,
+    unnamed: document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label])').length,
+    titles: document.querySelectorAll('#figure-images title').length,
+    loaded: [...document.images].every((image) => image.complete && image.naturalWidth > 0),
+  };
+  parent.postMessage(JSON.stringify(result), '*');
+});
+</script>"""
+
+
+def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, Any], str]:
+    """What a real browser makes of the page, and what it says on its console."""
+    watched = page.replace('<head>', f'<head>{_WATCH}', 1).replace('</body>', f'{_MEASURE}</body>')
+    (folder / 'watched.html').write_text(watched)
+    # No window of the browser is as narrow as a phone: a frame is.
+    frame = folder / 'frame.html'
+    frame.write_text(
+        '<script>addEventListener("message", (e) => document.body.dataset.measured = e.data)'
+        f'</script><iframe src="watched.html" style="width:{width}px;height:900px;border:0">'
+    )
+    done = subprocess.run(
+        [
+            BROWSER, '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic',
+            '--no-first-run', '--disable-background-networking', '--disable-component-update',
+            '--disable-sync', '--disable-dev-shm-usage', f'--user-data-dir={folder / "profile"}',
+            '--enable-logging=stderr', '--window-size=1700,1000',
+            f'--blink-settings=preferredColorScheme={0 if dark else 1}',
+            '--dump-dom', frame.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=60, check=True, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    found = re.search(r'data-measured="([^"]*)"', done.stdout)
+    assert found is not None, done.stderr[-2000:]
+    console = '\n'.join(line for line in done.stderr.splitlines() if 'CONSOLE' in line)
+    return json.loads(found[1].replace('&quot;', '"')), console
+
+
+@pytest.mark.slow
+@pytest.mark.packaging
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
+@pytest.mark.parametrize(('width', 'dark'), [(400, False), (1600, True)])
+def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -> None:
+    measured, console = shown(page, tmp_path, width, dark)
+    assert console == ''
+    assert measured['wrong'] == []
+    assert measured['inner'] == width
+    assert measured['scroll'] <= width
+    assert measured['paper'] == ('rgb(16, 21, 27)' if dark else 'rgb(255, 255, 255)')
+    assert set(measured['figures']) == {f'figure-{name}' for name in FIGURES}
+    for name, (wide, high, right, smallest) in measured['figures'].items():
+        assert wide > 300 and high > 200, name
+        assert right <= width, name
+        assert smallest >= 9, name  # px, from which print on a screen is readable
+    assert measured['loaded'] and measured['unnamed'] == 0
+    assert measured['titles'] == 10  # one for each image
+    assert 'Image 1 of 10' in measured['before'][0] and measured['before'][1] > 100
+    assert 'Image 2 of 10' in measured['after'][0] and measured['after'][1] > 100

@@ -1,0 +1,165 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Small pictures: how many are kept, what they show, and that they come back from a folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from starcal_ground.report.thumbnails import (
+    Album,
+    read_thumbnails,
+    star_of,
+    Thumbnail,
+    write_thumbnails,
+)
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.errors import ProductError
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+
+CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, 0, 0, 0, 0, 0]))
+GEOMETRY = CameraGeometry(CAMERA, np.array([0.0, 0, 0, 1]))
+RNG = np.random.default_rng(5)
+PIXELS = RNG.poisson(40, (512, 640)).astype(np.uint8)
+PIXELS[100, 200] = 255
+CUT_OUTS = (('blend', 0), ('blend', 1), ('blend', 2), ('saturated', 5), ('faint', 0))
+
+
+def observed(time_ns: int, refusal: str = '') -> StarObservations:
+    """An image without stars used and with one left out."""
+    return StarObservations.of_image(
+        time_ns,
+        (640, 512),
+        refusal=refusal,
+        refused_stars={'saturated': 1},
+        refused_catalog_id=np.array([7]),
+        refused_px=np.array([[200.0, 100.0]], np.float32),
+        refused_reason=np.array([0], np.uint8),
+    )
+
+
+def album_of(count: int, refused_every: int, expected: int = 0) -> Album:
+    album = Album(expected)
+    for k in range(count):
+        refusal = 'no_stars' if k % refused_every == 0 else ''
+        album.show(Image(k, PIXELS), observed(k, refusal), GEOMETRY)
+    return album
+
+
+def test_few_are_kept_of_many_and_evenly() -> None:
+    album = album_of(400, refused_every=50)
+    used = [one.observations.time_ns for one in album.used]
+    assert 6 <= len(used) < 12
+    steps = np.diff(used)
+    # The images between have been refused now and then: a step is longer by those at most.
+    assert steps.max() - steps.min() <= 2
+    assert used[-1] > 400 - 2 * steps.max()
+    assert [one.observations.time_ns for one in album.refused['no_stars']] == [0, 50]
+    assert len(album.stars['saturated']) == 6
+
+
+@pytest.mark.parametrize('expected', [10, 400, 500, 4000])
+def test_a_known_number_of_images_spreads_them_from_the_start(expected: int) -> None:
+    """More come than expected, as many, some fewer, and a tenth of them."""
+    used = [one.observations.time_ns for one in album_of(400, 1000, expected).used]
+    assert 2 <= len(used) < 12 if expected == 4000 else 6 <= len(used) < 12
+    assert np.ptp(np.diff(used)) <= 1  # the first image of all is refused
+
+
+def test_all_are_kept_of_few() -> None:
+    assert [one.observations.time_ns for one in album_of(5, refused_every=100).used] == [
+        1,
+        2,
+        3,
+        4,
+    ]
+
+
+def test_a_star_is_in_the_middle_of_its_picture() -> None:
+    thumbnail = album_of(1, refused_every=2).stars['saturated'][0]
+    picture = cv2.imdecode(np.frombuffer(thumbnail.encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert picture.argmax() == 12 * 25 + 12 and picture.shape == (25, 25)
+
+
+def test_a_star_outside_the_image_does_no_harm() -> None:
+    album = Album()
+    for place in ([-5.0, 3.0], [639.0, 511.0], [1e9, -1e9], [float('nan'), 4.0]):
+        record = observed(1)
+        record.refused_px[0] = place
+        album.show(Image(1, PIXELS), record, GEOMETRY)
+    assert len(album.stars['saturated']) == 4
+
+
+def test_a_thumbnail_finds_its_star() -> None:
+    record = dataclasses.replace(
+        observed(1),
+        refused_stars={'blend': 2, 'saturated': 1},
+        refused_catalog_id=np.array([7, 8, 9]),
+        refused_px=np.zeros((3, 2), np.float32),
+        refused_reason=np.array([0, 1, 0], np.uint8),
+    )
+    stars = [star_of(Thumbnail(1, reason, n, b''), record) for reason, n in CUT_OUTS]
+    assert stars == [7, 9, 7, 8, None]
+
+
+def test_a_large_image_is_reduced_before_it_is_drawn() -> None:
+    """A used star is marked at its place in the smaller picture."""
+    rng = np.random.default_rng(2)
+    large = rng.poisson(40, (2048, 2592)).astype(np.uint16)
+    camera = CameraModel(2592, 2048, np.array([7e3, 0, 7e3, 1295.5, 1023.5, 0, 0, 0, 0, 0]))
+    geometry = CameraGeometry(camera, np.array([0.0, 0, 0, 1]))
+    place = np.array([[1944.0, 512.0]])
+    record = dataclasses.replace(
+        StarObservations.of_image(1, (2592, 2048)),
+        catalog_id=np.array([1]),
+        direction_icrf=line_of_sight(camera, place),
+        magnitude=np.zeros(1, np.float32),
+        measured_px=place,
+        covariance_px2=np.ones((1, 3)),
+        flux_dn=np.ones(1, np.float32),
+        snr=np.ones(1, np.float32),
+    )
+    album = Album()
+    album.show(Image(1, large), record, geometry)
+    (thumbnail,) = album.thumbnails()
+    picture = cv2.imdecode(np.frombuffer(thumbnail.encoded, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None and picture.shape == (379, 480, 3)
+    coloured = np.argwhere(np.ptp(picture.astype(int), axis=2) > 60)
+    # A quarter of the way from the right and from the top; marks are 8 px wide.
+    np.testing.assert_allclose(coloured.mean(axis=0), [94.5, 359.9], atol=2.0)
+
+
+def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path: Path) -> None:
+    folder = tmp_path / 'thumbnails'
+    write_thumbnails(album_of(40, refused_every=10).thumbnails(), folder)
+    (folder / 'notes.txt').write_text('mine')
+    album = album_of(3, refused_every=2)
+    write_thumbnails(album.thumbnails(), folder)
+    assert set(read_thumbnails(folder)) == set(album.thumbnails())
+    assert (folder / 'notes.txt').read_text() == 'mine'
+    assert read_thumbnails(tmp_path / 'nowhere') == ()
+
+
+def test_only_pictures_of_the_folder_are_read(tmp_path: Path) -> None:
+    """No link, FIFO, huge file or other content: it would be in the report."""
+    secret, folder = tmp_path / 'secret', tmp_path / 'thumbnails'
+    secret.write_bytes(b'\xff\xd8\xff secret')
+    own = Thumbnail(1, '', 0, b'\xff\xd8\xff')
+    write_thumbnails([own], folder)
+    (folder / 'image_2.jpg').symlink_to(secret)
+    os.mkfifo(folder / 'image_3.jpg')
+    (folder / 'image_4.jpg').write_bytes(b'no picture')
+    (folder / 'image_5.jpg').write_bytes(b'\xff\xd8\xff' + bytes(2 << 20))
+    (folder / 'star_6_blend_0.png').mkdir()
+    assert read_thumbnails(folder) == (own,)
+    (tmp_path / 'link').symlink_to(folder)
+    assert read_thumbnails(tmp_path / 'link') == ()
+    with pytest.raises(ProductError, match='is a link'):
+        write_thumbnails([own], tmp_path / 'link')
+    assert secret.read_bytes() == b'\xff\xd8\xff secret'

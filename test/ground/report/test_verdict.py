@@ -1,0 +1,81 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The verdict of a report in words."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ground.report import verdict
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.records import GateCheck, SigmaPart
+
+GATE = (
+    GateCheck('residual', 'max_residual_rms_px', 0.2, 1.0, 'px', True),
+    GateCheck('step', 'max_step_px', math.nan, 10.0, 'px', None, 'no calibration was active'),
+    GateCheck('turn', 'max_step_rotation_deg', math.nan, 1.0, 'deg', None,
+              'no calibration was active'),
+    GateCheck('distance of cx', 'max_held_term_sigma', 0.00646, 5.0, 'sigma', True, 'put at 319'),
+    GateCheck('coverage', 'min_coverage', 0.1, 0.3, '', False),
+)  # fmt: skip
+
+
+def test_checks_that_were_not_made_did_not_pass() -> None:
+    sentence = 'Checks: 1 failed, 2 passed, 2 not checked (no calibration was active).'
+    assert verdict.checks_sentence(GATE) == sentence
+    assert verdict.checks_sentence(GATE[:1]) == 'Checks: 1 passed.'
+    assert verdict.checks_sentence(()) == ''
+
+
+def test_failed_checks_come_first_and_sigmas_have_one_name() -> None:
+    rows = verdict.check_rows(GATE)
+    names = ['coverage', 'residual', 'step', 'turn', 'distance of cx']
+    assert [check.name for check, *_ in rows] == names
+    assert rows[0][1:4] == ('failed', '0.1', 'at least 0.3')
+    assert rows[-1][1:] == ('passed', '0.0 sigma', 'at most 5 sigma', '')
+
+
+def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    assert calibration.maps is not None
+    sigma = np.full((10, 10), 0.2)
+    sigma[0, :2] = 9.0
+    budget = (
+        SigmaPart('total', 0.25, 8.0, ''),
+        SigmaPart('stars', 0.2, 0.2, ''),
+        SigmaPart('velocity', 0.001, 0.001, ''),
+        SigmaPart('fine structure', 0.15, 0.15, ''),
+        SigmaPart('star tracker noise', 0.0, 7.9, ''),
+    )
+    shown = dataclasses.replace(
+        calibration,
+        sigma_budget=budget,
+        maps=dataclasses.replace(calibration.maps, shape_sigma_arcsec=sigma),
+    )
+    assert verdict.precision_sentences(shown)[0] == (
+        'Camera alone: the 1-sigma of a line of sight is 0.25″ rms over the detector, at most '
+        '0.2″ over 98 % of it, 9″ at worst. Largest causes: stars (0.2″), fine structure (0.15″).'
+    )
+    assert 'camera (largest cause: stars), take more images' in verdict.next_step(shown)
+    refused = dataclasses.replace(shown, accepted=False)
+    assert verdict.next_step(refused).startswith('Do not use it for navigation')
+
+
+def test_a_refusal_states_the_measures_against_its_failed_checks(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+
+    def step(*failed: str) -> str:
+        gate = tuple(
+            dataclasses.replace(check, passed=check.passed and check.option not in failed)
+            for check in calibration.gate
+        )
+        return verdict.next_step(dataclasses.replace(calibration, accepted=False, gate=gate))
+
+    options = {check.option for check in calibration.gate}
+    assert options >= verdict._SIGMA_LIMITS
+    assert 'failed checks: take more images. Then' in step('min_images')
+    assert 'To reduce the sigma' in step('max_map_sigma_px')
+    assert step('max_change_px').endswith('failed checks and calibrate again.')

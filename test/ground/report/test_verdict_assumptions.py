@@ -1,0 +1,67 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Rows on the assumptions of a calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from starcal_ground.report.verdict import model_rows
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.records import HeldTerm
+
+
+def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
+    held = HeldTerm('cx', 320.0, 326.0, 2.0)
+    found = dataclasses.replace(checks, field_rms_px=0.25, field_worst_px=0.86, held=(held,))
+    lens, term, *others = model_rows(
+        dataclasses.replace(calibration, model_checks=found, zero_skew_cost_px=0.5)
+    )
+    assert lens.found == (
+        'field of 0.25 px rms per axis, at most 0.86 px; '
+        'camera_info, without field and skew, differs from the calibration by at most 0.5 px'
+    )
+    assert lens.p_value == '' and 'starcal lookup' in lens.remedy
+    assert term.found == 'the stars put it at 326: 3.0 sigma of the difference'
+    assert float(term.p_value) == pytest.approx(0.0027)
+    assert term.remedy.startswith('estimate cx')
+    assert [row.assumption for row in others] == [
+        'The detector has no step',
+        'The camera is the same in all images',
+    ]
+    assert all(row.remedy for row in others)
+
+
+def test_a_length_that_no_image_shows_has_no_digits(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
+    found = dataclasses.replace(
+        checks, field_rms_px=3e-5, field_worst_px=1e-4, image_variation_px=4e-6
+    )
+    lens, *_, camera = model_rows(dataclasses.replace(calibration, model_checks=found))
+    assert lens.found.startswith('field of less than 0.001 px everywhere; ')
+    assert camera.found == 'varies by less than 0.001 px in a corner'
+
+
+def test_values_that_the_stars_do_not_contradict_share_one_row(tiny_products: Path) -> None:
+    """A velocity of 478 km/s with a sigma of 627 km/s states nothing of the spacecraft."""
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
+    held = (HeldTerm('cx', 320.0, 326.0, 20.0), HeldTerm('velocity x', 0.0, 478e3, 627e3))
+    found = dataclasses.replace(checks, held=held)
+    _, term, *others = model_rows(dataclasses.replace(calibration, model_checks=found))
+    assert term.assumption == 'cx is 320, velocity x is 0'
+    assert term.found == 'the stars agree, within 0.8 sigma of the difference'
+    assert not any('478' in row.found for row in (term, *others))
+
+
+def test_a_calibration_without_checks_has_no_rows(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    assert model_rows(dataclasses.replace(calibration, model_checks=None)) == []

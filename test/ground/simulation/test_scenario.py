@@ -1,0 +1,92 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Simulated scenarios and scenes against analytic truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import erfa
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.simulation.scenario import (
+    attitude_samples,
+    camera_from_icrf,
+    Inertial,
+    scenario,
+    SCENARIOS,
+    scene,
+)
+from starcal_ros.constants import ARCSECOND_RAD
+
+
+def test_the_seed_draws_the_truth_but_not_the_prior() -> None:
+    for name in SCENARIOS:
+        a, b, again = scenario(name, 1), scenario(name, 2), scenario(name, 1)
+        assert np.array_equal(a.truth.camera.parameters, again.truth.camera.parameters)
+        assert not np.array_equal(a.truth.camera.parameters, b.truth.camera.parameters)
+        assert np.array_equal(a.prior.camera.parameters, b.prior.camera.parameters)
+        # The principal point cannot be told from the alignment: it is as the prior has it.
+        assert np.array_equal(a.truth.camera.parameters[3:5], a.prior.camera.parameters[3:5])
+    with pytest.raises(ValueError, match="'huge' is not one of tiny, small, paper"):
+        scenario('huge')
+
+
+def test_an_inertial_camera_looks_where_it_is_told() -> None:
+    tiny = scenario('tiny')
+    assert isinstance(tiny.pointing, Inertial)
+    for index, (ra, dec, roll) in enumerate(tiny.pointing.attitudes_deg):
+        R = camera_from_icrf(tiny, index)
+        assert np.allclose(R @ R.T, np.eye(3), atol=1e-14)
+        assert np.allclose(R[2], erfa.s2c(math.radians(ra), math.radians(dec)), atol=1e-14)
+        east = erfa.s2c(math.radians(ra + 90), 0.0)
+        # The roll turns +x from east: the angle between them is the roll itself.
+        assert R[0] @ east == pytest.approx(math.cos(math.radians(roll)), abs=1e-14)
+
+
+def test_an_earth_fixed_camera_looks_at_the_zenith() -> None:
+    paper = scenario('paper')
+    for index in (0, 358):
+        utc = 2440587.5, paper.time_ns(index) / 86400e9
+        ra, dec = erfa.atoc13(
+            'A', 0.0, 0.0, *utc, 0.0, math.radians(-95.37), math.radians(29.76),
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+        )  # fmt: skip
+        boresight = camera_from_icrf(paper, index)[2]
+        # ERFA takes off the aberration, 20.5" at most, which a camera's attitude does not have.
+        assert erfa.sepp(boresight, erfa.s2c(ra, dec)) < 30 * ARCSECOND_RAD
+    # Hercules: 16 h to 18 h, about 30 degrees north.
+    ra, dec = erfa.c2s(camera_from_icrf(paper, 180)[2])
+    assert 16 < math.degrees(ra % (2 * math.pi)) / 15 < 18
+    assert 25 < math.degrees(dec) < 35
+
+
+def test_star_tracker_errors_have_their_sigma_about_their_axes() -> None:
+    paper = dataclasses.replace(
+        scenario('paper'), star_tracker_sigma_arcsec=(5.0, 10.0, 40.0), image_count=300
+    )
+    camera_from_tracker = Rotation.from_quat(paper.truth.star_tracker_from_camera_xyzw).inv()
+    errors = []
+    for index in range(paper.image_count):
+        before, _, after, last = attitude_samples(paper, index)
+        tracker_from_icrf = camera_from_tracker.inv() * Rotation.from_matrix(
+            camera_from_icrf(paper, index, -0.75)
+        )
+        reported = Rotation.from_quat(before.icrf_from_star_tracker_xyzw)
+        errors.append((tracker_from_icrf * reported).as_rotvec() / ARCSECOND_RAD)
+        # One error per image: between two samples the tracker turns as the Earth does.
+        turned = reported.inv() * Rotation.from_quat(last.icrf_from_star_tracker_xyzw)
+        assert turned.magnitude() == pytest.approx(1.5 * 7.292115e-5, rel=1e-6)
+        assert after.time_ns - before.time_ns == 1_000_000_000
+    sigma = np.std(errors, axis=0)
+    assert np.allclose(sigma, [5.0, 10.0, 40.0], rtol=5 / math.sqrt(2 * 300))  # 5 standard errors
+
+
+def test_only_the_brightest_stars() -> None:
+    few = dataclasses.replace(scenario('tiny', seed=2), stars_per_image=9)
+    every, nine = scene(scenario('tiny', seed=2), 1), scene(few, 1)
+    size = np.array([few.truth.camera.width, few.truth.camera.height])
+    inside = ((every.pixel_px >= 0) & (every.pixel_px <= size - 1)).all(axis=1)
+    assert sorted(nine.magnitude) == sorted(every.magnitude[inside])[:9]

@@ -1,0 +1,228 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Two calibrations against each other: known differences, OpenCV's lines of sight, chance."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from opencv_points import undistorted  # type: ignore[import-not-found]
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ground import comparison
+from starcal_ground.cli import main
+from starcal_ground.comparison import compare
+from starcal_ground.report.detector_figures import write_comparison
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.records import Calibration, TemperatureTerms
+
+
+@pytest.fixture(scope='module')
+def tiny(tiny_products: Path) -> Calibration:
+    """The calibration of the tiny bag: a real covariance."""
+    return read_calibration(tiny_products / 'calibration.json')
+
+
+def moved(
+    calibration: Calibration, turned_rad: tuple[float, ...] = (0.0, 0.0, 0.0), **by: float
+) -> Calibration:
+    """A calibration with some parameters changed, and the camera frame turned."""
+    camera, quaternion = (
+        calibration.geometry.camera,
+        calibration.geometry.star_tracker_from_camera_xyzw,
+    )
+    parameters = camera.parameters.copy()
+    for name, change in by.items():
+        parameters[PARAMETER_NAMES.index(name)] += change
+    turned = Rotation.from_quat(quaternion) * Rotation.from_rotvec(turned_rad)
+    geometry = dataclasses.replace(
+        calibration.geometry,
+        camera=CameraModel(camera.width, camera.height, parameters),
+        star_tracker_from_camera_xyzw=turned.as_quat(),
+    )
+    return dataclasses.replace(calibration, geometry=geometry)
+
+
+def test_nothing_differs_from_itself(tiny: Calibration) -> None:
+    found = compare(tiny, tiny)
+    assert not found.difference.any()
+    assert found.total.value == 0 and found.total.p_value == 1
+    # Rounding of unit vectors, 1e-16, times a focal length of 1800 px.
+    assert found.before.length_px.max() < 1e-11
+    assert found.after.length_px.max() < 1e-11
+
+
+def opencv_sight(calibration: Calibration) -> np.ndarray:
+    """Lines of sight of the grid in the star tracker frame by OpenCV, which knows no skew."""
+    camera = calibration.geometry.camera
+    xy = undistorted(camera.parameters, pixel_grid(camera, GRID, GRID))
+    directions = np.c_[xy, np.ones(len(xy))]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(
+        Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).apply(directions)
+    )
+
+
+def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
+    a = moved(tiny, skew=-tiny.geometry.camera.parameters[1])
+    b = moved(a, (2e-5, -1e-5, 4e-5), fx=1.0, cy=-0.5, k1=0.01, p2=1e-4)
+    expected_px = np.linalg.norm(opencv_sight(b) - opencv_sight(a), axis=1) * float(
+        a.geometry.camera.parameters[0]
+    )
+    found = compare(a, b)
+    # The field that both have moves the places at which they differ, by less than 1e-4 px here.
+    np.testing.assert_allclose(found.before.length_px.ravel(), expected_px, atol=1e-6)
+    names = [*PARAMETER_NAMES]
+    assert found.difference[names.index('fx')] == pytest.approx(1.0)
+    np.testing.assert_allclose(found.difference[10:], [2e-5, -1e-5, 4e-5], atol=1e-15)
+
+
+def test_a_turn_is_taken_off(tiny: Calibration) -> None:
+    found = compare(tiny, moved(tiny, (100 * ARCSECOND_RAD, 0.0, 0.0)))
+    assert found.rotation_rad == pytest.approx(100 * ARCSECOND_RAD)
+    middle = GRID // 2
+    # A pixel at the axis moves by 100 arcsec of 1/fx: a lens of 1801 px.
+    expected_px = 100 * ARCSECOND_RAD * tiny.geometry.camera.parameters[0]
+    assert found.before.length_px[middle, middle] == pytest.approx(expected_px, rel=1e-3)
+    assert found.after.length_px.max() < 1e-9
+
+
+def test_sigmas_of_the_maps_are_those_of_the_table(tiny: Calibration) -> None:
+    """Angles over angles, also where B has another focal length."""
+    lens = dataclasses.replace(tiny.geometry.camera, field=None)
+    geometry = dataclasses.replace(tiny.geometry, camera=lens)
+    bare = dataclasses.replace(tiny, field=None, geometry=geometry)
+    certain = dataclasses.replace(bare, covariance=np.zeros((13, 13)))
+    longer = moved(bare, (2e-5, 0.0, 0.0), fx=90.0, fy=90.0)
+    found = compare(certain, longer)
+    camera = longer.geometry.camera
+    table = line_of_sight_table(camera, longer.map_covariance, pixel_grid(camera, GRID, GRID))
+    focal_px = certain.geometry.camera.parameters[0]
+    for part, sigma_arcsec in (
+        (found.before, table.sigma_arcsec),
+        (found.after, table.shape_sigma_arcsec),
+    ):
+        length_rad = part.length_px.ravel() / focal_px
+        expected = length_rad / (sigma_arcsec * ARCSECOND_RAD)
+        np.testing.assert_allclose(part.sigmas.ravel(), expected, rtol=1e-9)
+    made = comparison.content(found)
+    expected_arcsec = found.difference[-3:] / ARCSECOND_RAD
+    assert made['alignment_arcsec'] == pytest.approx(expected_arcsec, rel=1e-12)
+
+
+def test_a_reference_temperature_of_one_alone_is_noted(tiny: Calibration) -> None:
+    terms = TemperatureTerms(20.0, (), (), (), ())
+    at_20, at_25 = (
+        dataclasses.replace(tiny, temperature=dataclasses.replace(terms, reference_degc=degc))
+        for degc in (20.0, 25.0)
+    )
+    for a, b, noted in ((tiny, at_20, True), (at_20, at_20, False), (at_20, at_25, True)):
+        notes = compare(a, b).notes
+        assert any('different temperatures' in note for note in notes) is noted
+
+
+@pytest.mark.slow
+def test_sigmas_are_those_of_chance(tiny: Calibration) -> None:
+    """B drawn from the covariance of A: chi2 has its degrees as mean, each map a square of 1."""
+    rng = np.random.default_rng(3)
+    count = 100
+    draws = rng.multivariate_normal(np.zeros(13), tiny.covariance, count)
+    certain = dataclasses.replace(tiny, covariance=np.zeros((13, 13)))
+    found = [
+        compare(
+            tiny,
+            moved(certain, tuple(draw[10:]), **dict(zip(PARAMETER_NAMES, draw[:10], strict=True))),
+        )
+        for draw in draws
+    ]
+    degrees = 13  # ten camera parameters and three angles
+    assert all(one.total.degrees_of_freedom == degrees for one in found)
+    # The mean of 100 draws of chi2: sigma sqrt(2 * 13 / 100) = 0.51; less than four of them.
+    assert np.mean([one.total.value for one in found]) == pytest.approx(degrees, abs=1.9)
+    assert np.mean([one.total.p_value < 0.5 for one in found]) == pytest.approx(0.5, abs=0.2)
+    for squares in (
+        [one.before.sigmas**2 for one in found],
+        [one.after.sigmas**2 for one in found],
+    ):
+        # E|d|^2 = trace C at every pixel.  A few directions rule the map, so that the mean over it
+        # scatters by up to sqrt(2) for one draw: 0.14 for a hundred, four of them.
+        assert np.mean(squares) == pytest.approx(1.0, abs=0.57)
+
+
+def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
+    covariance = tiny.covariance.copy()
+    cx = PARAMETER_NAMES.index('cx')
+    covariance[cx] = covariance[:, cx] = 0.0
+    held = dataclasses.replace(tiny, covariance=covariance)
+    found = compare(held, moved(held, cx=1.0))
+    assert np.isnan(found.sigmas[cx])
+    assert any('held in both' in note and 'cx' in note for note in found.notes)
+    bare = dataclasses.replace(tiny.geometry.camera, field=None)
+    geometry = dataclasses.replace(tiny.geometry, camera=bare)
+    exact = dataclasses.replace(tiny, covariance=np.zeros((13, 13)), field=None, geometry=geometry)
+    nothing = compare(exact, exact)
+    assert nothing.total.degrees_of_freedom == 0
+    assert np.isnan(nothing.before.sigmas).all()
+    made = json.dumps(comparison.content(nothing), allow_nan=False)
+    assert json.loads(made)['chi2'] is None
+
+
+def test_notes_say_what_weakens_the_sigmas(tiny: Calibration) -> None:
+    assert any('the same stars' in note for note in compare(tiny, tiny).notes)
+    refused = dataclasses.replace(
+        tiny, accepted=False, reasons=('too bad',), parent_frame='other', provenance={}
+    )
+    notes = compare(tiny, refused).notes
+    assert any('refused B: too bad' in note for note in notes)
+    assert any('other' in note for note in notes)
+    assert not any('the same stars' in note for note in notes)
+
+
+def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
+    camera = tiny.geometry.camera
+    bigger = dataclasses.replace(
+        tiny.geometry, camera=CameraModel(camera.width + 1, camera.height, camera.parameters)
+    )
+    with pytest.raises(ProductError, match='640 x 512.*641 x 512'):
+        compare(tiny, dataclasses.replace(tiny, geometry=bigger))
+
+
+def test_the_figure_is_drawn(tiny: Calibration, tmp_path: Path) -> None:
+    write_comparison(compare(tiny, tiny), tmp_path / 'same.svg')  # and no warning
+    found = compare(tiny, moved(tiny, fx=1.0))
+    write_comparison(found, tmp_path / 'a.svg')
+    drawn = (tmp_path / 'a.svg').read_text()
+    ElementTree.fromstring(drawn)
+    assert f'at most {found.before.length_px.max():.3g} px' in drawn and '>no ' not in drawn
+    with pytest.raises(OptionError, match=r'a\.png: the name must end in \.svg'):
+        write_comparison(found, tmp_path / 'a.png')
+    with pytest.raises(ProductError, match='cannot be written'):
+        write_comparison(found, tmp_path / 'none' / 'a.svg')
+
+
+def test_the_tool_compares(
+    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, calibration in (('a', tiny), ('b', moved(tiny, fx=0.5))):
+        (tmp_path / name).mkdir()
+        write_calibration(calibration, tmp_path / name / 'calibration.json')
+    folders = [str(tmp_path / 'a'), str(tmp_path / 'b' / 'calibration.json')]
+    assert main.main(['compare', *folders, '-o', str(tmp_path / 'c.svg')]) == 0
+    out = capsys.readouterr().out
+    (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
+    sigma = np.sqrt(2) * tiny.sigma[0]
+    assert row[3:] == ['+0.500', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
+    assert (tmp_path / 'c.svg').is_file() and str(tmp_path / 'c.svg') in out
+    assert main.main(['compare', *folders, '--json']) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made['difference'][0] == pytest.approx(0.5)
+    # The outermost column lies 319.5 px from cx: half a pixel of focal length moves it by this.
+    assert made['lines_of_sight']['worst_px'] == pytest.approx(0.5 * 319.5 / 1801, rel=0.1)

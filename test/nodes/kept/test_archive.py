@@ -1,0 +1,325 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The state folder: what was kept comes back, through kills, damage and a full disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+from pathlib import Path
+import resource
+import shutil
+import time
+
+from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from sample_records import assert_same, calibration_of_0_1, observations  # type: ignore[import-not-found]
+
+from starcal_ros.errors import ArchiveError
+from starcal_ros.formats.bag import reader as bag_reader
+from starcal_ros.records import Ensemble
+from starcal_ros.ros.kept.archive import Archive, TOPIC
+from starcal_ros.ros.kept.seal import Seal
+from starcal_ros.ros.kept.state import Activation
+
+WRITTEN_BY_0_1 = Path(__file__).resolve().parents[2] / 'data' / 'written_by_0_1'
+
+
+def numbers(history: tuple[Activation, ...]) -> list[tuple[int, int]]:
+    """Event and calibration of each record."""
+    return [(record.event, record.calibration.number) for record in history]
+
+
+def test_what_is_kept_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    """In order of arrival, which is not that of the stamps."""
+    kept = Ensemble((images()[2], images()[0], images()[1]), {'no_stars': 3})
+    history = (activation(1), activation(2, before=1))
+    with opened(tmp_path / 'new' / 'state') as archive:
+        assert archive.read_ensemble() == Ensemble() and archive.read_history() == ()
+        archive.keep(Ensemble(kept.images[:2]), history[:1])
+        archive.keep(kept, history)
+        assert archive.saved(kept) == 3
+    with opened(tmp_path / 'new' / 'state') as archive:
+        ensemble, again = archive.read_ensemble(), archive.read_history()
+        assert archive.damage == [] and archive.last_event == 2
+    assert dict(ensemble.refused) == {'no_stars': 3}
+    for a, b in zip(kept.images, ensemble.images, strict=True):
+        assert_same(a, b)
+    for one, other in zip(history, again, strict=True):
+        assert (one.event, one.before) == (other.event, other.before)
+        assert_same(one.calibration, other.calibration)
+
+
+def test_another_image_of_a_stamp_on_disk_takes_its_place(tmp_path: Path) -> None:
+    """A reset that the disk did not take must not bring the first one back."""
+    first, second = images()[0], dataclasses.replace(images()[1], time_ns=images()[0].time_ns)
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble((first, images()[2])), ())
+        grown = Ensemble((images()[2], second))
+        assert archive.saved(grown) == 1
+        archive.keep(grown, ())
+        assert archive.saved(grown) == 2
+    with opened(tmp_path) as archive:
+        for a, b in zip(grown.images, archive.read_ensemble().images, strict=True):
+            assert_same(a, b)
+
+
+def test_the_ensemble_is_a_bag(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:12]), ())
+    found = list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))
+    assert [one.time_ns for one in found] == [one.time_ns for one in images()[:12]]
+    with AnyReader([tmp_path / 'ensemble']) as other:  # by its metadata, as rosbag2 does
+        assert {topic: info.msgcount for topic, info in other.topics.items()} == {
+            TOPIC: len(found)
+        }
+        assert (other.start_time, other.end_time - 1) == (found[0].time_ns, found[-1].time_ns)
+
+
+def test_no_metadata_lacks_an_image(tmp_path: Path) -> None:
+    """While the folder is in use, and so after a kill, there is none: all images are read."""
+    metadata = tmp_path / 'ensemble' / 'metadata.yaml'
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:2]), ())
+        assert not metadata.exists()
+    assert metadata.exists()
+    with opened(tmp_path) as archive:
+        assert not metadata.exists()
+        archive.keep(Ensemble((*archive.read_ensemble().images, images()[2])), ())
+        assert len(list(bag_reader.read_observations([metadata.parent], TOPIC))) == 3
+
+
+def test_what_goes_from_the_ensemble_goes_from_the_disk(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:4], {'no_stars': 1}), ())
+        archive.keep(Ensemble((*images()[:2], *images()[3:5])), ())
+    with opened(tmp_path) as archive:
+        stamps = [image.time_ns for image in archive.read_ensemble().images]
+        assert stamps == [images()[k].time_ns for k in (0, 1, 3, 4)]
+        archive.keep(Ensemble(), ())
+    with opened(tmp_path) as archive:
+        assert archive.read_ensemble() == Ensemble()
+        archive.keep(Ensemble(images()[:1]), ())
+        assert archive.saved(Ensemble(images()[:2])) == 1
+
+
+def test_an_image_that_comes_again_after_a_reset_is_kept(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        for _ in range(2):
+            archive.keep(Ensemble(images()[:2]), ())
+            archive.keep(Ensemble(), ())
+        archive.keep(Ensemble(images()[:2]), ())
+    with opened(tmp_path) as archive:
+        assert len(archive.read_ensemble().images) == 2
+
+
+def test_history_is_bounded_by_what_is_handed_over(tmp_path: Path) -> None:
+    history = tuple(activation(event) for event in range(1, 6))
+    with opened(tmp_path) as archive:
+        for k in range(1, 6):
+            archive.keep(Ensemble(), history[max(0, k - 3) : k])
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(3, 3), (4, 4), (5, 5)]
+
+
+@pytest.mark.slow
+def test_killed_at_any_instant(tmp_path: Path) -> None:
+    """What was told of as kept is there after each of ten kills, and nothing is damaged."""
+    processes = multiprocessing.get_context('forkserver')
+    processes.set_forkserver_preload(
+        ['starcal_ros.ros.kept.archive', 'starcal_ground.simulation.scenario']
+    )
+    random = np.random.default_rng(5)
+    for _ in range(10):
+        reader, writer = processes.Pipe(duplex=False)
+        child = processes.Process(target=collect, args=(tmp_path, images()[:3], writer))
+        child.start()
+        writer.close()
+        said = [reader.recv()]
+        time.sleep(random.uniform(0.0, 0.04))  # the instant is what is drawn at random
+        child.kill()
+        child.join()
+        with contextlib.suppress(EOFError):
+            while True:
+                said.append(reader.recv())
+        reader.close()
+        last_image, last_event = said[-1]
+        with opened(tmp_path) as archive:
+            ensemble, history = archive.read_ensemble(), archive.read_history()
+            assert archive.damage == []
+        stamps = [image.time_ns for image in ensemble.images]
+        assert stamps == list(range(len(stamps))) and len(stamps) in (
+            last_image + 1,
+            last_image + 2,  # kept, but killed before it was told
+        )
+        assert history[-1].event in (last_event, last_event + 1)
+        assert not list(tmp_path.glob('*/.*'))
+
+
+@pytest.mark.parametrize('kind', ['flip', 'cut'])
+@pytest.mark.parametrize('pattern', ['ensemble/*.mcap', 'calibrations/*2.json'])
+def test_a_damaged_file_is_never_believed(tmp_path: Path, pattern: str, kind: str) -> None:
+    """It is read as it was written (a flip where nothing is said), or set aside and named."""
+    sound = tmp_path / 'sound'
+    with opened(sound) as archive:
+        archive.keep(Ensemble(images()[:1]), (activation(1), activation(2, before=1)))
+    random = np.random.default_rng(3)
+    set_aside = 0
+    for k in range(24):
+        folder = tmp_path / f'{k}'
+        shutil.copytree(sound, folder)
+        (victim,) = folder.glob(pattern)
+        data = bytearray(victim.read_bytes())
+        place = int(random.integers(len(data)))
+        if kind == 'flip':
+            data[place] ^= 1 << int(random.integers(8))
+        else:
+            del data[place:]
+        victim.write_bytes(data)
+        with opened(folder) as archive:
+            ensemble, history = archive.read_ensemble(), archive.read_history()
+            damage = archive.damage
+        aside = list(folder.glob('*/*.damaged'))
+        assert len(damage) == len(aside) <= 1
+        set_aside += len(aside)
+        if aside:
+            assert aside[0].name == f'{victim.name}.damaged' and str(aside[0]) in damage[0]
+        if aside and pattern.startswith('ensemble'):
+            assert ensemble.images == ()
+        else:
+            assert_same(ensemble.images[0], images()[0])
+        expected = [(1, 1)] if aside and pattern.startswith('calib') else [(1, 1), (2, 2)]
+        assert numbers(history) == expected
+        assert history[-1].calibration.residual_rms_px == expected[-1][1] / 7
+    # Flips in the white space of JSON, or in the index of a bag, change nothing that is read.
+    assert set_aside >= (12 if kind == 'flip' else 22)
+
+
+def test_a_folder_of_version_0_1_is_read(tmp_path: Path) -> None:
+    """Written by that version; its unknown attitude gap was -1."""
+    shutil.copytree(WRITTEN_BY_0_1 / 'state', tmp_path / 'state')
+    with opened(tmp_path / 'state') as archive:
+        ensemble, history = archive.read_ensemble(), archive.read_history()
+        assert archive.damage == []
+    first, second = ensemble.images
+    without = {
+        'star_tracker_rate_rad_s': np.full(3, np.nan),
+        'velocity_sigma_m_s': np.nan,
+        'zenith_icrf': np.full(3, np.nan),
+        'refraction_arcsec': np.zeros(2),
+    }
+    assert_same(first, dataclasses.replace(observations(), **without))
+    assert np.isnan(second.attitude_gap_s) and len(second) == 0
+    assert ensemble.refused == {'no_match': 2}
+    (record,) = history
+    found = record.calibration
+    assert (record.event, found.number, found.active_since_ns) == (7, 3, 123)
+    expected = dataclasses.replace(
+        calibration_of_0_1(), number=3, active_since_ns=123, gate=found.gate
+    )
+    assert_same(found, expected)
+    assert [check.passed for check in found.gate] == [False, True, None]
+
+
+def test_a_calibration_of_before_the_gate_told_is_read(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(), (activation(1),))
+    (path,) = tmp_path.glob('calibrations/*.json')
+    content = json.loads(path.read_text())
+    del content['sha256'], content['gate']
+    path.write_text(Seal().sealed(content))
+    with opened(tmp_path) as archive:
+        (record,) = archive.read_history()
+        assert archive.damage == []
+    assert record.calibration.gate == ()
+
+
+def test_a_damaged_rollback_still_goes_back(tmp_path: Path) -> None:
+    """Its name says to which calibration, and that one has a file of its own."""
+    with opened(tmp_path) as archive:
+        history: tuple[Activation, ...] = (
+            activation(1),
+            activation(2, before=1),
+            activation(3, number=1),
+        )
+        archive.keep(Ensemble(), history)
+    next(tmp_path.glob('calibrations/00000003_*')).write_bytes(b'{"half')
+    with opened(tmp_path) as archive:
+        history = archive.read_history()
+        assert numbers(history) == [(1, 1), (2, 2), (3, 1)]
+        archive.keep(Ensemble(), history)
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(1, 1), (2, 2), (3, 1)]
+        assert archive.damage == []
+
+
+def test_an_event_is_never_given_twice(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(), (activation(1), activation(2, before=1)))
+    next(tmp_path.glob('calibrations/00000002_*')).write_bytes(b'')
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(1, 1)]
+        assert archive.last_event == 2
+
+
+@pytest.mark.parametrize('key', ['schema', 'archive'])
+def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(), (activation(1), activation(2, before=1)))
+    path = next(tmp_path.glob('calibrations/00000002_*'))
+    content = json.loads(path.read_text())
+    del content['sha256']
+    content[key] = 99 if key == 'schema' else {'schema': 99}
+    path.write_text(Seal().sealed(content))
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(1, 1)]
+        assert archive.damage == [f'{path}: of another version, skipped']
+    assert path.exists()
+
+
+def test_one_owner(tmp_path: Path) -> None:
+    with (
+        opened(tmp_path),
+        pytest.raises(ArchiveError, match=f'{tmp_path} is in use by another calibrator'),
+    ):
+        Archive(tmp_path, 'camera')
+    Archive(tmp_path, 'camera').close()
+
+
+def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    for path in (tmp_path / 'file', tmp_path / 'file' / 'below'):
+        with pytest.raises(ArchiveError, match=f'state_dir: {path}'):
+            Archive(path, 'camera')
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """No file of this process can grow past a hundred bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_told_and_tried_again(tmp_path: Path) -> None:
+    whole = Ensemble(images()[:3], {'no_stars': 1})
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:2]), (activation(1),))
+        with full_disk():
+            for history in ((activation(1),), (activation(1), activation(2))):
+                with pytest.raises(ArchiveError, match=r'^state_dir: .*cannot be written'):
+                    archive.keep(whole, history)
+            assert archive.saved(whole) == 2
+        assert not list(tmp_path.glob('*/.*'))
+        archive.keep(whole, (activation(1), activation(2)))
+        assert archive.saved(whole) == 3
+    with opened(tmp_path) as archive:
+        assert len(archive.read_ensemble().images) == 3
+        assert numbers(archive.read_history()) == [(1, 1), (2, 2)]

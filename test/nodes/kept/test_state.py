@@ -1,0 +1,432 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""What a calibrator keeps: in memory, on disk, across restarts, and what it answers."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+from pathlib import Path
+import resource
+from typing import Any
+
+import numpy as np
+import pytest
+
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import scenario
+from starcal_ros.errors import ArchiveError, OptionError
+from starcal_ros.formats.products.camera_yaml import write_camera_info
+from starcal_ros.pipeline import solve as solving
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.seal import CHECKSUMS
+from starcal_ros.ros.kept.state import Answer, CalibratorState
+
+SCENARIO = scenario('tiny', seed=7)
+
+
+@pytest.fixture(scope='module')
+def shown() -> tuple[StarObservations, ...]:
+    return true_observations(SCENARIO).images
+
+
+def load(folder: Path, scenario_name: str = 'tiny', **values: object) -> Setup:
+    prior = scenario(scenario_name, seed=7).prior
+    write_camera_info(prior.camera, folder / f'{scenario_name}.yaml')
+    return load_setup(
+        {
+            'camera_info_url': str(folder / f'{scenario_name}.yaml'),
+            'prior_alignment': prior.star_tracker_from_camera_xyzw.tolist(),
+            **values,
+        }
+    )
+
+
+@pytest.fixture(scope='module')
+def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
+    return load(tmp_path_factory.mktemp('setup'))
+
+
+def started(setup: Setup, folder: Path | str = '') -> CalibratorState:
+    state = CalibratorState(itertools.count(1).__next__)
+    state.open(setup, CalibratorOptions(state_dir=str(folder)))
+    return state
+
+
+def filled(
+    setup: Setup, shown: tuple[StarObservations, ...], folder: Path | str = ''
+) -> CalibratorState:
+    state = started(setup, folder)
+    for image in shown:
+        state.add(image)
+    return state
+
+
+@pytest.mark.slow
+def test_a_restart_goes_on_where_it_stood(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """The same solution to the last bit, and the same active calibration."""
+    first = filled(setup, shown, tmp_path)
+    first.add(refused_image(5, 8, 8, 'no_stars', ''))
+    answer = first.solve()
+    assert answer.success and answer.active and answer.calibration is not None
+    assert (answer.calibration.number, answer.calibration.active_since_ns) == (1, 1)
+    status = first.status()
+    assert status.images == status.images_saved == len(shown)
+    first.close()
+    second = started(setup, tmp_path)
+    assert dict(second.status().refused) == {'no_stars': 1}
+    active, again = second.active, second.solve().calibration
+    assert active is not None and again is not None
+    for found in (active, again):
+        assert found.covariance.tobytes() == answer.calibration.covariance.tobytes()
+        assert found.provenance == answer.calibration.provenance
+    assert (active.number, again.number) == (1, 2)
+    second.close()
+
+
+@pytest.mark.slow
+def test_rollback_outlasts_a_restart(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown, tmp_path)
+    for estimate in (('fx', 'fy'), ('fx', 'fy', 'k1'), ('fx',)):
+        assert state.solve(estimate=estimate, force=True).success
+    assert state.rollback().success
+    state.close()
+    state = started(setup, tmp_path)
+    active = state.active
+    assert active is not None and active.estimated == ('fx', 'fy', 'k1')
+    assert (active.number, active.active_since_ns) == (2, 4)
+    back = state.rollback()
+    assert back.calibration is not None and back.calibration.number == 1
+    assert state.rollback() == Answer(False, 'there is no calibration before the active one')
+    # A new one goes back to what was in force when it came.
+    assert state.solve(estimate=('fx', 'fy'), force=True).success
+    back = state.rollback()
+    assert back.calibration is not None and back.calibration.number == 1
+    state.close()
+
+
+@pytest.mark.slow
+def test_history_is_bounded(
+    setup: Setup,
+    shown: tuple[StarObservations, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('starcal_ros.ros.kept.state._HISTORY', 2)
+    state = started(setup, tmp_path)
+    for image in shown:
+        state.add(image)
+    for _ in range(4):
+        assert state.solve().success
+    assert len(list((tmp_path / 'calibrations').iterdir())) == 2
+    assert state.rollback().success
+    gone = state.rollback()
+    assert gone.message == 'there is no calibration before the active one on record'
+    state.close()
+
+
+@pytest.mark.slow
+def test_the_time_of_an_activation_is_read_when_it_is_made(
+    setup: Setup, shown: tuple[StarObservations, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A roll-back during a solve is the earlier activation, and its time the earlier one."""
+    state = filled(setup, shown)
+    assert state.solve().success and state.solve().success
+    solve, times = solving.solve, []
+
+    def long_solve(*arguments: Any, **options: Any) -> Any:
+        solved = solve(*arguments, **options)
+        back = state.rollback()
+        assert back.calibration is not None
+        times.append(back.calibration.active_since_ns)
+        return solved
+
+    monkeypatch.setattr(solving, 'solve', long_solve)
+    answer = state.solve()
+    assert answer.calibration is not None and answer.calibration is state.active
+    assert times[0] < answer.calibration.active_since_ns
+
+
+@pytest.mark.slow
+def test_what_is_forced_says_so(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
+    refused = state.solve()
+    assert not refused.success and refused.calibration is not None
+    assert (refused.calibration.number, refused.calibration.forced) == (0, False)
+    assert state.active is None
+    assert state.solve(dry_run=True, force=True).success and state.active is None
+    assert state.solve(force=True).success
+    state.close()
+    state = started(setup, tmp_path)
+    active = state.active
+    assert active is not None and active.forced and not active.accepted
+    assert active.reasons[-1] == 'activated by request despite the gate'
+    state.close()
+
+
+def test_what_would_count_twice_or_wrong_is_refused(
+    setup: Setup, shown: tuple[StarObservations, ...]
+) -> None:
+    state = filled(setup, (*shown, shown[0]))
+    state.add(dataclasses.replace(shown[0], time_ns=1, width=8))
+    status = state.status()
+    assert status.images == len(shown) and status.images_saved == 0
+    assert dict(status.refused) == {'duplicate': 1, 'wrong_size': 1}
+
+
+def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    other = dataclasses.replace(shown[1], time_ns=shown[0].time_ns)
+    before = filled(setup, (*shown[:2], other), tmp_path)
+    before.close()
+    after = started(setup, tmp_path)
+    after.add(other)
+    for state in (before, after):
+        stars = [image.catalog_id.tolist() for image in state.ensemble.images]
+        assert stars == [image.catalog_id.tolist() for image in shown[:2]]
+    assert dict(before.ensemble.refused) == {'duplicate': 1}
+    assert dict(after.ensemble.refused) == {'duplicate': 2}
+    after.close()
+
+
+def test_the_limit_holds_on_disk_too(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """A folder that a kill has left with an image too many is cut down when it is read."""
+    filled(setup, shown, tmp_path).close()
+    few = dataclasses.replace(
+        setup, calibration=dataclasses.replace(setup.calibration, max_images=4)
+    )
+    state = started(few, tmp_path)
+    status = state.status()
+    assert status.images == status.images_saved == 4
+    assert len(list((tmp_path / 'ensemble').glob('*.mcap'))) == 4
+    state.close()
+
+
+def test_reset_and_the_image_after_it(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown, tmp_path)
+    assert state.reset().message.startswith(f'{len(shown)} images dropped')
+    state.add(shown[3])
+    state.close()
+    state = started(setup, tmp_path)
+    assert [image.time_ns for image in state.ensemble.images] == [shown[3].time_ns]
+    state.close()
+
+
+def test_a_full_disk_costs_nothing_that_memory_holds(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown[:-1], tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        state.add(shown[-1])
+        answer = state.solve()
+        status = state.status()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert answer.success and 'not on disk: state_dir:' in answer.message
+    assert (status.images, status.images_saved) == (len(shown), len(shown) - 1)
+    assert 'cannot be written: File too large' in state.trouble
+    # The folder is let go of and taken up again before the disk has room: nothing is lost.
+    state.close()
+    state.open(setup, CalibratorOptions(state_dir=str(tmp_path)))
+    assert state.trouble == '' and state.status().images_saved == len(shown)
+    state.close()
+    state = started(setup, tmp_path)
+    assert len(state.ensemble.images) == len(shown) and state.active is not None
+    state.close()
+
+
+def test_a_folder_of_another_camera_is_refused(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    filled(setup, shown[:1], tmp_path / 'state').close()
+    other = load(tmp_path, 'small')
+    with pytest.raises(OptionError, match=f'state_dir: {tmp_path / "state"} is of a camera of'):
+        started(other, tmp_path / 'state')
+    started(setup, tmp_path / 'state').close()  # it was let go of
+
+
+def test_two_on_one_folder(setup: Setup, tmp_path: Path) -> None:
+    first = started(setup, tmp_path)
+    with pytest.raises(ArchiveError, match='in use by another calibrator'):
+        started(setup, tmp_path)
+    first.close()
+    first.close()
+    started(setup, tmp_path).close()
+
+
+def test_damage_is_named(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    filled(setup, shown, tmp_path).close()
+    victim = tmp_path / 'ensemble' / '00000002.mcap'
+    victim.write_bytes(victim.read_bytes()[:-100])
+    state = started(setup, tmp_path)
+    assert len(state.damage) == 1 and '00000002.mcap.damaged' in state.damage[0]
+    assert len(state.ensemble.images) == len(shown) - 1
+    state.close()
+
+
+def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
+    state = started(setup)
+    assert state.rollback() == Answer(False, 'no calibration is active')
+    assert 'too few observations' in state.solve().message
+    assert state.ensemble == Ensemble() and state.disk_free_bytes() is None
+    for image in shown:
+        state.add(image)
+    assert state.solve().success
+    state.close()
+    state.open(setup, CalibratorOptions())
+    active = state.active
+    assert active is not None and np.isfinite(active.covariance).all()
+
+
+@pytest.mark.slow
+def test_the_gate_of_today_judges_what_was_stored(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """With another prior or limit it is not active, stays on disk, and comes back with them."""
+    state = filled(setup, shown, tmp_path)
+    first, second = state.solve().calibration, state.solve().calibration
+    assert first is not None and second is not None
+    state.close()
+    kept = sorted((tmp_path / 'calibrations').iterdir())
+    camera = setup.prior.camera.replace(fx=2400.0, fy=2400.0)
+    turned = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    for changed, option in (
+        (dataclasses.replace(setup, prior=CameraGeometry(camera, turned)), 'max_change_px'),
+        (dataclasses.replace(setup, prior=CameraGeometry(setup.prior.camera, turned)),
+         'max_rotation_deg'),
+        (dataclasses.replace(setup, gate=tighter), 'max_residual_rms_px'),
+    ):  # fmt: skip
+        state = started(changed, tmp_path)
+        assert state.active is None
+        assert len(state.withheld) == 2 and all(option in text for text in state.withheld)
+        assert state.rollback() == Answer(False, 'no calibration is active')
+        assert state.damage == ()
+        state.close()
+        assert sorted((tmp_path / 'calibrations').iterdir()) == kept
+    state = started(setup, tmp_path)
+    assert state.withheld == () and state.active is not None and state.active.number == 2
+    state.close()
+
+
+def test_the_gate_judges_what_is_in_memory_alone(
+    setup: Setup, shown: tuple[StarObservations, ...]
+) -> None:
+    """Cleaned up, configured with a tighter limit, and back."""
+    state = filled(setup, shown)
+    assert state.solve().success
+    state.close()
+    tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    state.open(dataclasses.replace(setup, gate=tighter), CalibratorOptions())
+    assert state.active is None and len(state.withheld) == 1
+    state.open(setup, CalibratorOptions())
+    assert state.active is not None and state.withheld == ()
+
+
+@pytest.mark.slow
+def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """Event 3 went back from 2 to 1: where 1 is refused, 2 must not come up again."""
+    state = filled(setup, shown, tmp_path)
+    assert state.solve().success and state.solve().success and state.rollback().success
+    state.close()
+    for path in (tmp_path / 'calibrations').glob('*_calibration_00000001.json'):
+        content = CHECKSUMS.opened(path.read_bytes())
+        path.write_text(CHECKSUMS.sealed({**content, 'accepted': False, 'reasons': ['forged']}))
+    state = started(setup, tmp_path)
+    assert state.active is None
+    assert 'its file states that the gate refused it; forged' in state.withheld[0]
+    state.close()
+
+
+def test_what_was_forced_stays_for_its_own_reasons_only(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
+    assert state.solve(force=True).success
+    state.close()
+    state = started(dataclasses.replace(setup, gate=gate), tmp_path)
+    assert state.active is not None and state.active.forced
+    state.close()
+    tighter = dataclasses.replace(gate, max_map_sigma_px=1e-6)
+    state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
+    assert state.active is None and 'max_map_sigma_px' in state.withheld[0]
+    assert 'max_residual_rms_px' not in state.withheld[0]
+    state.close()
+
+
+def test_reasons_that_a_sender_makes_up_are_one(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = started(setup, tmp_path)
+    for k in range(50):
+        state.add(refused_image(k, 640, 512, f'reason {k}', ''))
+    assert dict(state.ensemble.refused) == {'other': 50}
+    assert (tmp_path / 'ensemble' / 'refused.json').stat().st_size < 300
+    state.close()
+
+
+def test_a_reset_keeps_what_was_set_aside(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    filled(setup, shown[:2], tmp_path).close()
+    victim = tmp_path / 'ensemble' / '00000002.mcap'
+    victim.write_bytes(victim.read_bytes()[:-100])
+    (tmp_path / 'ensemble' / 'notes.txt').write_text('mine')
+    state = started(setup, tmp_path)
+    state.reset()
+    state.close()
+    left = sorted(path.name for path in (tmp_path / 'ensemble').iterdir())
+    assert left == ['00000002.mcap.damaged', 'notes.txt']
+
+
+def test_one_image_of_another_size_is_set_aside(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    other = dataclasses.replace(shown[2], width=1280)
+    with contextlib.closing(Archive(tmp_path, 'camera')) as archive:
+        archive.keep(Ensemble((*shown[:2], other)), ())
+    state = started(setup, tmp_path)
+    assert len(state.ensemble.images) == 2
+    assert '00000003.mcap.damaged' in state.damage[0] and 'an image of 1280 x' in state.damage[0]
+    state.close()
+
+
+def test_without_the_key_nothing_is_believed(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    key = tmp_path / 'key'
+    key.write_bytes(b'sixteen bytes...')
+    filled(setup, shown[:2], tmp_path / 'state').close()
+    options = CalibratorOptions(state_dir=str(tmp_path / 'state'), state_key_file=str(key))
+    state = CalibratorState(itertools.count(1).__next__)
+    state.open(setup, options)
+    assert len(state.ensemble.images) == 0
+    assert all('the HMAC is missing' in text for text in state.damage) and len(state.damage) == 2
+    state.add(shown[0])
+    state.close()
+    state = CalibratorState(itertools.count(1).__next__)
+    state.open(setup, options)
+    assert len(state.ensemble.images) == 1 and state.damage == ()
+    state.close()

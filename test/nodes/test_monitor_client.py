@@ -1,0 +1,146 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The node of the monitor: what it receives on the graph, and what it leaves out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any, TYPE_CHECKING
+
+import pytest
+from sample_records import calibration, observations, status  # type: ignore[import-not-found]
+
+if TYPE_CHECKING:
+    from conftest import Client
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal_ground.ros.monitor_client import Monitor
+from starcal_ros.formats.messages.calibration_messages import (
+    calibration_to_message,
+    status_to_message,
+)
+from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+
+pytestmark = pytest.mark.nodes
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def test_what_the_nodes_publish_is_seen(client: Client) -> None:
+    monitor = Monitor(client._context)
+    client._executor.add_node(monitor)
+
+    def publish(kind: Any, topic: str, message: Any, qos: Any = 10) -> None:
+        publisher = client.node.create_publisher(kind, topic, qos)
+        client.until(publisher.get_subscription_count)
+        publisher.publish(message)
+
+    try:
+        record, counted, active = observations(), status(), calibration()
+        sound = observations_to_message(record, 'camera', make_message)
+        publish(StarObservations, 'observations', sound)
+        client.until(lambda: monitor.seen.images == 1)
+        assert monitor.seen.last is not None and len(monitor.seen.last) == len(record)
+        publish(
+            EnsembleStatus,
+            'ensemble_status',
+            status_to_message(counted, 'camera', make_message),
+            LATCHED,
+        )
+        client.until(lambda: monitor.seen.status is not None)
+        assert monitor.seen.status is not None and monitor.seen.status.images == counted.images
+        message = calibration_to_message(active, make_message)
+        publish(Calibration, 'candidate_calibration', message, LATCHED)
+        client.until(lambda: monitor.seen.candidate is not None)
+        publish(Calibration, 'calibration', message, LATCHED)
+        client.until(lambda: monitor.seen.active is not None)
+        assert monitor.seen.candidate is None
+        healthy = DiagnosticStatus(
+            level=DiagnosticStatus.WARN, name='starcal: star_observer', message='late'
+        )
+        other = DiagnosticStatus(name='another node', message='no concern of ours')
+        publish(DiagnosticArray, '/diagnostics', DiagnosticArray(status=[healthy, other]))
+        client.until(lambda: monitor.seen.health)
+        assert monitor.seen.health == {'star_observer': (1, 'late')}
+        sound.covariance_px2[0] = -1.0
+        publish(StarObservations, 'observations', sound)
+        client.until(lambda: 'monitor' in monitor.seen.health)
+        assert 'not positive definite' in monitor.seen.health['monitor'][1]
+        assert monitor.seen.images == 1
+    finally:
+        client._executor.remove_node(monitor)
+        monitor.destroy_node()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('after', ['start', 'view', 'both'])
+def test_a_signal_ends_it_without_a_traceback(
+    client: Client, number: signal.Signals, after: str
+) -> None:
+    """At its start, while it draws, and a second time while it ends."""
+    name = f'monitor_{number}_{after}'
+    command = [
+        sys.executable,
+        '-m',
+        'starcal_ros.entry_points',
+        'starcal_ground.ros.monitor_client',
+    ]
+    remap = ('--ros-args', '-r', f'__node:={name}')
+    end = subprocess.PIPE
+    with subprocess.Popen([*command, *remap], stdout=end, stderr=end, text=True) as monitor:
+        try:
+            # A signal during the imports has the default action of the system.
+            until_ros(monitor.pid)
+            if after != 'start':
+                client.until(lambda: name in client.node.get_node_names())
+            for _ in range(2 if after == 'both' else 1):
+                monitor.send_signal(number)
+            said = monitor.communicate(timeout=60.0)[1]
+        finally:
+            monitor.kill()
+    assert monitor.returncode == 0 and 'Traceback' not in said, said
+
+
+def until_ros(pid: int) -> None:
+    """Wait until a process handles SIGTERM, which Python does not by itself: `main` is reached."""
+    deadline_s = time.monotonic() + 60.0
+    while time.monotonic() < deadline_s:
+        fields = dict(
+            line.split(':', 1) for line in Path(f'/proc/{pid}/status').read_text().splitlines()
+        )
+        if int(fields['SigCgt'], 16) & 1 << (signal.SIGTERM - 1):
+            return
+        time.sleep(0.01)
+    raise AssertionError('the process does not handle SIGTERM')
+
+
+@pytest.mark.parametrize('client_name', ['monitor_client', 'calibrate_client'])
+@pytest.mark.parametrize('remap', ['__ns:=bad name', '__node:=3', ':='])
+def test_a_bad_remap_is_answered_without_a_traceback(client_name: str, remap: str) -> None:
+    """The last line is ours, after those that rcl logs."""
+    command = [
+        sys.executable,
+        '-m',
+        'starcal_ros.entry_points',
+        f'starcal_ground.ros.{client_name}',
+    ]
+    done = subprocess.run(
+        [*command, '--ros-args', '-r', remap],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+    )
+    assert done.returncode == 2 and 'Traceback' not in done.stderr, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f'{client_name.removesuffix("_client")}') and remap in last

@@ -1,0 +1,808 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The nodes as processes: services, refusals, faults, parameters, signals."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Callable
+import dataclasses
+import functools
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from typing import Any, TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+if TYPE_CHECKING:
+    from conftest import Client, NodeProcess, StartNode
+
+    from starcal_ros.records import Calibration as CalibrationRecord
+    from starcal_ros.records import Ensemble
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped, TransformStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, Temperature
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal.srv import Calibrate, LineOfSightTable
+from starcal_ground.cli.main import main
+from starcal_ros.assessment.lookup import COLUMNS
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages import message_fields
+from starcal_ros.formats.messages.calibration_messages import (
+    calibration_from_message,
+    calibration_to_message,
+    camera_info_to_message,
+)
+from starcal_ros.formats.messages.image_messages import image_from_message, image_to_message
+from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.observation_messages import (
+    observations_from_message,
+    observations_to_message,
+)
+from starcal_ros.formats.messages.telemetry import attitude_to_message, temperature_to_message
+from starcal_ros.formats.products.calibration_json import (
+    CALIBRATION_FILE,
+    read_calibration,
+    write_calibration,
+)
+from starcal_ros.pipeline import solve as solving
+from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.records import Image as ImageRecord
+from starcal_ros.records import refused_image
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+
+pytestmark = pytest.mark.nodes
+
+BOTH = ('star_observer', 'calibrator')
+REMAPS = (
+    *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
+    *('-r', 'velocity:=/spacecraft/velocity'),
+)
+
+
+def parameters(folder: Path, *more: str) -> tuple[str, ...]:
+    """ROS arguments for the parameter file of a bag and further ones."""
+    given = [part for one in more for part in ('-p', one)]
+    return ('--params-file', str(folder / 'params.yaml'), *given)
+
+
+def blank(stamp_ns: int, **change: Any) -> Any:
+    """Return an image message of a dark sky with some fields changed."""
+    pixels = np.zeros((8, 8), np.uint16)
+    message = image_to_message(ImageRecord(stamp_ns, pixels), '', make_message)
+    for name, value in change.items():
+        setattr(message, name, value)
+    return message
+
+
+def attitude(stamp_ns: int) -> Any:
+    """Return an attitude message."""
+    return attitude_to_message(stamp_ns, np.array([0, 0, 0, 1.0]), '', make_message)
+
+
+def play(start_node: StartNode, folder: Path, *more: str) -> None:
+    """Play a bag at full speed to its end."""
+    player = start_node('bag_player', ros=('-p', f'bag:={folder}', '-p', 'rate:=0', *more))
+    assert player.wait(120.0) == 0, player.said()
+
+
+def send_observations(client: Client, products: Path) -> None:
+    """Publish the observations of products; a player would take as long to start as a node."""
+    publisher = client.publisher(StarObservations, 'observations')
+    for raw in reader.read_raw([products / 'observations.mcap']):
+        publisher.publish(raw.data)
+
+
+def test_nodes_and_tool_give_the_same_calibration(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+) -> None:
+    for name in BOTH:
+        start_node(name, ros=(*parameters(tiny_bag), *REMAPS))
+    # The player waits for the observer, but the calibrator must not miss the first image.
+    client.until_listened()
+    play(start_node, tiny_bag)
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    images = json.loads((tiny_bag / 'truth.json').read_text())['images']
+    client.until(lambda: status and status[-1].images == images)
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert answer.success, answer.message
+    found = client.latched(Calibration, 'calibration')
+    client.until(lambda: found)
+    live = calibration_from_message(found[0])
+    offline = read_calibration(tiny_products / CALIBRATION_FILE)
+    for a, b in (
+        (live.geometry.camera.parameters, offline.geometry.camera.parameters),
+        (
+            live.geometry.star_tracker_from_camera_xyzw,
+            offline.geometry.star_tracker_from_camera_xyzw,
+        ),
+        (live.covariance, offline.covariance),
+        (live.residual_rms_px, offline.residual_rms_px),
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=0)
+    assert (live.stars_used, live.stars_rejected) == (offline.stars_used, offline.stars_rejected)
+    assert live.images_refused == offline.images_refused
+    ours = {k: v for k, v in offline.provenance.items() if not k.startswith('input ')}
+    assert dict(live.provenance) == ours
+
+
+def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool(
+    client: Client, start_node: StartNode, tmp_path: Path
+) -> None:
+    """The observer measures the images that matched no star again with the first calibration."""
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    wrong = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
+    assert main(['simulate', '--scenario', 'tiny', *wrong, '-o', str(bag)]) == 0
+    given = ('--params', str(bag / 'params.yaml'), '--no-report')
+    assert main(['calibrate', str(bag), *given, '-o', str(out)]) == 0
+    for name in BOTH:
+        start_node(name, ros=(*parameters(bag), *REMAPS))
+    client.until_listened()
+    play(start_node, bag)
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    found = client.latched(Calibration, 'calibration')
+    for images in (8, 10):
+        client.until(lambda images=images: status and status[-1].images == images)
+        answer = client.call(Trigger, '/calibrator/calibrate')
+        assert answer.success, answer.message
+        client.until(lambda images=images: found and found[-1].images_used == images)
+    live = calibration_from_message(found[-1])
+    offline = read_calibration(out / CALIBRATION_FILE)
+    off = live.geometry.camera.parameters - offline.geometry.camera.parameters
+    # The order of the images differs: sums round differently.
+    assert np.abs(off / offline.sigma[:-3]).max() < 1e-4
+    np.testing.assert_allclose(live.sigma, offline.sigma, rtol=1e-4)
+
+
+@pytest.fixture
+def calibrated(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+) -> list[Any]:
+    """Calibrations published by a calibrator that has collected the tiny bag: one so far."""
+    start_node('calibrator', ros=parameters(tiny_bag))
+    send_observations(client, tiny_products)
+    images = json.loads((tiny_bag / 'truth.json').read_text())['images']
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images == images)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    published: list[Any] = client.latched(Calibration, 'calibration')
+    client.until(lambda: published)
+    return published
+
+
+def test_rollback(client: Client, calibrated: list[Any]) -> None:
+    """Rollback activates the previous calibration, and fails without one."""
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    back = client.call(Trigger, '/calibrator/rollback')
+    assert back.success and 'activated again' in back.message
+    none = client.call(Trigger, '/calibrator/rollback')
+    assert not none.success and 'no calibration before' in none.message
+
+
+def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: list[Any]) -> None:
+    # All but k3, which is zero in truth: the gate would name any other that is held.
+    names = ['fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2']
+    trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=names)
+    assert trial.success and 'would be activated' in trial.message, trial.message
+    assert list(trial.calibration.estimated) == names
+    bad = client.call(Calibrate, '/calibrator/solve', estimate=['fz'])
+    assert not bad.success and 'fz' in bad.message
+    assert bad.calibration.stars_used == 0
+    bad = client.call(Calibrate, '/calibrator/solve', method='magic')
+    assert not bad.success and 'magic' in bad.message
+    for estimate in (['fx'] * 100_000, ['fx', 'fx'], ['x' * 10**6]):
+        bad = client.call(Calibrate, '/calibrator/solve', estimate=estimate)
+        assert not bad.success and len(bad.message) < 1000
+    assert len(calibrated) == 1
+
+
+def test_the_table_of_lines_of_sight_is_that_of_the_tool(
+    client: Client, calibrated: list[Any], tmp_path: Path
+) -> None:
+    answer = client.call(LineOfSightTable, '/calibrator/lookup', points=7)
+    assert answer.success and '49 lines of sight' in answer.message
+    write_calibration(calibration_from_message(calibrated[0]), tmp_path / 'calibration.json')
+    table = tmp_path / 'table.csv'
+    assert main(['lookup', str(tmp_path), '-o', str(table), '--points', '7']) == 0
+    columns = np.genfromtxt(table, delimiter=',', names=True)
+    assert len(columns) == 49
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(answer, name), columns[name])
+    budget = calibration_from_message(calibrated[0]).sigma_budget
+    assert [part.cause for part in answer.sigma_budget] == [part.cause for part in budget]
+    assert answer.sigma_budget[0].map_arcsec == budget[0].map_arcsec > 0.0
+    default = client.call(LineOfSightTable, '/calibrator/lookup')
+    assert len(default.u_px) == 25**2
+    for points in (1, 201, 2**32 - 1):
+        refused = client.call(LineOfSightTable, '/calibrator/lookup', points=points)
+        assert not refused.success and f'points: {points}' in refused.message
+
+
+def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> None:
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status)
+    images = status[-1].images
+    reset = client.call(Trigger, '/calibrator/reset')
+    assert reset.success and str(images) in reset.message
+    client.until(lambda: status[-1].images == 0)
+    empty = client.call(Trigger, '/calibrator/calibrate')
+    assert not empty.success
+    assert len(calibrated) == 1
+
+
+def test_gate_refusal_and_force(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+) -> None:
+    """A refused candidate is only in the response, unless it is forced."""
+    calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_residual_rms_px:=0.001'))
+    send_observations(client, tiny_products)
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images >= 10)
+    found = client.latched(Calibration, 'calibration')
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert not answer.success and answer.message.startswith('refused by the gate')
+    solved = client.call(Calibrate, '/calibrator/solve')
+    assert not solved.success and solved.calibration.stars_used > 0
+    assert solved.calibration.reasons and not solved.calibration.accepted
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: any('refused by the gate' in m.status[0].message for m in diagnostics))
+    assert not found
+    candidate = client.latched(Calibration, 'candidate_calibration')
+    client.until(lambda: candidate)
+    assert candidate[0].reasons and candidate[0].number == 0
+    forced = client.call(Calibrate, '/calibrator/solve', force=True)
+    assert forced.success and not forced.calibration.accepted
+    client.until(lambda: found)
+    assert found[0].reasons[-1] == 'activated by request despite the gate'
+    assert found[0].forced and found[0].number == 1
+    client.until(
+        lambda: any('active despite the gate' in m.status[0].message for m in diagnostics)
+    )
+    assert calibrator.process.poll() is None
+
+
+def test_every_image_gets_one_answer(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """Unusable images are refused with a reason, in order, each once."""
+    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=0.5'))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, 'image', 50)
+    attitudes = client.publisher(QuaternionStamped, 'attitude')
+    client.until_listened()
+    sent = [
+        (blank(1, encoding='rgb8'), 'bad_encoding'),
+        (blank(2, step=3), 'bad_layout'),
+        (blank(3, data=array.array('B')), 'bad_layout'),
+        (blank(10_000_000_000), 'wrong_size'),
+        (blank(9_000_000_000), 'wrong_size'),
+    ]
+    for message, _ in sent:
+        images.publish(message)
+    for k in range(30):
+        attitudes.publish(attitude(k * 500_000_000))
+    client.until(lambda: len(answers) == len(sent))
+    stamps = [message_fields.stamp_ns(m.header.stamp) for m, _ in sent]
+    assert [message_fields.stamp_ns(a.header.stamp) for a in answers] == stamps
+    assert [a.refusal for a in answers] == [reason for _, reason in sent]
+    assert all(a.detail for a in answers)
+    images.publish(blank(60_000_000_000))
+    client.until(lambda: len(answers) == len(sent) + 1)
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: diagnostics)
+    values = {v.key: v.value for v in diagnostics[0].status[0].values}
+    assert (values['images'], values['refused_bad_layout']) == ('6', '2')
+    assert diagnostics[0].status[0].level == b'\x01'
+
+
+def test_attitudes_of_an_imu_are_taken_by_parameter(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """The orientations of an Imu serve as the quaternions do."""
+    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_message:=imu'))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, 'image', 50)
+    attitudes = client.publisher(Imu, 'attitude', 200)
+    client.until_listened()
+    for raw in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+        decoded = reader.decode(raw)
+        sample = Imu()
+        sample.header.stamp.sec = decoded.header.stamp.sec
+        sample.header.stamp.nanosec = decoded.header.stamp.nanosec
+        for axis in 'xyzw':
+            setattr(sample.orientation, axis, getattr(decoded.quaternion, axis))
+        attitudes.publish(sample)
+    first = next(iter(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    assert isinstance(first, ImageRecord)
+    images.publish(image_to_message(first, 'camera', make_message))
+    client.until(lambda: bool(answers))
+    assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
+
+
+def test_image_waits_for_its_attitude(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """An image that arrives before its attitude waits for it."""
+    start_node('star_observer', ros=(*parameters(tiny_bag, 'attitude_timeout_s:=60.0'), *REMAPS))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, '/opnav/image_raw', 10)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    first = next(reader.read_raw([tiny_bag], ['/opnav/image_raw']))
+    samples = list(reader.read_raw([tiny_bag], ['/star_tracker/attitude']))
+    client.until_listened()
+    images.publish(first.data)
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(functools.partial(is_waiting, diagnostics, 1))
+    assert not answers
+    for sample in samples:
+        attitudes.publish(sample.data)
+    client.until(lambda: answers)
+    assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
+
+
+def test_observations_carry_the_temperature(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
+    start_node('star_observer', ros=(*given, *REMAPS, '-r', 'temperature:=/box'))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, '/opnav/image_raw', 10)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    temperatures = client.publisher(Temperature, '/box')
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    first = next(reader.read_raw([tiny_bag], ['/opnav/image_raw']))
+    for offset_ns, degc in ((-2 * 10**9, 3.5), (-(10**9), -7.25), (10**9, 40.0)):
+        message = temperature_to_message(
+            first.log_time_ns + offset_ns, degc, 'camera', make_message
+        )
+        temperatures.publish(message)
+    assert temperatures.wait_for_all_acked()
+    client.until_listened()
+    images.publish(first.data)
+    client.until(functools.partial(is_waiting, diagnostics, 1))
+    for sample in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+        attitudes.publish(sample.data)
+    client.until(lambda: answers)
+    assert answers[0].refusal == '' and answers[0].temperature_degc == -7.25
+
+
+def test_observations_carry_rate_and_velocity_sigma(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """Of a camera that is still, with the velocity in its bag."""
+    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    client.until_listened()
+    start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
+    client.until(lambda: len(answers) == 10)
+    assert {answer.velocity_sigma_m_s for answer in answers} == {10.0}
+    rates_rad_s = np.array([answer.star_tracker_rate_rad_s for answer in answers])
+    assert rates_rad_s.shape == (10, 3) and np.abs(rates_rad_s).max() < 1e-12
+
+
+def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """A PNG on image/compressed gives the same observations as the raw image, also remapped."""
+    # A small message waits behind a large one of its participant, under load longer than 10 s.
+    patient = 'attitude_timeout_s:=60.0'
+    raw_observer = start_node('star_observer', ros=(*parameters(tiny_bag, patient), *REMAPS))
+    start_node(
+        'star_observer',
+        ros=(
+            *(*parameters(tiny_bag, patient, 'image_transport:=compressed'), *REMAPS),
+            *('-r', 'observations:=of_png', '-r', '__node:=png_observer'),
+        ),
+    )
+    raw: list[Any] = client.collect(StarObservations, 'observations')
+    png: list[Any] = client.collect(StarObservations, 'of_png')
+    images = client.publisher(Image, '/opnav/image_raw', 10)
+    compressed = client.publisher(CompressedImage, '/opnav/image_raw/compressed', 10)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    client.until(lambda: attitudes.get_subscription_count() == 2)
+    client.until_listened()
+    client.until_listened('png_observer')
+    first = next(iter(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    assert isinstance(first, ImageRecord)
+    message = CompressedImage(format='mono16; png compressed')
+    message.header = make_header(first.time_ns, 'camera', make_message)
+    message.data = array.array('B', cv2.imencode('.png', first.pixels)[1].tobytes())
+    compressed.publish(message)
+    images.publish(image_to_message(first, 'camera', make_message))
+    for sample in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+        attitudes.publish(sample.data)
+    client.until(lambda: raw and png)
+    assert raw[0].refusal == '' and raw[0].header == png[0].header
+    # Not as bytes: what pads a field to its place in a serialised message may be anything.
+    one, other = (dataclasses.asdict(observations_from_message(m[0])) for m in (raw, png))
+    np.testing.assert_equal(one, other)
+    assert raw_observer.process.poll() is None
+
+
+def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """With more images than the queue holds, each is answered, the surplus with overrun."""
+    start_node(
+        'star_observer', ros=parameters(tiny_bag, 'image_queue:=5', 'attitude_timeout_s:=60.0')
+    )
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    images = client.publisher(Image, 'image', 50)
+    attitudes = client.publisher(QuaternionStamped, 'attitude')
+    client.until_listened()
+    for first, end in ((1, 5), (6, 8), (9, 11)):
+        for k in range(first, end + 1):
+            images.publish(blank(k))
+        # DDS itself keeps no more than five: these are taken before the next are sent.
+        client.until(functools.partial(is_waiting, diagnostics, end))
+    attitudes.publish(attitude(100_000_000_000))
+    client.until(lambda: len(answers) == 11)
+    assert [a.refusal for a in answers] == ['wrong_size'] * 5 + ['overrun'] * 6
+
+
+def is_waiting(diagnostics: list[Any], images: int) -> bool:
+    """Return True if the latest diagnostics report this number of queued images."""
+    values = {v.key: v.value for m in diagnostics[-1:] for v in m.status[0].values}
+    return values.get('images_waiting') == str(images)
+
+
+def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """The annotated image has the size and stamp of the image."""
+    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    pictures = client.collect(Image, 'annotated_image', 5)
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    client.until_listened()
+    play(start_node, tiny_bag)
+    client.until(lambda: len(pictures) >= 1 and len(answers) >= 10)
+    picture = pictures[0]
+    assert picture.encoding == 'bgr8'
+    assert (picture.height, picture.width) == (answers[0].height, answers[0].width)
+    assert len(picture.data) == picture.height * picture.width * 3
+    assert np.ptp(np.frombuffer(picture.data, np.uint8)) > 100
+
+
+def test_camera_info_per_image(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
+) -> None:
+    """The active calibration with the header of each image; never the prior or a candidate."""
+    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
+    active = solving.solve(tiny_observations, setup)
+    assert active.accepted
+    candidate = dataclasses.replace(active, accepted=False, reasons=('bad',))
+    observer = start_node(
+        'star_observer',
+        ros=parameters(tiny_bag, 'attitude_timeout_s:=0.0'),
+    )
+    best_effort = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    lossy = client.collect(CameraInfo, 'image_camera_info', best_effort)
+    infos: list[Any] = client.collect(CameraInfo, 'image_camera_info')
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, 'image', 50)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    calibrations = client.node.create_publisher(Calibration, 'calibration', latched)
+    camera = setup.prior.camera
+
+    def show(stamp_ns: int, frame_id: str = 'opnav', **size: int) -> Any:
+        message = blank(stamp_ns, **{'width': camera.width, 'height': camera.height, **size})
+        message.header.frame_id = frame_id
+        images.publish(message)
+        return message.header
+
+    def publish(calibration: CalibrationRecord, said: str) -> None:
+        calibrations.publish(calibration_to_message(calibration, make_message))
+        client.until(lambda: said in observer.said())
+
+    show(1)
+    publish(candidate, 'calibration: refused by the gate')
+    show(2)
+    client.until(lambda: len(answers) == 2)
+    publish(active, 'predicting stars with the active calibration')
+    headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
+    client.until(lambda: len(answers) == 6 and len(infos) == 3)
+    # Nothing of the first two comes later: what is of one publisher comes in order.
+    assert [info.header for info in infos] == [headers[0], *headers[2:]]
+    assert lossy[0].header in headers
+    expected = camera_info_to_message(active, make_message)
+    for info in infos:
+        expected.header = info.header
+        assert info == expected
+    forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
+    calibrations.publish(calibration_to_message(forced, make_message))
+    client.until(lambda: observer.said().count('predicting stars') == 2)
+    header = show(8)
+    client.until(lambda: len(infos) == 4)
+    assert infos[-1].header == header
+
+
+def test_calibrator_collects_while_it_solves(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+) -> None:
+    """Observations that arrive during a calibration are all counted."""
+    start_node('calibrator', ros=parameters(tiny_bag))
+    send_observations(client, tiny_products)
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images >= 10)
+    observations = client.publisher(StarObservations, 'observations')
+    solve = client.node.create_client(Calibrate, '/calibrator/solve')
+    client.until(solve.service_is_ready)
+    futures = [solve.call_async(Calibrate.Request(dry_run=True)) for _ in range(5)]
+    for k in range(300):
+        refused = refused_image(k, 8, 8, 'no_stars', '')
+        observations.publish(observations_to_message(refused, '', make_message))
+    client.until(lambda: all(future.done() for future in futures), 120.0)
+    assert all(future.result().success for future in futures)
+    client.until(lambda: 'no_stars' in {entry.reason for entry in status[-1].refused})
+    client.until(lambda: sum(e.count for e in status[-1].refused) == 300)
+
+
+def test_state_outlasts_a_kill(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
+) -> None:
+    """Ensemble and active calibration survive kill -9; the state folder has one owner."""
+    tool = read_calibration(tiny_products / CALIBRATION_FILE)
+    state = f'state_dir:={tmp_path / "state"}'
+    killed = start_node('calibrator', ros=parameters(tiny_bag, state))
+    play(start_node, tiny_products / 'observations.mcap')
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images_saved == tool.images_used)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    second = start_node('calibrator', ros=parameters(tiny_bag, state))
+    assert second.wait() == 2
+    assert f'state_dir: {tmp_path / "state"} is in use by another calibrator' in second.said()
+    killed.process.kill()
+    killed.process.wait()
+    # The graph takes twenty seconds to forget the dead: its heir has another name.
+    start_node('calibrator', ros=(*parameters(tiny_bag, state), '-r', '__node:=heir'))
+    found = client.latched(Calibration, 'calibration')
+    client.until(lambda: found)
+    active = calibration_from_message(found[0])
+    assert active.number == 1 and active.active_since_ns > 0
+    again = client.call(Calibrate, '/heir/solve', dry_run=True)
+    answer = calibration_from_message(again.calibration)
+    for one in (active, answer):
+        np.testing.assert_array_equal(one.covariance, tool.covariance)
+    ensemble_by_tool = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate']
+    ensemble_by_tool += [str(tmp_path / 'state' / 'ensemble'), '-o', str(tmp_path / 'again')]
+    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml')]
+    subprocess.run(ensemble_by_tool, check=True, capture_output=True)
+    repeated = read_calibration(tmp_path / 'again' / CALIBRATION_FILE)
+    np.testing.assert_array_equal(repeated.covariance, tool.covariance)
+
+
+def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """Inconsistent observations are logged and counted as refused; the next ones are used."""
+    calibrator = start_node('calibrator', ros=parameters(tiny_bag))
+    observations = client.publisher(StarObservations, 'observations')
+    observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
+    refused = refused_image(5, 8, 8, 'no_stars', '')
+    observations.publish(observations_to_message(refused, '', make_message))
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    both = ['bad_observations', 'no_stars']
+    client.until(lambda: status and [e.reason for e in status[-1].refused] == both)
+    assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
+    assert 'Traceback' not in calibrator.said()
+
+
+def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """A calibration of an empty ensemble is refused; the prior is no calibration."""
+    start_node('calibrator', ros=parameters(tiny_bag))
+    latched = [
+        client.latched(CameraInfo, 'camera_info'),
+        client.latched(TransformStamped, 'alignment'),
+        client.latched(Calibration, 'calibration'),
+    ]
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert not answer.success
+    assert str(status_of(client, status).min_images) in answer.message
+    assert '\n' not in answer.message
+    rollback = client.call(Trigger, '/calibrator/rollback')
+    assert not rollback.success and rollback.message == 'no calibration is active'
+    assert latched == [[], [], []]
+
+
+def status_of(client: Client, status: list[Any]) -> Any:
+    """Latest ensemble status."""
+    client.until(lambda: status)
+    return status[-1]
+
+
+INTERRUPTED = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == 'starcal_ros.pipeline.setup':
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+from starcal_ros import entry_points
+entry_points.{}()
+"""
+
+
+@pytest.mark.parametrize('name', BOTH)
+def test_a_signal_while_python_imports(name: str) -> None:
+    """Ctrl-C during imports ends the console script without a traceback."""
+    command = [sys.executable, '-c', INTERRUPTED.format(name)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals(client: Client, start_node: StartNode, tiny_bag: Path, number: int) -> None:
+    nodes = [start_node(name, ros=parameters(tiny_bag)) for name in BOTH]
+    client.until(lambda: set(BOTH) <= set(client.node.get_node_names()))
+    for node in nodes:
+        assert node.stop(number) == 0
+        assert 'Traceback' not in node.said()
+
+
+def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tuple[str, ...]]:
+    """ROS arguments for a changed copy of the parameter file of the bag."""
+
+    def arguments(folder: Path, scratch: Path) -> tuple[str, ...]:
+        text = change((folder / 'params.yaml').read_text())
+        (scratch / 'params.yaml').write_text(text)
+        return ('--params-file', str(scratch / 'params.yaml'))
+
+    return arguments
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [
+        (lambda f, _: parameters(f, 'max_attitude_gap_s:=-1.0'), 'max_attitude_gap_s'),
+        (lambda f, _: parameters(f, 'max_attitude_gap_s:=soon'), 'max_attitude_gap_s'),
+        (lambda f, _: parameters(f, 'attitude_direction:=up'), 'attitude_direction'),
+        (lambda f, _: parameters(f, 'prior_alignment:=[1.0, 2.0]'), 'prior_alignment'),
+        (lambda f, _: parameters(f, 'estimate:=[fx, fz]'), 'estimate'),
+        (lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
+        (lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
+        (lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
+        (tiny_parameters(lambda text: text.replace(':', ':::')), 'params.yaml'),
+        (tiny_parameters(lambda text: text + '    psf: {a: [1, b'), 'params.yaml'),
+        (tiny_parameters(lambda text: text.replace('camera.yaml', 'no.yaml')), 'no.yaml'),
+    ],
+)
+def test_bad_parameters(
+    start_node: StartNode,
+    tiny_bag: Path,
+    tmp_path: Path,
+    arguments: Callable[[Path, Path], tuple[str, ...]],
+    text: str,
+) -> None:
+    """A bad parameter ends either node with status 2 and one line that names it."""
+    for node in [start_node(name, ros=arguments(tiny_bag, tmp_path)) for name in BOTH]:
+        assert node.wait() == 2
+        said = node.said()
+        lines = [line for line in said.splitlines() if line.startswith(f'{node.name}: ')]
+        assert len(lines) == 1, said
+        assert text in lines[0]
+        assert 'Traceback' not in said
+
+
+def test_parameters_while_running(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """Parameters have descriptions, and those in use cannot be changed."""
+    node = start_node('star_observer', ros=parameters(tiny_bag, 'max_attitude_gap_s:=3'))
+    described = client.call(
+        DescribeParameters,
+        '/star_observer/describe_parameters',
+        names=['max_attitude_gap_s', 'attitude_direction', 'image_queue'],
+    )
+    gap, direction, queue = described.descriptors
+    assert gap.floating_point_range[0].from_value == 0.0
+    assert 'inertial_to_st' in direction.description
+    assert queue.integer_range[0].to_value == 1000
+    client.until(lambda: state_of(client) == 'active')
+    assert 'in use' in set_gap(client, 1.0)
+    assert change_state(client, Transition.TRANSITION_DEACTIVATE)
+    assert change_state(client, Transition.TRANSITION_CLEANUP)
+    assert set_gap(client, 1.0) == ''
+    assert 'max_attitude_gap_s' in set_gap(client, -1.0)
+    assert 'Type' in set_gap(client, 1.0, 41)
+    assert change_state(client, Transition.TRANSITION_CONFIGURE)
+    assert change_state(client, Transition.TRANSITION_ACTIVATE)
+    assert node.process.poll() is None
+
+
+def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DOUBLE) -> str:
+    """Set a parameter; return the reason of a refusal, '' if accepted."""
+    number = ParameterValue(type=kind, double_value=value)
+    parameter = Parameter(name='max_attitude_gap_s', value=number)
+    answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
+    return '' if answer.results[0].successful else str(answer.results[0].reason)
+
+
+def state_of(client: Client, name: str = 'star_observer') -> str:
+    """Lifecycle state of a node."""
+    answer = client.call(GetState, f'/{name}/get_state')
+    return str(answer.current_state.label)
+
+
+def change_state(client: Client, transition: int, name: str = 'star_observer') -> bool:
+    """Request a transition; return True if the node made it."""
+    request = Transition(id=transition)
+    return bool(client.call(ChangeState, f'/{name}/change_state', transition=request).success)
+
+
+@pytest.mark.parametrize('name', BOTH)
+def test_lifecycle_by_hand(
+    client: Client, start_node: StartNode, tiny_bag: Path, name: str
+) -> None:
+    """Without autostart the node stays unconfigured; an invalid transition is answered."""
+    node = start_node(name, ros=parameters(tiny_bag, 'autostart:=false'))
+    assert state_of(client, name) == 'unconfigured'
+    assert not change_state(client, Transition.TRANSITION_ACTIVATE, name)
+    assert state_of(client, name) == 'unconfigured'
+    for _ in range(2):
+        for transition, state in (
+            (Transition.TRANSITION_CONFIGURE, 'inactive'),
+            (Transition.TRANSITION_ACTIVATE, 'active'),
+            (Transition.TRANSITION_DEACTIVATE, 'inactive'),
+            (Transition.TRANSITION_CLEANUP, 'unconfigured'),
+        ):
+            assert change_state(client, transition, name)
+            assert state_of(client, name) == state
+    assert node.stop() == 0
+    assert 'Traceback' not in node.said()
+
+
+def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:
+    """A bag of large images at full speed arrives completely, in order, with its stamps."""
+    random = np.random.default_rng(2)
+    with BagWriter(tmp_path / 'large') as writer:
+        for k in range(24):
+            pixels = random.integers(0, 4096, (1024, 1296)).astype(np.uint16)
+            for j in range(40):
+                writer.write_attitude('/attitude', k * 10**9 + j, np.array([0, 0, 0, 1.0]), 'i')
+            writer.write_image('/image', ImageRecord(k * 10**9 + 40, pixels), 'camera')
+    # A listener that is slow to take loses what its own history has no room for.
+    images: list[Any] = client.collect(Image, '/image', 24)
+    attitudes: list[Any] = client.collect(QuaternionStamped, '/attitude', 24 * 40)
+    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "large"}', '-p', 'rate:=0.0'))
+    client.until(lambda: player.process.poll() is not None, 60.0)
+    assert player.process.returncode == 0, player.said()
+    client.until(lambda: len(images) == 24 and len(attitudes) == 24 * 40)
+    sound = list(reader.read_images([tmp_path / 'large'], '/image'))
+    for message, image in zip(images, sound, strict=True):
+        got = image_from_message(message)
+        assert got.time_ns == image.time_ns and isinstance(image, ImageRecord)
+        np.testing.assert_array_equal(got.pixels, image.pixels)
+    stamps = [message_fields.stamp_ns(m.header.stamp) for m in attitudes]
+    assert stamps == sorted(stamps)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [
+        ((), 'bag: path of the bag to play is missing'),
+        (('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such bag'),
+        (('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
+    ],
+)
+def test_player_refuses(start_node: StartNode, arguments: tuple[str, ...], text: str) -> None:
+    player = start_node('bag_player', ros=arguments)
+    assert player.wait() == 2
+    assert text in player.said() and 'Traceback' not in player.said()
+
+
+def test_player_stops_when_told(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    player: NodeProcess = start_node('bag_player', ros=('-p', f'bag:={tiny_bag}'))
+    client.until(lambda: 'bag_player' in client.node.get_node_names())
+    assert player.stop(signal.SIGTERM) == 0, player.said()
+    assert 'Traceback' not in player.said()

@@ -1,0 +1,239 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Lines of sight by pixel: against the camera, against differences, and in every format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.mission.export.lookup_table import write_lookup_table
+from starcal_ros.assessment.lookup import (
+    COLUMNS,
+    Derivatives,
+    line_of_sight_table,
+    LineOfSightTable,
+    pixels_every,
+)
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
+from starcal_ros.camera.detector_field import degrees, DetectorField
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import ProductError
+from starcal_ros.records import MapCovariance
+
+LENS = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.1, 4e-4, -3e-4]))
+DEGREE = 3
+TERMS = len(degrees(DEGREE))
+FIELD = DetectorField(
+    640, 512, DEGREE, np.random.default_rng(1).normal(scale=0.3, size=(2, TERMS))
+)
+WITH_FIELD = CameraModel(640, 512, LENS.parameters, field=FIELD)
+CAMERAS = pytest.mark.parametrize('camera', [LENS, WITH_FIELD], ids=['lens', 'field'])
+# fx to p2, the alignment (rad), and coefficients of a field (px): 1-sigma of a usual calibration.
+SIGMA = np.r_[0.3, 0.1, 0.3, 0.5, 0.5, 1e-3, 1e-2, 1e-1, 1e-4, 1e-4, np.full(3, 2e-5)]
+# Of differences over a hundredth of a 1-sigma from both sides: their cubes and rounding are 1e-8.
+RTOL = 1e-6
+PIXELS = np.array([[0.0, 0.0], [319.5, 255.5], [639.0, 511.0], [100.0, 400.0], [600.25, 17.5]])
+
+
+def covariance_of(camera: CameraModel) -> np.ndarray:
+    """A covariance with correlations of every sign."""
+    sigma = SIGMA if camera.field is None else np.r_[SIGMA, np.full(2 * TERMS, 0.02)]
+    mixed = np.random.default_rng(2).normal(size=(len(sigma), len(sigma)))
+    correlated = mixed @ mixed.T
+    scale = sigma / np.sqrt(np.diag(correlated))
+    return np.asarray(correlated * np.outer(scale, scale))
+
+
+def moved(camera: CameraModel, change: np.ndarray) -> tuple[CameraModel, Rotation]:
+    """A camera and the rotation of its frame after a change of all their numbers."""
+    p = len(camera.parameters)
+    field = camera.field
+    if field is not None:
+        coefficients = field.coefficients + change[p + 3 :].reshape(2, -1)
+        field = DetectorField(field.width, field.height, field.degree, coefficients)
+    parameters = camera.parameters + change[:p]
+    # camera_from_star_tracker <- exp(-[dtheta x]) camera_from_star_tracker (Eq. 11).
+    rotation = Rotation.from_rotvec(change[p : p + 3])
+    return CameraModel(camera.width, camera.height, parameters, field=field), rotation
+
+
+def differences(camera: CameraModel, pixels: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Movement (n, 3) of the directions of pixels by a change, from both of its sides."""
+    step = 0.01
+    ends = []
+    for sign in (1.0, -1.0):
+        other, rotation = moved(camera, sign * step * change)
+        ends.append(rotation.apply(line_of_sight(other, pixels)))
+    return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+
+
+@CAMERAS
+def test_directions_are_those_of_the_camera(camera: CameraModel) -> None:
+    table = line_of_sight_table(camera, MapCovariance(covariance_of(camera)), PIXELS)
+    np.testing.assert_array_equal(table.pixels, PIXELS)
+    np.testing.assert_array_equal(table.direction_camera, line_of_sight(camera, PIXELS))
+    np.testing.assert_allclose(np.linalg.norm(table.direction_camera, axis=1), 1.0, rtol=1e-14)
+    # The inversion of lens and field ends at 1e-10 px or better.
+    np.testing.assert_allclose(project(camera, table.direction_camera), PIXELS, atol=1e-8)
+
+
+@CAMERAS
+def test_derivatives_are_the_limits_of_differences(camera: CameraModel) -> None:
+    J = Derivatives.at(camera, PIXELS).J
+    sigma = np.sqrt(np.diag(covariance_of(camera)))
+    assert J.shape == (len(PIXELS), 3, len(sigma))
+    for k, change in enumerate(np.diag(sigma)):
+        expected = differences(camera, PIXELS, change)
+        np.testing.assert_allclose(
+            J[:, :, k] * sigma[k], expected, atol=1e-12 + RTOL * np.abs(expected).max()
+        )
+
+
+@CAMERAS
+def test_sigma_is_that_of_differences(camera: CameraModel) -> None:
+    """Sum of the squared movements by independent changes; common rotation by least squares."""
+    covariance = covariance_of(camera)
+    table = line_of_sight_table(camera, MapCovariance(covariance), PIXELS)
+    p = len(camera.parameters)
+    both = pixel_grid(camera, 25, 25)
+    at_grid, at_pixels = line_of_sight(camera, both), line_of_sight(camera, PIXELS)
+    whole, shape = np.zeros(len(PIXELS)), np.zeros(len(PIXELS))
+    small = 1e-4  # of a 1-sigma: its rotation is linear in it
+    # Columns of a square root of the covariance move the camera independently of each other.
+    for change in np.linalg.cholesky(covariance).T:
+        whole += (differences(camera, PIXELS, change) ** 2).sum(axis=1)
+        change = change.copy()
+        change[p : p + 3] = 0.0
+        of_grid = differences(camera, both, change)
+        turn, _ = Rotation.align_vectors(at_grid + small * of_grid, at_grid)
+        common = (turn.apply(at_pixels) - at_pixels) / small
+        left = differences(camera, PIXELS, change) - common
+        shape += (left**2).sum(axis=1)
+    np.testing.assert_allclose(
+        table.sigma_arcsec,
+        np.sqrt(whole) / ARCSECOND_RAD,
+        rtol=RTOL,
+    )
+    np.testing.assert_allclose(table.shape_sigma_arcsec, np.sqrt(shape) / ARCSECOND_RAD, rtol=1e-5)
+
+
+@CAMERAS
+def test_structure_finer_than_the_field_moves_each_pixel_by_itself(camera: CameraModel) -> None:
+    nothing = np.zeros_like(covariance_of(camera))
+    table = line_of_sight_table(camera, MapCovariance(nothing, 0.3), PIXELS)
+    square = np.zeros(len(PIXELS))
+    for step in np.eye(2):
+        ends = [line_of_sight(camera, PIXELS + sign * 0.01 * step) for sign in (1.0, -1.0)]
+        square += (((ends[0] - ends[1]) / 0.02) ** 2).sum(axis=1)
+    expected = 0.3 * np.sqrt(square) / ARCSECOND_RAD
+    # Of a field that is steep, the derivative is that without the field: to its slope.
+    rtol = 1e-6 if camera.field is None else 0.02
+    for found in (table.sigma_arcsec, table.shape_sigma_arcsec):
+        np.testing.assert_allclose(found, expected, rtol=rtol)
+    both = line_of_sight_table(camera, MapCovariance(covariance_of(camera), 0.3), PIXELS)
+    alone = line_of_sight_table(camera, MapCovariance(covariance_of(camera)), PIXELS)
+    np.testing.assert_allclose(both.sigma_arcsec, np.hypot(alone.sigma_arcsec, table.sigma_arcsec))
+
+
+def test_many_pixels_are_as_each_alone() -> None:
+    covariance = covariance_of(LENS)
+    pixels = pixels_every(LENS, 8.0)
+    assert len(pixels) > 4096  # more than are taken at a time
+    table = line_of_sight_table(LENS, MapCovariance(covariance), pixels)
+    for k in (0, 4095, 4096, len(pixels) - 1):
+        alone = line_of_sight_table(LENS, MapCovariance(covariance), pixels[k : k + 1])
+        for name in ('direction_camera', 'sigma_arcsec', 'shape_sigma_arcsec'):
+            # Sums in another order.
+            one, other = getattr(table, name)[k], getattr(alone, name)[0]
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14, err_msg=name)
+
+
+def test_an_alignment_alone_has_no_shape() -> None:
+    covariance = np.zeros((13, 13))
+    covariance[11, 11] = (50 * ARCSECOND_RAD) ** 2
+    centre = LENS.parameters[3:5][None]
+    table = line_of_sight_table(LENS, MapCovariance(covariance), centre)
+    assert table.shape_sigma_arcsec[0] == 0.0
+    # A rotation about y moves what lies along z by its whole angle.
+    assert table.sigma_arcsec[0] == pytest.approx(50.0, rel=1e-5)
+
+
+def test_a_pixel_without_a_line_of_sight_is_nan() -> None:
+    folded = LENS.replace(k1=-12.0, k2=0.0, k3=0.0)
+    table = line_of_sight_table(folded, MapCovariance(covariance_of(LENS)), PIXELS)
+    folds = np.isnan(line_of_sight(folded, PIXELS)).any(axis=1)
+    assert folds.any() and not folds.all()
+    for values in (table.direction_camera[:, 0], table.sigma_arcsec, table.shape_sigma_arcsec):
+        np.testing.assert_array_equal(np.isnan(values), folds)
+
+
+@pytest.mark.parametrize(
+    ('step_px', 'of_u', 'of_v'),
+    [
+        (100.0, [0, 100, 200, 300, 400, 500, 600], [0, 100, 200, 300, 400, 500]),
+        (213.0, [0, 213, 426, 639], [0, 213, 426]),  # the last column is one of the detector
+        (255.5, [0, 255.5, 511], [0, 255.5, 511]),
+        (640.0, [0], [0]),
+    ],
+)
+def test_pixels_at_every_step(step_px: float, of_u: list[float], of_v: list[float]) -> None:
+    expected = [(u, v) for v in of_v for u in of_u]  # u fastest
+    np.testing.assert_array_equal(pixels_every(LENS, step_px), expected)
+
+
+@pytest.fixture
+def table() -> LineOfSightTable:
+    return line_of_sight_table(LENS, MapCovariance(covariance_of(LENS)), pixels_every(LENS, 200.0))
+
+
+def columns_of(table: LineOfSightTable) -> dict[str, np.ndarray]:
+    """The columns by the names of the files."""
+    x, y, z = table.direction_camera.T
+    return {
+        'u_px': table.pixels[:, 0],
+        'v_px': table.pixels[:, 1],
+        'x': x,
+        'y': y,
+        'z': z,
+        'shape_sigma_arcsec': table.shape_sigma_arcsec,
+        'sigma_arcsec': table.sigma_arcsec,
+    }
+
+
+def test_csv_comes_back_to_the_last_bit(table: LineOfSightTable, tmp_path: Path) -> None:
+    write_lookup_table(table, tmp_path / 'a.csv')
+    assert (tmp_path / 'a.csv').read_text().splitlines()[0] == ','.join(COLUMNS)
+    back = np.genfromtxt(tmp_path / 'a.csv', delimiter=',', names=True)
+    assert back.dtype.names == COLUMNS
+    for name, values in columns_of(table).items():
+        np.testing.assert_array_equal(back[name], values, name)
+
+
+def test_npz_comes_back_to_the_last_bit(table: LineOfSightTable, tmp_path: Path) -> None:
+    write_lookup_table(table, tmp_path / 'a.npz')
+    with np.load(tmp_path / 'a.npz') as archive:
+        assert tuple(archive.files) == COLUMNS
+        for name, values in columns_of(table).items():
+            np.testing.assert_array_equal(archive[name], values, name)
+
+
+def test_fits_comes_back_to_the_last_bit(table: LineOfSightTable, tmp_path: Path) -> None:
+    fits = pytest.importorskip('astropy.io.fits')
+    write_lookup_table(table, tmp_path / 'a.fits')
+    with fits.open(tmp_path / 'a.fits') as file:
+        made = file['LINES_OF_SIGHT']
+        assert tuple(made.columns.names) == COLUMNS
+        units = [unit or '' for unit in made.columns.units]
+        assert units == ['pix', 'pix', '', '', '', 'arcsec', 'arcsec']
+        for name, values in columns_of(table).items():
+            np.testing.assert_array_equal(made.data[name], values, name)
+
+
+@pytest.mark.parametrize('name', ['a.txt', 'a', 'a.CSV.gz'])
+def test_another_ending_is_refused(table: LineOfSightTable, tmp_path: Path, name: str) -> None:
+    with pytest.raises(ProductError, match=f'{name}: ends neither in .csv'):
+        write_lookup_table(table, tmp_path / name)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,186 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Contradictions of priors and departures from the model, each with its number."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from random_pointings import displaced, estimated, HEIGHT, honesty, of_random_pointings, WIDTH  # type: ignore[import-not-found]
+
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import Scenario
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.model_checks import model_checks
+from starcal_ros.constants import SPEED_OF_LIGHT_M_S
+from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks
+
+CORNER_PX = float(np.hypot(WIDTH, HEIGHT)) / 2.0
+LIMIT_SIGMA = 5.0  # the gate's, of a held term
+WITHOUT_CX = ('fx', 'skew', 'fy', 'cy', 'distortion')
+
+
+def held(checks: ModelChecks, name: str) -> HeldTerm:
+    return next(term for term in checks.held if term.name == name)
+
+
+def amplitude(checks: ModelChecks, name: str) -> Amplitude:
+    return next(one for one in checks.amplitudes if one.name == name)
+
+
+def with_cx_off(given: Scenario, off_px: float) -> Scenario:
+    """The scenario with a true principal point that is off the prior."""
+    camera = given.truth.camera
+    moved = camera.replace(cx=float(given.prior.camera.parameters[3]) + off_px)
+    return dataclasses.replace(given, truth=dataclasses.replace(given.truth, camera=moved))
+
+
+@pytest.mark.slow
+def test_a_sound_camera_contradicts_nothing() -> None:
+    """Eight campaigns: no held term beyond 4.5 sigma, no likelihood ratio of a 1e-5 level."""
+    for seed in range(1, 9):
+        given = of_random_pointings(seed, images=6)
+        checks = model_checks(estimated(given, true_observations(given)))
+        assert {'cx', 'cy'} <= {term.name for term in checks.held}
+        assert all(term.significance < 4.5 for term in checks.held)
+        assert all(one.likelihood_ratio < 20.0 for one in checks.amplitudes)
+        assert checks.field_rms_px < 0.01 and checks.image_variation_px < 0.05
+
+
+def test_a_principal_point_that_is_held_where_it_is_not_is_named() -> None:
+    given = with_cx_off(of_random_pointings(8), 30.0)
+    cx = held(model_checks(estimated(given, true_observations(given), estimate=WITHOUT_CX)), 'cx')
+    assert cx.assumed == pytest.approx(given.prior.camera.parameters[3], abs=1e-9)
+    # One step from where a field has taken what it can: the side is right, not the size.
+    assert cx.significance > 2 * LIMIT_SIGMA and cx.estimated > cx.assumed + 5 * cx.sigma
+
+
+def test_a_prior_that_is_right_is_not_contradicted_and_a_weak_one_moves_nothing() -> None:
+    given = with_cx_off(of_random_pointings(8), 30.0)
+    cx = held(model_checks(estimated(given, true_observations(given))), 'cx')
+    assert cx.estimated - cx.assumed == pytest.approx(30.0, abs=1.5)  # the stars know it to 0.3 px
+    assert cx.sigma == pytest.approx(0.03 * WIDTH, rel=0.01)  # what the prior claims
+    assert cx.significance < 1.0
+
+
+@pytest.mark.parametrize('off_px', [30.0, -30.0])
+def test_a_narrow_prior_of_the_principal_point_that_is_wrong_is_named(off_px: float) -> None:
+    # A field of tenths of a pixel takes the shift on one side, and hid it from the check.
+    given = with_cx_off(of_random_pointings(8), off_px)
+    sigma_px = tuple(2.0 if k in (3, 4) else 0.0 for k in range(10))
+    found = estimated(given, true_observations(given), prior_sigma=sigma_px)
+    cx, cy = (held(model_checks(found), name) for name in ('cx', 'cy'))
+    assert cx.estimated - cx.assumed == pytest.approx(off_px, abs=1.5)
+    assert cx.significance > 2 * LIMIT_SIGMA and cy.significance < 3.0
+
+
+def with_velocity_off(ensemble: Ensemble, wrong_m_s: Floats) -> Ensemble:
+    """The ensemble with the aberration of a velocity that the observer does not have."""
+    images = []
+    for image in ensemble.images:
+        e = image.direction_icrf + wrong_m_s / SPEED_OF_LIGHT_M_S
+        e /= np.linalg.norm(e, axis=1)[:, None]
+        images.append(dataclasses.replace(image, direction_icrf=e))
+    return Ensemble(tuple(images))
+
+
+def unmoved(pixels: Floats) -> Floats:
+    return np.zeros_like(pixels)
+
+
+WRONG_M_S = 60e3 * np.array([0.6, 0.0, -0.8])  # twice the Earth's: its sign is wrong
+
+
+def test_a_velocity_off_its_prior_is_found_and_named() -> None:
+    given = of_random_pointings(9)
+    ensemble = with_velocity_off(true_observations(given), WRONG_M_S)
+    found = estimated(given, ensemble, velocity_sigma_m_s=8000.0)  # as without a topic
+    terms = [held(model_checks(found), f'velocity_{axis}_m_s') for axis in 'xyz']
+    assert max(term.significance for term in terms) > LIMIT_SIGMA
+    assert np.linalg.norm([term.estimated for term in terms] + WRONG_M_S) < 0.1 * 60e3
+    assert honesty(given, found, unmoved)[0] < 2.0
+
+
+def test_a_velocity_that_is_wrong_beyond_its_prior_is_in_the_sigma_and_named() -> None:
+    """Given to 10 m/s, 60 km/s off: a camera that changes between images takes its place."""
+    given = of_random_pointings(9)
+    ensemble = with_velocity_off(true_observations(given), WRONG_M_S)
+    found = estimated(given, ensemble)
+    checks = model_checks(found)
+    assert amplitude(checks, 'change from image to image').likelihood_ratio > 50.0
+    assert honesty(given, found, unmoved)[0] < 2.0
+    terms = [held(checks, f'velocity_{axis}_m_s') for axis in 'xyz']
+    assert np.linalg.norm([term.estimated for term in terms] + WRONG_M_S) < 0.1 * 60e3
+    assert max(term.significance for term in terms) > 4 * LIMIT_SIGMA
+
+
+def test_the_step_the_field_and_the_predictions_are_in_the_record() -> None:
+    given = of_random_pointings(6)
+
+    def ripple(pixels: Floats) -> Floats:
+        x, y = 4.0 * np.pi * pixels[:, 0] / WIDTH, 3.0 * np.pi * pixels[:, 1] / WIDTH
+        return 0.3 * np.stack([np.sin(x + 0.3) * np.cos(y), np.cos(x - y)], axis=-1)
+
+    checks = model_checks(estimated(given, displaced(true_observations(given), ripple)))
+    field = amplitude(checks, 'field')
+    assert field.likelihood_ratio > 100.0
+    # 0.15 px rms along u, 0.21 along v; the lens and the alignment take a part.
+    assert 0.08 < checks.field_rms_px < 0.25 < checks.field_worst_px < 1.5
+    assert 0.05 < field.value < 0.5
+    assert checks.step.p_value > 1e-6
+    assert checks.predictions
+
+
+def breathing(ensemble: Ensemble, scales: Floats) -> Ensemble:
+    """The ensemble with each image scaled about its middle."""
+    middle = np.array([WIDTH - 1, HEIGHT - 1]) / 2.0
+    images = tuple(
+        dataclasses.replace(
+            image, measured_px=image.measured_px + scale * (image.measured_px - middle)
+        )
+        for image, scale in zip(ensemble.images, scales, strict=True)
+    )
+    return Ensemble(images)
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_breathes_is_estimated_image_by_image() -> None:
+    given = of_random_pointings(9)
+    scales = np.random.default_rng(9).normal(size=12) * 3e-4  # a quarter of a pixel in a corner
+    ensemble = true_observations(given)
+    still = estimated(given, ensemble)
+    found = estimated(given, breathing(ensemble, scales))
+    checks = model_checks(found)
+    change = amplitude(checks, 'change from image to image')
+    assert change.likelihood_ratio > 100.0
+    assert amplitude(model_checks(still), change.name).likelihood_ratio < 15.0
+    focal_px = float(found.geometry.camera.parameters[0])
+    assert checks.image_variation_px == pytest.approx(scales.std() * CORNER_PX, rel=0.5)
+    # The shapes are those that were made, but for what the mean of twelve takes.
+    shown = found.posterior.of_images[:, 3] / focal_px
+    np.testing.assert_allclose(shown - shown.mean(), scales - scales.mean(), atol=4e-5)
+    # The scale varies, the others do not.
+    scale_px, *others_px = found.posterior.shape_sigma_px
+    assert max(others_px) < 0.1 * scale_px
+    # The camera of one image scatters by that about the mean, which adds 1 in 12 of the variance;
+    # what neighbours may share comes to it.
+    assert 1.0 < found.covariance[0, 0] / scale_px**2 * 12.0 < 15.0
+    # What is left of the stars is their noise again.
+    np.testing.assert_allclose(
+        found.residual_px[found.kept].std(), still.residual_px[still.kept].std(), rtol=0.02
+    )
+
+
+def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
+    """Three images with stars in a third of the detector show one component to 700 km/s."""
+    given = of_random_pointings(9, images=3)
+    images = []
+    for image in true_observations(given).images:
+        off_px = np.abs(image.measured_px - [WIDTH / 2, HEIGHT / 2]).max(axis=1)
+        images.append(image.select(off_px < 200.0))
+    found = estimated(
+        given, Ensemble(tuple(images)), method='per_image', velocity_sigma_m_s=8000.0
+    )
+    names = {term.name for term in model_checks(found).held if 'velocity' in term.name}
+    assert names == {'velocity_x_m_s', 'velocity_y_m_s'}

@@ -1,0 +1,40 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The one table of remedies: each name is given by something, each option in a text exists."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+import pytest
+
+import starcal_ros
+from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.options import names_of
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.setup import OPTION_CLASSES
+from starcal_ros.records import IMAGE_REFUSALS
+
+OPTIONS = names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
+ROOT = Path(starcal_ros.__file__).parents[1]
+SOURCE = '\n'.join(
+    path.read_text()
+    for package in ('starcal_ros', 'starcal_ground')
+    for path in (ROOT / package).rglob('*.py')
+    if path.name != 'remedies.py'
+)
+
+
+@pytest.mark.parametrize('name', REMEDIES)
+def test_each_name_is_a_refusal_a_check_an_assumption_or_a_cause(name: str) -> None:
+    is_written = f"'{name}'" in SOURCE or f'"{name}"' in SOURCE
+    assert name in {*IMAGE_REFUSALS, *OPTIONS} or name.startswith('assumed ') or is_written
+
+
+@pytest.mark.parametrize('name', REMEDIES)
+def test_the_options_of_a_remedy_exist(name: str) -> None:
+    assert set(re.findall(r'\b[a-z]\w*_\w+', REMEDIES[name])) <= OPTIONS
+
+
+def test_no_other_module_has_a_table_of_remedies() -> None:
+    assert not re.findall(r'^_?(?:REMED|MEASURES)\w* = \{', SOURCE, re.MULTILINE)

@@ -1,0 +1,198 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Calibration with every lens model: exact without noise, within the reported covariance with."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from random_pointings import displaced, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import Scenario, scenario
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment.observability import map_error_px
+from starcal_ros.camera import CameraModel, pixel_grid, project_jacobians
+from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
+from starcal_ros.records import CameraGeometry, Ensemble
+
+#           k1   k2    k3    p1     p2     k4    k5   k6
+RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]
+PRISM = [2e-3, -1e-3, -1.5e-3, 5e-4]
+LENSES = {
+    'plumb_bob': [-0.2, 0.08, -0.01, 1e-3, -7e-4],
+    'rational_polynomial': RATIONAL,
+    'thin_prism': [*RATIONAL, *PRISM],
+    'tilted': [*RATIONAL, *PRISM, 0.02, -0.03],
+    'equidistant': [-0.02, 0.01, -0.004, 5e-4],
+}
+# Tens of degrees: in a narrow field the terms of these models cannot be told apart.
+FOCAL_PX = 420.0
+# On a field of 66 degrees the higher terms of the large models still trade with each other: they
+# are held at the truth.
+ESTIMATE = {
+    'plumb_bob': ('fx', 'skew', 'fy', 'distortion'),
+    'rational_polynomial': ('fx', 'skew', 'fy', 'k1', 'k2', 'p1', 'p2', 'k4'),
+    'thin_prism': ('fx', 'skew', 'fy', 'k1', 'k2', 'p1', 'p2', 's1', 's3'),
+    'tilted': ('fx', 'skew', 'fy', 'k1', 'k2', 'tau_x', 'tau_y'),
+    'equidistant': ('fx', 'skew', 'fy', 'distortion'),
+}
+each_model = pytest.mark.parametrize('model', COEFFICIENTS)
+
+
+def wide(model: str, seed: int = 3) -> Scenario:
+    """The tiny scenario with a wide lens of a model, and a prior that is off."""
+    tiny = scenario('tiny', seed=seed)
+    camera = tiny.truth.camera
+    parameters = np.r_[FOCAL_PX, 0.3, FOCAL_PX + 1.0, camera.parameters[3:5], LENSES[model]]
+    truth = dataclasses.replace(
+        tiny.truth, camera=CameraModel(camera.width, camera.height, parameters, model)
+    )
+    return dataclasses.replace(tiny, truth=truth, magnitude_limit=5.5)
+
+
+def prior_of(made: Scenario, model: str) -> CameraGeometry:
+    """Focal length 2 % off, the estimated coefficients by a fifth, the mounting by 0.1 degrees."""
+    off = Rotation.from_euler('xyz', [0.1, -0.1, 0.05], degrees=True)
+    mounting = Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw) * off
+    parameters = made.truth.camera.parameters.copy()
+    names = made.truth.camera.parameter_names
+    options = CalibrationOptions(estimate=ESTIMATE[model])
+    for name in estimated_parameters(options, model):
+        parameters[names.index(name)] *= 1.02 if name in ('fx', 'fy') else 0.8
+    camera = dataclasses.replace(made.truth.camera, parameters=parameters)
+    return CameraGeometry(camera, mounting.as_quat())
+
+
+def estimate_of(made: Scenario, model: str, ensemble: Ensemble, **other: object) -> Estimate:
+    options = CalibrationOptions(
+        estimate=ESTIMATE[model],
+        star_tracker_sigma_arcsec=made.star_tracker_sigma_arcsec,
+        **other,  # type: ignore[arg-type]
+    )
+    return estimate_calibration(ensemble, prior_of(made, model), options)
+
+
+@each_model
+def test_without_noise_the_truth_comes_back(model: str) -> None:
+    made = wide(model)
+    ensemble = true_observations(made, centroid_noise=False, attitude_noise=False)
+    found = estimate_of(made, model, ensemble)
+    assert found.termination == 'converged' and found.kept.all()
+    assert np.abs(found.residual_px).max() < 1e-6
+    assert map_error_px(found.geometry.camera, made.truth.camera) < 1e-6
+    held = np.setdiff1d(
+        np.arange(len(found.linear.problem.prior_parameters)), found.linear.problem.free
+    )
+    before, after = found.linear.problem.prior_parameters, found.geometry.camera.parameters
+    np.testing.assert_array_equal(after[held], before[held])
+
+
+@pytest.mark.slow
+@each_model
+def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
+    squares, count = 0.0, 0
+    for seed in range(4):
+        made = wide(model, seed)
+        ensemble = true_observations(made)
+        found = estimate_of(made, model, ensemble)
+        p = len(found.geometry.camera.parameters)
+        assert found.covariance.shape == (p + 3, p + 3)
+        free = [*found.linear.problem.free, p, p + 1, p + 2]
+        turn = (
+            Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
+            * Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw)
+        ).as_rotvec()
+        error = np.r_[found.geometry.camera.parameters - made.truth.camera.parameters, turn][free]
+        covariance = found.covariance[np.ix_(free, free)]
+        sigma = np.sqrt(np.diag(covariance))
+        whitened = np.linalg.solve(
+            np.linalg.cholesky(covariance / np.outer(sigma, sigma)), error / sigma
+        )
+        squares, count = squares + float(whitened @ whitened), count + len(free)
+        camera = found.geometry.camera
+        pixels = pixel_grid(camera, 25, 20)
+        table = line_of_sight_table(camera, found.map_covariance, pixels)
+        assert (table.sigma_arcsec > 0).all()
+    # Chi^2 with `count` degrees of freedom, 5 sigma on either side.
+    assert abs(squares / count - 1.0) < 5 * np.sqrt(2 / count)
+
+
+@each_model
+def test_blocks_equal_the_dense_normal_matrices(model: str) -> None:
+    made = wide(model)
+    ensemble = true_observations(made)
+    table = star_table(ensemble.images)
+    camera = made.truth.camera
+    star_tracker_from_icrf = Rotation.from_quat(
+        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
+    ).inv()
+    alignment = Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
+    rotations = (alignment * star_tracker_from_icrf).as_matrix()
+    everything = np.ones(len(table), bool)
+    measurements = arrange(table, everything, table.covariance_px2)
+    cost, blocks = normal_blocks(measurements, model, camera.parameters, rotations)
+    pixels, J_parameters, J_rotation = project_jacobians(
+        camera, np.einsum('nij,nj->ni', rotations[table.image], table.direction_icrf)
+    )
+    residual = (table.measured_px - pixels)[..., None]
+    J = np.concatenate([J_parameters, J_rotation, residual], axis=-1)
+    uu, uv, vv = table.covariance_px2.T
+    W = np.linalg.inv(np.array([[uu, uv], [uv, vv]]).transpose(2, 0, 1))
+    products = np.swapaxes(J, 1, 2) @ W @ J
+    dense = np.zeros_like(blocks)
+    np.add.at(dense, table.image, products)
+    unit = 1 / np.sqrt(np.einsum('mii->mi', dense))
+    scaled = (blocks - dense) * unit[:, :, None] * unit[:, None, :]
+    # Sums of some hundred products in another order.
+    np.testing.assert_allclose(scaled, 0.0, rtol=0, atol=1e-11)
+    assert cost == pytest.approx(0.5 * dense[:, -1, -1].sum(), rel=1e-12)
+    # Parameters of each image, as where temperature changes them, are the same numbers.
+    own = np.tile(camera.parameters, (len(rotations), 1))
+    each_cost, each = normal_blocks(measurements, model, own, rotations)
+    assert each_cost == pytest.approx(cost, rel=1e-12)
+    np.testing.assert_allclose(
+        (each - blocks) * unit[:, :, None] * unit[:, None, :], 0, atol=1e-11
+    )
+
+
+@pytest.mark.parametrize(
+    ('options', 'says'),
+    [
+        ({'estimate': ('fx', 'p1')}, 'estimate: p1 is not a parameter of the lens model equidist'),
+        ({'prior_sigma': (0.0,) * 10}, 'prior_sigma: 10 numbers, but the lens model equidistant'),
+    ],
+)
+def test_options_of_another_model_are_refused(options: dict[str, object], says: str) -> None:
+    made = wide('equidistant')
+    chosen = CalibrationOptions(**options)  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match=says):
+        estimate_calibration(true_observations(made), made.truth, chosen)
+
+
+def test_a_prior_sigma_of_every_parameter() -> None:
+    made = wide('equidistant')
+    tight = (1e-3, 1e-3, 1e-3, 0.0, 0.0, 1e-6, 1e-6, 1e-6, 1e-6)
+    chosen = CalibrationOptions(prior_sigma=tight, velocity_sigma_m_s=10.0)
+    found = estimate_calibration(true_observations(made), made.truth, chosen)
+    sigma = np.sqrt(np.diag(found.covariance))[[1, 5, 6, 7, 8]]
+    assert (sigma <= np.array(tight)[[1, 5, 6, 7, 8]]).all()
+    # A change that lasts over all images may be in the focal length: 0.01 px at most here.
+    assert (np.sqrt(np.diag(found.covariance))[[0, 2]] < 0.01).all()
+
+
+def test_mirrored_images_are_named() -> None:
+    given = of_random_pointings(3, images=6)
+
+    def mirrored(pixels: Floats) -> Floats:
+        return np.stack([WIDTH - 1 - 2.0 * pixels[:, 0], 0.0 * pixels[:, 1]], axis=-1)
+
+    with pytest.raises(TooFewObservations, match='^the stars are those of a mirrored image'):
+        estimated(given, displaced(true_observations(given), mirrored))

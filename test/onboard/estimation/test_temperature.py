@@ -1,0 +1,368 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Temperature terms: recovery, errors within sigma, and terms that are none."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import scenario
+from starcal_ros.assessment.observability import (
+    estimated_names,
+    keep_most_informative,
+    predicted_sigma,
+)
+from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.estimation import temperature
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.problem import METHODS
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    CameraGeometry,
+    Ensemble,
+    StarObservations,
+    TemperatureTerms,
+)
+
+SCENARIO = scenario('tiny', seed=3)
+TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
+TRACKER_ARCSEC = (10.0, 10.0, 40.0)
+FREE = [
+    PARAMETER_NAMES.index(name) for name in estimated_parameters(CalibrationOptions(), 'plumb_bob')
+]
+REFERENCE_DEGC = 15.0
+TEMPERATURES_DEGC = np.array([-20.0, 12.0, -5.0, 31.0, 3.0, 40.0, -14.0, 22.0, 9.0, 35.0])
+# A lens of a few 10^-5 per degree (0.4 px at the edge over 60 degrees), and a mount that turns by
+# arcseconds per degree.
+FOCAL = (4e-5, 6e-7)
+RATE_RAD = np.array([4.0, -6.0, 20.0]) * ARCSECOND_RAD
+TRIALS = 40
+
+
+def camera_of(temperature_degc: float, focal: tuple[float, ...]) -> CameraModel:
+    """The true camera at a temperature."""
+    dT = temperature_degc - REFERENCE_DEGC
+    factor = 1.0 + sum(a * dT ** (k + 1) for k, a in enumerate(focal))
+    fx, skew, fy = TRUTH.camera.parameters[:3] * factor
+    return TRUTH.camera.replace(fx=fx, skew=skew, fy=fy)
+
+
+def alignment_of(temperature_degc: float, rate_rad: np.ndarray) -> Rotation:
+    """True camera_from_star_tracker at a temperature: a passive rotation from the reference."""
+    dT = temperature_degc - REFERENCE_DEGC
+    turn = Rotation.from_rotvec(-rate_rad * dT)
+    return turn * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv()
+
+
+@functools.cache
+def stars() -> tuple[StarObservations, ...]:
+    """Ten images with every third star, of a camera that does not change."""
+    images = true_observations(SCENARIO, centroid_noise=False, attitude_noise=False).images
+    return tuple(image.select(np.arange(len(image)) % 3 == 0) for image in images)
+
+
+def observed(
+    focal: tuple[float, ...] = FOCAL,
+    rate_rad: np.ndarray = RATE_RAD,
+    temperatures_degc: np.ndarray = TEMPERATURES_DEGC,
+    seed: int | None = None,
+    tracker_arcsec: tuple[float, ...] = TRACKER_ARCSEC,
+) -> Ensemble:
+    """Observations with the temperature-dependent camera; noise if a seed is given."""
+    rng = np.random.default_rng(seed)
+    images = []
+    for image, degc in zip(stars(), temperatures_degc, strict=True):
+        icrf_from_star_tracker = Rotation.from_quat(image.icrf_from_star_tracker_xyzw)
+        camera_from_icrf = alignment_of(degc, rate_rad) * icrf_from_star_tracker.inv()
+        pixels = project(camera_of(degc, focal), camera_from_icrf.apply(image.direction_icrf))
+        if seed is not None:
+            uu, uv, vv = image.covariance_px2.T
+            L = np.linalg.cholesky(np.array([[uu, uv], [uv, vv]]).transpose(2, 0, 1))
+            pixels = pixels + np.einsum('nij,nj->ni', L, rng.normal(size=pixels.shape))
+            error = rng.normal(size=3) * np.array(tracker_arcsec) * ARCSECOND_RAD
+            icrf_from_star_tracker = icrf_from_star_tracker * Rotation.from_rotvec(error)
+        images.append(
+            dataclasses.replace(
+                image,
+                measured_px=pixels,
+                icrf_from_star_tracker_xyzw=icrf_from_star_tracker.as_quat(),
+                temperature_degc=float(degc),
+            )
+        )
+    return Ensemble(tuple(images))
+
+
+def options(method: str = 'hierarchical', order: int = 2, **other: object) -> CalibrationOptions:
+    values: dict[str, object] = {
+        # Of a method that takes the star tracker as perfect, a perfect one.
+        'star_tracker_sigma_arcsec': (1e-3,) * 3 if method == 'single' else TRACKER_ARCSEC,
+        'star_tracker_slow_arcsec': 0.1,
+        'velocity_sigma_m_s': 10.0,
+        'focal_temperature_order': order,
+        'alignment_temperature': method != 'per_image',
+        'reference_temperature_degc': REFERENCE_DEGC,
+        **other,
+    }
+    return CalibrationOptions(method=method, **values)  # type: ignore[arg-type]
+
+
+def found(ensemble: Ensemble, chosen: CalibrationOptions) -> tuple[Estimate, TemperatureTerms]:
+    estimate = estimate_calibration(ensemble, PRIOR, chosen)
+    assert estimate.termination == 'converged'
+    assert estimate.thermal is not None
+    return estimate, estimate.thermal
+
+
+def error_of(estimate: Estimate) -> np.ndarray:
+    """Camera and alignment at the reference less the truth: (13,), angles in rad."""
+    one, true = (
+        Rotation.from_quat(g.star_tracker_from_camera_xyzw) for g in (estimate.geometry, TRUTH)
+    )
+    parameters = estimate.geometry.camera.parameters - TRUTH.camera.parameters
+    return np.asarray(np.r_[parameters, -(one.inv() * true).as_rotvec()])
+
+
+@pytest.mark.parametrize('focal', [(), (3e-5,), (3e-5, -2e-7)])
+def test_derivatives_by_camera_and_focal_terms(focal: tuple[float, ...]) -> None:
+    above_k = np.array([-30.0, 0.0, 12.0])
+    x = np.r_[TRUTH.camera.parameters, focal]
+    chain = temperature.parameters_chain(x[:10], x[10:], above_k)
+    assert chain.shape == (3, 10, 10 + len(focal))
+    for k in range(len(x)):
+        # Bilinear: a central difference is exact, but for the rounding of parameters of 2000.
+        step = np.eye(len(x))[k] * 1e-3 * max(abs(x[k]), 1e-3)
+        high, low = (
+            temperature.parameters_at((x + s)[:10], (x + s)[10:], above_k) for s in (step, -step)
+        )
+        numerical = (high - low) / (2 * step[k])
+        np.testing.assert_allclose(chain[:, :, k], numerical, rtol=1e-6, atol=1e-6)
+
+
+def test_derivatives_by_alignment_and_its_rate() -> None:
+    above_k = np.array([-30.0, 0.0, 12.0])
+    rate = np.array([2.0, -1.0, 3.0]) * 1e-5
+    chain = temperature.turns_chain(rate, above_k)
+    for k in range(6):
+        step = 1e-6
+        angles, more = np.split(np.eye(6)[k] * step, 2)
+        before = temperature.turns(rate, above_k)
+        after = temperature.turns(rate + more, above_k) * Rotation.from_rotvec(-angles)
+        turned = -(after * before.inv()).as_rotvec() / step
+        # The series ends at a twelfth of the squared turn: (1e-3)^2 / 12 of 30 degrees.
+        np.testing.assert_allclose(chain[:, :, k], turned, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('order', [1, 2])
+def test_without_noise_the_truth_comes_back(method: str, order: int) -> None:
+    rate = np.zeros(3) if method == 'per_image' else RATE_RAD
+    estimate, terms = found(observed(FOCAL[:order], rate), options(method, order))
+    assert estimate.kept.all() and terms.note == ''
+    assert terms.reference_degc == REFERENCE_DEGC
+    fx, edge = TRUTH.camera.parameters[0], 0.23 * TRUTH.camera.parameters[0]
+    # 1e-6 px at the edge of the field: residuals are of 1e-9 px.
+    error = error_of(estimate)
+    assert np.abs(error[:5]).max() < 1e-6 and np.abs(error[10:] * fx).max() < 1e-6
+    dT = np.abs(TEMPERATURES_DEGC - REFERENCE_DEGC).max()
+    for k, (got, true) in enumerate(zip(terms.focal_per_degc, FOCAL[:order], strict=True), 1):
+        assert abs(got - true) * dT**k * edge < 1e-6
+    if method != 'per_image':
+        rate_found = np.array(terms.alignment_rate_rad_per_degc)
+        assert np.abs(rate_found - RATE_RAD).max() * dT * fx < 1e-6
+    assert np.abs(estimate.residual_px).max() < 1e-7
+    assert len(estimate.information) == len(estimate.information_names)
+    # Each name has its own row: the sigmas of the terms are those of the whole covariance.
+    sigma = dict(
+        zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
+    )
+    degrees = range(1, order + 1)
+    assert terms.focal_per_degc_sigma == tuple(sigma[f'focal_temperature_{k}'] for k in degrees)
+    rate_names = [f'{name}_temperature' for name in ALIGNMENT_NAMES if method != 'per_image']
+    assert terms.alignment_rate_rad_per_degc_sigma == tuple(sigma[name] for name in rate_names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('method', METHODS)
+def test_the_reported_sigmas_are_true(method: str) -> None:
+    tracker = (0.0, 0.0, 0.0) if method == 'single' else TRACKER_ARCSEC
+    rate_rad = np.zeros(3) if method == 'per_image' else RATE_RAD
+    rows = [*FREE, 10, 11, 12]
+    camera, focal, rate = [], [], []
+    for seed in range(TRIALS):
+        estimate, terms = found(observed(FOCAL, rate_rad, seed=seed, tracker_arcsec=tracker),
+                                options(method))  # fmt: skip
+        assert len(terms.focal_per_degc) == 2, terms.note
+        scale = np.sqrt(np.diag(estimate.covariance))[rows]
+        C = estimate.covariance[np.ix_(rows, rows)] / np.outer(scale, scale)
+        error = error_of(estimate)[rows] / scale
+        camera.append(error @ np.linalg.solve(C, error))
+        focal.append((np.array(terms.focal_per_degc) - FOCAL) / terms.focal_per_degc_sigma)
+        if method != 'per_image':
+            got = np.array(terms.alignment_rate_rad_per_degc)
+            rate.append((got - RATE_RAD) / terms.alignment_rate_rad_per_degc_sigma)
+    # The field and the changes of the camera that ten images do not exclude are in the sigma: it
+    # is up to a quarter larger than the errors of a sound camera.
+    low, high = chi2.ppf([0.005, 0.995], len(rows) * TRIALS) / TRIALS
+    assert low / 1.5 < np.mean(camera) < high
+    low, high = chi2.ppf([0.005, 0.995], TRIALS) / TRIALS
+    for errors in (focal, rate):
+        for mean in np.mean(np.square(errors), axis=0) if errors else ():
+            assert low / 1.5 < mean < high
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_temperatures_that_nobody_asks_for_change_no_bit(method: str) -> None:
+    plain = options(method, order=0, alignment_temperature=False)
+    warm = observed((), np.zeros(3), seed=1)
+    unknown = Ensemble(
+        tuple(dataclasses.replace(i, temperature_degc=float('nan')) for i in warm.images)
+    )
+    one, other = (estimate_calibration(e, PRIOR, plain) for e in (warm, unknown))
+    assert one.thermal is None
+    # Asked for, but not to be had: said, and the same numbers.
+    third, terms = found(unknown, options(method))
+    assert terms.note == 'left out: 10 of 10 images have no temperature'
+    for estimate in (other, third):
+        assert estimate.geometry.camera.parameters.tobytes() == (
+            one.geometry.camera.parameters.tobytes()
+        )
+        assert estimate.covariance.tobytes() == one.covariance.tobytes()
+        assert estimate.information.tobytes() == one.information.tobytes()
+
+
+@pytest.mark.parametrize(
+    ('temperatures', 'note'),
+    [
+        (np.where(np.arange(10) == 4, np.nan, TEMPERATURES_DEGC), '1 of 10 images have no temp'),
+        (np.linspace(20.0, 21.0, 10), 'the temperatures spread by 0.32 degC, less than 1'),
+        (np.repeat([0.0, 30.0], 5), '2 temperatures do not determine a polynomial of degree 2'),
+    ],
+)
+def test_what_the_images_do_not_carry_is_left_out(temperatures: np.ndarray, note: str) -> None:
+    ensemble = observed((), np.zeros(3), np.nan_to_num(temperatures), seed=1)
+    ensemble = Ensemble(
+        tuple(
+            dataclasses.replace(image, temperature_degc=float(degc))
+            for image, degc in zip(ensemble.images, temperatures, strict=True)
+        )
+    )
+    _, terms = found(ensemble, options())
+    assert not terms.focal_per_degc and not terms.alignment_rate_rad_per_degc
+    assert note in terms.note
+
+
+def test_terms_that_are_none_stay_within_their_sigma() -> None:
+    """What is asked for is estimated: no test of significance decides."""
+    for focal, rate_rad in ((FOCAL[:1], RATE_RAD), ((), np.zeros(3))):
+        _, terms = found(observed(focal, rate_rad, seed=1), options())
+        assert terms.note == ''
+        off = (np.array(terms.focal_per_degc) - [*focal, *[0.0] * (2 - len(focal))]) / np.array(
+            terms.focal_per_degc_sigma
+        )
+        off_rate = (np.array(terms.alignment_rate_rad_per_degc) - rate_rad) / np.array(
+            terms.alignment_rate_rad_per_degc_sigma
+        )
+        assert max(np.abs(off).max(), np.abs(off_rate).max()) < 4.0
+
+
+def test_a_changing_camera_fits_only_where_it_is_asked_for() -> None:
+    noisy = observed(seed=1)
+    estimate, _ = found(noisy, options())
+    plain = options(order=0, alignment_temperature=False)
+    without = estimate_calibration(noisy, PRIOR, plain)
+    rms, more = (np.sqrt(np.mean(e.residual_px[e.kept] ** 2)) for e in (estimate, without))
+    assert estimate.variance_factor == pytest.approx(1.0, abs=0.1)
+    # Without the terms the images have shapes of their own, and the camera is known less well.
+    assert without.posterior.shape.likelihood_ratio > 50.0
+    assert estimate.posterior.shape.likelihood_ratio < 15.0
+    assert more == pytest.approx(rms, rel=0.02)
+    assert without.covariance[0, 0] > 4 * estimate.covariance[0, 0]
+
+
+@pytest.mark.parametrize('method', ['hierarchical', 'per_image'])
+def test_the_prediction_accounts_for_the_terms(method: str) -> None:
+    rate_rad = np.zeros(3) if method == 'per_image' else RATE_RAD
+    # With the principal point held: where it trades with an alignment that rotates, as in
+    # `single`, the sigma of the rate depends on the rate, which a prediction takes as zero.
+    estimate_names = ('fx', 'skew', 'fy', 'distortion')
+    chosen = options(method, variance_components=False, estimate=estimate_names)
+    ensemble = observed(FOCAL, rate_rad)
+    estimate, terms = found(ensemble, chosen)
+    assert terms.note == ''
+    sigma = dict(
+        zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
+    )
+    names = estimated_names(chosen, 'plumb_bob')
+    asked = estimated_parameters(chosen, 'plumb_bob')
+    assert set(names) == {n for n in sigma if n not in PARAMETER_NAMES or n in asked}
+    predicted = dict(zip(names, predicted_sigma(ensemble, TRUTH, chosen), strict=True))
+    # A field and changes of the camera that the stars do not exclude are no part of a prediction.
+    of_camera = [name for name in names if 'alignment' not in name]
+    for name in of_camera:
+        assert predicted[name] == pytest.approx(sigma[name], rel=0.25), name
+    # They cost something, and what they cost is predicted.
+    plain = dataclasses.replace(chosen, focal_temperature_order=0, alignment_temperature=False)
+    assert predicted['fx'] > 1.02 * predicted_sigma(ensemble, TRUTH, plain)[names.index('fx')]
+
+
+def test_terms_that_the_images_do_not_carry_are_infinite_and_cost_nothing() -> None:
+    chosen, plain = options(), options(order=0, alignment_temperature=False)
+    ensemble = observed(FOCAL, RATE_RAD, np.full(10, 15.0))
+    names, sigma = estimated_names(chosen, 'plumb_bob'), predicted_sigma(ensemble, TRUTH, chosen)
+    of_temperature = np.array(['temperature' in name for name in names])
+    assert of_temperature.sum() == 5 and np.isinf(sigma[of_temperature]).all()
+    np.testing.assert_array_equal(sigma[~of_temperature], predicted_sigma(ensemble, TRUTH, plain))
+
+
+def test_images_that_tell_of_the_temperature_are_kept() -> None:
+    temperatures = np.array([15.0, 14.0, 40.0, 16.0, 15.5, -20.0, 14.5, 15.2, 13.0, 15.7])
+    ensemble = observed(FOCAL[:1], RATE_RAD, temperatures)
+    chosen = options(order=1, max_images=4)
+    plain = dataclasses.replace(chosen, focal_temperature_order=0, alignment_temperature=False)
+    kept, without = (keep_most_informative(ensemble, TRUTH, o) for o in (chosen, plain))
+    assert {40.0, -20.0} <= {image.temperature_degc for image in kept.images}
+    assert not {40.0, -20.0} <= {image.temperature_degc for image in without.images}
+
+
+def test_per_image_has_no_rate() -> None:
+    with pytest.raises(OptionError, match='alignment_temperature: the method per_image'):
+        estimate_calibration(observed(), PRIOR, options('per_image', alignment_temperature=True))
+
+
+def test_the_camera_at_a_temperature() -> None:
+    terms = TemperatureTerms(
+        REFERENCE_DEGC, FOCAL, (1e-6, 1e-8), tuple(RATE_RAD.tolist()), (1e-6,) * 3
+    )
+    for degc in (-20.0, REFERENCE_DEGC, 35.0):
+        got = temperature.geometry_at(TRUTH, terms, degc)
+        np.testing.assert_allclose(
+            got.camera.parameters, camera_of(degc, FOCAL).parameters, rtol=1e-15
+        )
+        turn = Rotation.from_quat(got.star_tracker_from_camera_xyzw) * alignment_of(degc, RATE_RAD)
+        assert turn.magnitude() < 1e-15
+    assert temperature.geometry_at(
+        TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0
+    ) == CameraGeometry(TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw)
+    assert temperature.geometry_at(TRUTH, None, 50.0) is TRUTH
+
+
+def test_the_summary_is_a_line() -> None:
+    terms = TemperatureTerms(
+        20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
+    )
+    assert temperature.summary(terms) == (
+        'a1 +0.0000400 (0.000001) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
+        'arcsec/degC; reference 20 degC; left out: this'
+    )
+    assert temperature.summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'
+    both = TemperatureTerms(20.0, (4e-5, 2e-6), (1e-6, 1e-7))
+    assert '; a2 +0.00000200 (0.0000001) /degC^2;' in temperature.summary(both)

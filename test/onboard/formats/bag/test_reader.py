@@ -1,0 +1,450 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Bags: round trips, independent readers and writers, damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+import subprocess
+import sys
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Footer
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+import yaml
+
+from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.formats.bag import reader as bag_reader
+from starcal_ros.formats.bag import writer as writer_module
+from starcal_ros.formats.bag.frames import read_telemetry
+from starcal_ros.formats.bag.mcap_reader import Damage
+from starcal_ros.formats.bag.reader import Topics
+from starcal_ros.formats.bag.typestore import make_message, typestore
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.image_messages import color_image_to_message, image_to_message
+from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPE,
+    CALIBRATION_TYPE,
+    IMAGE_TYPE,
+    stamp_ns,
+)
+from starcal_ros.records import Image, refused_image, StarObservations
+from starcal_ros.sky.attitude import AttitudeHistory
+
+SHARED = Path(__file__).parents[5] / 'shared'  # inputs from elsewhere, not part of the tree
+START_NS = 1_700_000_000_000_000_000
+SECOND_NS = 10**9
+
+
+def write_bag(path: Path, images: int = 6, size: int = 600) -> Path:
+    """Write a bag of noise images, one a second, with two attitudes about each."""
+    random = np.random.default_rng(1)
+    with BagWriter(path) as writer:
+        for k in range(images):
+            time_ns = START_NS + k * SECOND_NS
+            pixels = random.integers(0, 4096, (size, size + 2)).astype(np.uint16)
+            half = np.array([0.0, np.sin(k / 9), 0.0, np.cos(k / 9)])
+            writer.write_attitude('/attitude', time_ns - 100, half, 'icrf')
+            writer.write_image('/image', Image(time_ns, pixels), 'camera')
+            writer.write_attitude('/attitude', time_ns + 100, half, 'icrf')
+            record = refused_image(time_ns, size + 2, size, 'no_stars', str(k))
+            writer.write_observations('/observations', record, 'camera')
+            writer.write_velocity('/velocity', time_ns, np.array([k, 2.0, 3e4]), 'icrf')
+            writer.write_temperature('/temperature', time_ns, 20.0 - k, 'camera')
+    return path
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An intact bag folder."""
+    return write_bag(tmp_path_factory.mktemp('bag') / 'six')
+
+
+def images_of(path: Path, **options: Any) -> list[Image | StarObservations]:
+    """All images of a bag."""
+    return list(bag_reader.read_images([path], '/image', **options))
+
+
+def attitudes_of(path: Path, on_damage: Damage, topic: str = '/attitude') -> AttitudeHistory:
+    """All attitudes of a bag."""
+    return read_telemetry([path], Topics('', topic), on_damage=on_damage).attitudes
+
+
+@pytest.mark.parametrize('compression', CompressionType)
+@pytest.mark.parametrize('name', ['b', 'b.mcap'])
+def test_round_trip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType, name: str
+) -> None:
+    """Records survive writing and reading, as a folder and as a file, however compressed."""
+    monkeypatch.setattr(writer_module, '_COMPRESSION', compression)
+    path = write_bag(tmp_path / name)
+    assert (tmp_path / name).is_file() == name.endswith('.mcap')
+    images = images_of(path)
+    random = np.random.default_rng(1)
+    assert len(images) == 6
+    for k, image in enumerate(images):
+        assert isinstance(image, Image)
+        assert image.time_ns == START_NS + k * SECOND_NS
+        np.testing.assert_array_equal(image.pixels, random.integers(0, 4096, (600, 602)))
+    telemetry = read_telemetry([path], Topics('', '/attitude', '/velocity', '/temperature'))
+    attitudes = telemetry.attitudes
+    assert len(attitudes) == 12
+    xyzw, gap_s = attitudes.at(START_NS + SECOND_NS, max_gap_s=1.0)
+    np.testing.assert_allclose(xyzw, [0, np.sin(1 / 9), 0, np.cos(1 / 9)], atol=1e-15)
+    assert gap_s == pytest.approx(2e-7)
+    details = [record.detail for record in bag_reader.read_observations([path], '/observations')]
+    assert details == list('012345')
+    velocities = telemetry.velocities
+    assert velocities[5][0] == START_NS + 5 * SECOND_NS
+    np.testing.assert_array_equal(velocities[5][1], [5.0, 2.0, 3e4])
+    temperatures = telemetry.temperatures
+    assert temperatures[5] == (START_NS + 5 * SECOND_NS, 15.0)
+
+
+def test_same_records_same_bytes(tmp_path: Path, folder: Path) -> None:
+    """Writing is deterministic, file and metadata alike."""
+    again = write_bag(tmp_path / 'six')
+    for file in sorted(folder.iterdir()):
+        assert file.read_bytes() == (again / file.name).read_bytes()
+
+
+def stamped(reader: AnyReader, data: bytes, type_name: str) -> Any:
+    """Return a message decoded by rosbags, untyped."""
+    return reader.deserialize(data, type_name)
+
+
+def test_read_by_rosbags(folder: Path) -> None:
+    """An independent reader finds every message, its type and its stamp."""
+    with AnyReader([folder]) as reader:
+        assert reader.message_count == 36
+        image = next(c for c in reader.connections if c.topic == '/image')
+        assert image.msgtype == 'sensor_msgs/msg/Image'
+        found = [
+            (time_ns, stamp_ns(stamped(reader, data, c.msgtype).header.stamp))
+            for c, time_ns, data in reader.messages([image])
+        ]
+        assert found == [(START_NS + k * SECOND_NS,) * 2 for k in range(6)]
+        observations = next(c for c in reader.connections if c.topic == '/observations')
+        data = next(iter(reader.messages([observations])))[2]
+        assert stamped(reader, data, observations.msgtype).detail == '0'
+
+
+def test_metadata_for_rosbag2(folder: Path) -> None:
+    """Profile, encodings, offered QoS, type hashes and metadata.yaml are written."""
+    with next(folder.glob('*.mcap')).open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+    assert summary is not None
+    assert {c.message_encoding for c in summary.channels.values()} == {'cdr'}
+    assert {s.encoding for s in summary.schemas.values()} == {'ros2msg'}
+    for channel in summary.channels.values():
+        (profile,) = yaml.safe_load(channel.metadata['offered_qos_profiles'])
+        assert profile['reliability'] == 'reliable'
+        assert channel.metadata['topic_type_hash'].startswith('RIHS01_')
+    schema = next(s for s in summary.schemas.values() if s.name.endswith('StarObservations'))
+    for part in (b'MSG: std_msgs/Header', b'MSG: geometry_msgs/Quaternion', b'catalog_digest'):
+        assert part in schema.data
+    text = (folder / 'metadata.yaml').read_text()
+    assert '&' not in text, 'references are legal YAML that few write'
+    information = yaml.safe_load(text)['rosbag2_bagfile_information']
+    assert information['version'] == 9
+    assert information['message_count'] == 36
+    assert information['starting_time'] == {'nanoseconds_since_epoch': START_NS - 100}
+    assert information['duration'] == {'nanoseconds': 5 * SECOND_NS + 200}
+    assert information['relative_file_paths'] == ['six_0.mcap']
+
+
+def test_topics_and_their_choice(folder: Path) -> None:
+    """The only topic of a type is chosen; otherwise the error lists the topics."""
+    listed = {t.name: (t.type_name, t.count) for t in bag_reader.topics([folder])}
+    assert listed['/image'] == (IMAGE_TYPE, 6)
+    assert listed['/attitude'] == (ATTITUDE_TYPE, 12)
+    assert bag_reader.choose_topic([folder], IMAGE_TYPE) == '/image'
+    assert bag_reader.choose_topic([folder], IMAGE_TYPE, 'image') == '/image'
+    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*available: /image\)'):
+        bag_reader.choose_topic([folder], IMAGE_TYPE, '/nope')
+    with pytest.raises(BagError, match='no topic of type starcal/msg/Calibration'):
+        bag_reader.choose_topic([folder], CALIBRATION_TYPE)
+
+
+def test_several_topics_of_a_type(tmp_path: Path) -> None:
+    """Two topics of a type need an explicit choice."""
+    with BagWriter(tmp_path / 'two') as writer:
+        for topic in ('/b', '/a'):
+            writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
+    with pytest.raises(BagError, match='several topics of type .* choose one: /a, /b'):
+        bag_reader.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'text'),
+    [
+        ('missing', None, 'no such bag'),
+        ('text.mcap', b'hello', 'not an MCAP bag'),
+        ('empty.mcap', b'', 'not an MCAP bag'),
+        ('folder/', None, 'no .mcap files'),
+        ('folder/x.db3', b'', 'an SQLite bag: rosbags-convert --src'),
+        ('x.db3', b'SQLite format 3\0 and more', 'an SQLite bag: rosbags-convert --src'),
+        ('x.bag', b'#ROSBAG V2.0\n', 'x.bag --dst'),
+    ],
+)
+def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) -> None:
+    """The error for a file that is not a bag is one line with its path."""
+    path = tmp_path / name
+    if '/' in name:
+        path.parent.mkdir(exist_ok=True)
+        (tmp_path / 'folder').mkdir(exist_ok=True)
+    if content is not None:
+        path.write_bytes(content)
+    path = tmp_path / name.split('/')[0]
+    with pytest.raises(BagError, match=text) as error:
+        bag_reader.topics([path])
+    assert str(path) in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
+    """Files of a split bag are read in recording order: 10 after 9."""
+    (tmp_path / 'split').mkdir()
+    for k in (0, 9, 10):
+        with BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
+            writer.write_image('/image', Image(k, np.zeros((2, 2), np.uint8)), '')
+    assert [image.time_ns for image in images_of(tmp_path / 'split')] == [0, 9, 10]
+
+
+def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
+    """A colour image and an undecodable message become refusals between the other images."""
+    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', make_message)
+    with BagWriter(tmp_path / 'mixed') as writer:
+        writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
+        writer._write('/image', IMAGE_TYPE, 7, bad)
+        number, _ = writer._channels['/image']
+        writer._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
+        writer.write_image('/image', Image(9, np.zeros((2, 3), np.uint8)), '')
+    first, second, third, last = images_of(tmp_path / 'mixed', stamp_offset_s=1e-9)
+    assert isinstance(first, Image) and first.time_ns == 7
+    assert isinstance(second, StarObservations)
+    assert (second.refusal, second.time_ns, second.width) == ('bad_encoding', 8, 3)
+    assert isinstance(third, StarObservations) and third.refusal == 'bad_layout'
+    assert isinstance(last, Image)
+
+
+def test_invalid_attitude_sample(tmp_path: Path) -> None:
+    """An attitude that is not a unit quaternion gives the refusal bad_attitude."""
+    with BagWriter(tmp_path / 'b') as writer:
+        for k, w in enumerate([1.0, np.nan, 1.0]):
+            writer.write_attitude('/attitude', k, np.array([0, 0, 0, w]), 'icrf')
+    history = attitudes_of(tmp_path / 'b', print)
+    with pytest.raises(ImageRefused, match='bad_attitude'):
+        history.at(1, max_gap_s=1.0)
+
+
+def test_truncated_bag(tmp_path: Path, folder: Path) -> None:
+    """A bag truncated anywhere gives the images before the end and reports the truncation."""
+    whole = next(folder.glob('*.mcap')).read_bytes()
+    sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
+    file = tmp_path / 'cut.mcap'
+    most = 0
+    for size in np.linspace(len(whole) - 1, 20, 40).astype(int):
+        file.write_bytes(whole[:size])
+        said: list[str] = []
+        images = images_of(file, on_damage=said.append)
+        assert len(said) == 1, said
+        assert str(file) in said[0] and 'truncated' in said[0]
+        for image, pixels in zip(images, sound, strict=False):
+            assert isinstance(image, Image)
+            np.testing.assert_array_equal(image.pixels, pixels)
+        most = max(most, len(images))
+        names = [t.name for t in bag_reader.topics([file], lambda _: None)]
+        assert ('/image' in names) == bool(images)
+    assert most == 6
+
+
+def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
+    """A flipped bit in a chunk is reported, and no wrong pixel is read."""
+    whole = next(folder.glob('*.mcap')).read_bytes()
+    sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
+    with next(folder.glob('*.mcap')).open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    random = np.random.default_rng(5)
+    file = tmp_path / 'flipped.mcap'
+    for chunk in summary.chunk_indexes:
+        head = chunk.chunk_start_offset
+        # The kind of the record, its checksum's last bytes, and some of its content.
+        content = random.integers(head + 60, head + chunk.chunk_length, 8)
+        for offset in [head, *content]:
+            damaged = bytearray(whole)
+            damaged[offset] ^= 1 << int(random.integers(8))
+            file.write_bytes(damaged)
+            said: list[str] = []
+            images = images_of(file, on_damage=said.append)
+            assert said, offset
+            assert all('\n' not in text for text in said)
+            for image in images:
+                assert isinstance(image, Image)
+                k = (image.time_ns - START_NS) // SECOND_NS
+                np.testing.assert_array_equal(image.pixels, sound[k])
+
+
+@pytest.fixture(scope='module')
+def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of many small chunks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer_module, '_CHUNK_BYTES', 800)
+        folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
+    return next(folder.glob('*.mcap'))
+
+
+def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) -> None:
+    """Without the first chunk, which holds the topic names, the other chunks are read."""
+    whole = bytearray(small_chunks.read_bytes())
+    with small_chunks.open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and len(summary.chunk_indexes) > 8
+    first = summary.chunk_indexes[0]
+    file = tmp_path / 'flipped.mcap'
+    # In its length, which hides all chunks up to the next one in the summary, and in its content.
+    for offset in (5, first.chunk_length // 2):
+        damaged = bytearray(whole)
+        damaged[first.chunk_start_offset + offset] ^= 4
+        file.write_bytes(damaged)
+        said: list[str] = []
+        assert len(attitudes_of(file, said.append)) == 15
+        assert said[-1].endswith('lost 1 of 16 on /attitude')
+        assert len(images_of(file, on_damage=said.append)) == 8
+        assert bag_reader.choose_topic([file], ATTITUDE_TYPE) == '/attitude'
+
+
+@pytest.mark.slow
+@settings(max_examples=250, derandomize=True, deadline=None)
+@given(data=st.data())
+def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> None:
+    """
+    With any flipped bits and truncation, messages read were written, and losses are reported.
+
+    With an intact summary the count of lost messages is exact.
+    """
+    whole = small_chunks.read_bytes()
+    sound = list(bag_reader.read_raw([small_chunks]))
+    with small_chunks.open('rb') as stream:
+        records = StreamReader(stream).records
+        summary_start = next(r.summary_start for r in records if isinstance(r, Footer))
+    offsets = st.integers(8, len(whole) - 1)
+    flips = data.draw(st.lists(st.tuples(offsets, st.integers(0, 7)), max_size=3, unique=True))
+    size = data.draw(st.one_of(st.just(len(whole)), offsets))
+    damaged = bytearray(whole)
+    for offset, bit in flips:
+        damaged[offset] ^= 1 << bit
+    file = small_chunks.with_name('damaged.mcap')
+    file.write_bytes(damaged[:size])
+    said: list[str] = []
+    read = list(bag_reader.read_raw([file], on_damage=said.append))
+    left = iter(sound)
+    assert all(any(message == one for one in left) for message in read), 'in order, as written'
+    missing = len(sound) - len(read)
+    assert said or not missing
+    if size == len(whole) and all(offset < summary_start for offset, _ in flips):
+        counted = [int(n) for text in said for n in re.findall(r'(\d+) of \d+ on ', text)]
+        assert sum(counted) == missing
+    bag_reader.topics([file], said.append)
+
+
+def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
+    """Reading a file with random bytes never raises an unexpected error."""
+    whole = np.frombuffer(next(folder.glob('*.mcap')).read_bytes(), np.uint8)
+    random = np.random.default_rng(6)
+    file = tmp_path / 'rubbish.mcap'
+    for _ in range(60):
+        damaged = whole.copy()
+        start = int(random.integers(8, len(damaged) - 64))
+        damaged[start : start + 64] = random.integers(0, 256, 64)
+        file.write_bytes(damaged.tobytes())
+        said: list[str] = []
+        images_of(file, on_damage=said.append)
+        bag_reader.topics([file], said.append)
+
+
+@pytest.mark.parametrize('indexed', [False, True])
+def test_other_writers(tmp_path: Path, indexed: bool) -> None:
+    """A file without chunks or summary is read; a channel that is not ROS 2 is skipped."""
+    file = tmp_path / 'plain.mcap'
+    store = typestore()
+    message = image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', make_message)
+    with file.open('wb') as stream:
+        writer = Writer(
+            stream, use_chunking=indexed, use_statistics=indexed, compression=CompressionType.NONE
+        )
+        writer.start()
+        definition, _ = store.generate_msgdef(IMAGE_TYPE, ros_version=2)
+        schema = writer.register_schema(IMAGE_TYPE, 'ros2msg', definition.encode())
+        image = writer.register_channel('/image', 'cdr', schema)
+        other = writer.register_channel('/other', 'json', 0)
+        writer.add_message(other, 1, b'{}', 1)
+        writer.add_message(image, 5, bytes(store.serialize_cdr(message, IMAGE_TYPE)), 5)
+        writer.finish()
+    assert [t.name for t in bag_reader.topics([file])] == ['/image']
+    (read,) = images_of(file)
+    assert isinstance(read, Image) and read.time_ns == 5
+
+
+MEMORY = """
+import resource, sys
+from starcal_ros.formats.bag import reader as bag_reader
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for k, image in enumerate(bag_reader.read_images([sys.argv[1]], '/image')):
+    if k == 10:
+        early = peak()
+print(k, peak() - early)
+"""
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='ru_maxrss is in kB on Linux')
+@pytest.mark.slow
+def test_memory_is_flat(tmp_path: Path) -> None:
+    """Fifty images need no more memory than ten."""
+    path = write_bag(tmp_path / 'long', images=50, size=1000)
+    done = subprocess.run(
+        [sys.executable, '-c', MEMORY, str(path)], capture_output=True, text=True, check=True
+    )
+    last, growth_kb = map(int, done.stdout.split())
+    assert last == 49
+    assert growth_kb < 10_000  # the 39 images between are 78 MB
+
+
+def real(name: str) -> Path:
+    """Path of an external bag; skips the test if it is missing."""
+    path = SHARED / name
+    if not path.exists():
+        pytest.skip(f'{name} is not on this machine')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('name', 'images', 'shape', 'dtype'),
+    [
+        ('independent/small_101.mcap', 16, (1024, 1296), np.uint16),
+        ('realsky/granasat', 11, (960, 1280), np.uint8),
+    ],
+)
+def test_bags_of_others(name: str, images: int, shape: tuple[int, int], dtype: Any) -> None:
+    """Bags by other writers are read completely, without reports of damage."""
+    said: list[str] = []
+    path = real(name)
+    topic = bag_reader.choose_topic([path], IMAGE_TYPE)
+    found = list(bag_reader.read_images([path], topic, on_damage=said.append))
+    assert len(found) == images
+    for image in found:
+        assert isinstance(image, Image)
+        assert (image.pixels.shape, image.pixels.dtype) == (shape, dtype)
+    attitude_topic = bag_reader.choose_topic([path], ATTITUDE_TYPE)
+    assert len(attitudes_of(path, said.append, attitude_topic)) == 2 * images
+    assert not said

@@ -1,0 +1,162 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""What people give in place of an MCAP bag: it is named, with a command that helps and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import contextlib
+from pathlib import Path
+import re
+import shlex
+import shutil
+import sqlite3
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+from starcal_ros.errors import BagError
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import ATTITUDE_TYPE
+from starcal_ros.records import Image
+
+TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+ATTITUDE = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def attitude(store, k: int, **header):
+    stamp = store.types['builtin_interfaces/msg/Time'](1_800_000_000 + k, 0)
+    quaternion = store.types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    made = store.types['std_msgs/msg/Header'](stamp=stamp, frame_id='icrf', **header)
+    return store.types[ATTITUDE_TYPE](made, quaternion)
+
+
+def write_sqlite(folder: Path) -> None:
+    """Write a bag as `ros2 bag record -a` of Humble does, which keeps no definitions of types."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    own = get_typestore(Stores.EMPTY)
+    own.register(get_types_from_msg('float64 volt', 'power_msgs/msg/Battery'))
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag:
+        topic = bag.add_connection('/star tracker/attitude', ATTITUDE_TYPE, typestore=store)
+        event_type = 'rcl_interfaces/msg/ParameterEvent'
+        events = bag.add_connection('/parameter_events', event_type, typestore=store)
+        power = bag.add_connection('/battery', 'power_msgs/msg/Battery', typestore=own)
+        for k in range(3):
+            data = store.serialize_cdr(attitude(store, k), ATTITUDE_TYPE)
+            bag.write(topic, 1_800_000_000_000_000_000 + k, data)
+            bag.write(events, 1_800_000_000_000_000_000 + k, bytes(40))
+            bag.write(power, 1_800_000_000_000_000_000 + k, bytes(12))
+    (file,) = folder.glob('*.db3')
+    with contextlib.closing(sqlite3.connect(file)) as base:
+        base.executescript('DROP TABLE message_definitions; UPDATE schema SET schema_version = 3')
+    metadata = folder / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('version: 8', 'version: 5'))
+
+
+def write_ros_1(path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Ros1Writer(path) as bag:
+        topic = bag.add_connection('/attitude', ATTITUDE_TYPE, typestore=store)
+        for k in range(3):
+            data = store.serialize_ros1(attitude(store, k, seq=k), ATTITUDE_TYPE)
+            bag.write(topic, 1_800_000_000_000_000_000 + k, data)
+
+
+def write_compressed(folder: Path) -> None:
+    """Write a bag as `ros2 bag record --compression-mode file` does."""
+    shutil.copytree(TINY, folder)
+    (bag,) = folder.glob('*.mcap')
+    subprocess.run(['zstd', '-q', '--rm', bag, '-o', f'{bag}.zstd'], check=True)
+    metadata = folder / 'metadata.yaml'
+    text = metadata.read_text().replace(bag.name, f'{bag.name}.zstd')
+    metadata.write_text(re.sub("compression_mode: ''", 'compression_mode: FILE', text))
+    assert 'FILE' in metadata.read_text()
+
+
+def run_remedy(words: str, folder: Path) -> None:
+    """Run the command that an error message names."""
+    command = re.search(r'((rosbags-convert|zstd) .*?)( makes one)?$', words)
+    assert command is not None, words
+    scripts = str(Path(sys.executable).parent)
+    environment = {'PATH': f'{scripts}:/usr/bin:/bin'}
+    done = subprocess.run(
+        command[1], shell=True, cwd=folder, env=environment, capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr.decode()[-500:]
+
+
+@pytest.mark.parametrize(
+    ('write', 'name', 'read'),
+    [
+        (write_sqlite, 'a flight', 'a flight_mcap'),
+        (write_ros_1, 'a.bag', 'a_mcap'),
+        (write_compressed, 'flight', 'flight'),
+    ],
+)
+def test_the_command_that_is_named_makes_a_bag_that_is_read(
+    write: Callable[[Path], None], name: str, read: str, tmp_path: Path
+) -> None:
+    if write is write_compressed and shutil.which('zstd') is None:
+        pytest.skip('zstd is not installed')
+    write(tmp_path / name)
+    with pytest.raises(BagError) as error:
+        reader.topics([tmp_path / name])
+    assert '\n' not in str(error.value)
+    run_remedy(str(error.value), tmp_path)
+    assert any(topic.type_name == ATTITUDE_TYPE for topic in reader.topics([tmp_path / read]))
+
+
+def test_a_file_of_a_sqlite_bag_is_converted_as_its_folder(tmp_path: Path) -> None:
+    write_sqlite(tmp_path / 'flight')
+    (file,) = (tmp_path / 'flight').glob('*.db3')
+    with pytest.raises(BagError, match="--include-topic '/star tracker/attitude'") as error:
+        reader.topics([file])
+    run_remedy(str(error.value), tmp_path)
+    assert reader.topics([tmp_path / 'flight_mcap'])
+
+
+OTHERS: Mapping[str, tuple[bytes, str]] = {
+    'rec.mcap.zstd': (b'(\xb5/\xfd' + bytes(40), 'a file compressed by zstd: zstd -d {file}'),
+    'rec.mcap.gz': (b'\x1f\x8b\x08' + bytes(40), 'a file compressed by gzip: gunzip -k {file}'),
+    'rec.zip': (b'PK\x03\x04' + bytes(40), 'a zip archive: unzip {file} -d unzipped'),
+    'a.jpg': (b'\xff\xd8\xff' + bytes(40), 'a JPEG: starcal calibrate or init takes images'),
+    'a.HEIC': (b'\0\0\0\x18ftypheic', 'a HEIF image (HEIC): starcal calibrate or init takes'),
+    'a.fits': (b'SIMPLE  =', 'a FITS file: starcal calibrate or init takes images alone; starcal'),
+}
+
+
+@pytest.mark.parametrize('name', OTHERS)
+@pytest.mark.parametrize('in_a_folder', [False, True])
+def test_another_file_is_named_with_the_command_that_helps(
+    name: str, in_a_folder: bool, tmp_path: Path
+) -> None:
+    content, words = OTHERS[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(BagError) as error:
+        reader.topics([tmp_path if in_a_folder else tmp_path / name])
+    assert words.format(file=shlex.quote(str(tmp_path / name))) in str(error.value)
+    assert in_a_folder == ('no .mcap files in the folder, but' in str(error.value))
+
+
+@pytest.mark.parametrize('order', [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
+def test_files_are_read_in_the_order_of_their_first_messages(
+    order: tuple[int, ...], tmp_path: Path
+) -> None:
+    """A shell gives rec_10 before rec_2."""
+    pixels = np.zeros((4, 4), np.uint8)
+    names = ['rec_2.mcap', 'rec_10.mcap', 'rec_11.mcap']
+    for k, name in enumerate(names):
+        with BagWriter(tmp_path / name) as bag:
+            bag.write_image('/image', Image(1_800_000_000_000_000_000 + k, pixels), 'camera')
+    # A file that was cut off has no summary.
+    cut = tmp_path / names[1]
+    cut.write_bytes(cut.read_bytes()[:-40])
+    given = [tmp_path / names[k] for k in order]
+    stamps = [image.time_ns for image in reader.read_images(given, '/image')]
+    assert stamps == sorted(stamps) and len(stamps) == 3
+    assert reader.mcap_files([tmp_path, *given]) == [tmp_path / name for name in names]

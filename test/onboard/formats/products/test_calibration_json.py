@@ -1,0 +1,308 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""File calibration.json: round trips, damaged files, errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from sample_records import (  # type: ignore[import-not-found]
+    assert_same,
+    calibration,
+    calibration_of_0_1,
+    plain_calibration,
+    with_joint_covariance,
+    without_field,
+)
+
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.bag.typestore import make_message, typestore
+from starcal_ros.formats.messages.calibration_messages import calibration_to_message
+from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
+from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms
+
+WRITTEN_BY_0_1 = Path(__file__).resolve().parents[3] / 'data' / 'written_by_0_1'
+GATE = (
+    GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
+    GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
+    GateCheck(
+        'turn', 'max_step_rotation_deg', math.nan, 0.5, 'deg', None, 'no calibration was active'
+    ),
+)
+
+
+def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    cases: tuple[dict[str, Any], ...] = (
+        {},
+        {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
+        {'temperature': TemperatureTerms(20.0, note='left out: everything')},
+        {'model_checks': dataclasses.replace(calibration().model_checks, held=())},
+    )
+    records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
+    for record in (calibration(), without_field(), *records):
+        write_calibration(record, tmp_path / 'calibration.json')
+        assert_same(record, read_calibration(tmp_path / 'calibration.json'))
+
+
+def test_the_checks_of_the_gate_come_back(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(dataclasses.replace(calibration(), gate=GATE), path)
+    assert [check['passed'] for check in json.loads(path.read_text())['gate']] == [
+        True,
+        False,
+        None,
+    ]
+    assert repr(read_calibration(path).gate) == repr(GATE)  # NaN is not equal to itself
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@pytest.mark.slow
+@settings(
+    max_examples=50,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    fx=st.floats(1e3, 1e7),
+    others=st.lists(st.floats(-1e-3, 1e-3), min_size=8, max_size=8),
+    covariance=st.lists(finite, min_size=169, max_size=169),
+    quaternion=st.tuples(*[st.floats(0.1, 1.0)] * 4),
+    number=finite,
+)
+def test_any_finite_number_comes_back(
+    tmp_path: Path,
+    fx: float,
+    others: list[float],
+    covariance: list[float],
+    quaternion: tuple[float, ...],
+    number: float,
+) -> None:
+    parameters = np.array([fx, others[0], fx, *others[1:]])
+    rotation = np.array(quaternion) / np.linalg.norm(quaternion)
+    record = dataclasses.replace(
+        plain_calibration(),
+        geometry=CameraGeometry(CameraModel(1296, 1024, parameters), rotation),
+        covariance=np.array(covariance).reshape(13, 13),
+        residual_rms_px=number,
+    )
+    write_calibration(record, tmp_path / 'c.json')
+    assert_same(record, read_calibration(tmp_path / 'c.json'))
+
+
+def test_numbers_that_are_not_finite_are_null_and_come_back_nan(tmp_path: Path) -> None:
+    covariance = np.eye(13)
+    covariance[3, 3] = np.inf
+    path = tmp_path / 'c.json'
+    record = dataclasses.replace(calibration(), covariance=covariance, variance_factor=math.nan)
+    write_calibration(record, path)
+    content = json.loads(path.read_text(), parse_constant=pytest.fail)  # strict JSON
+    assert content['covariance'][3][3] is None
+    back = read_calibration(path)
+    assert math.isnan(back.covariance[3, 3]) and math.isnan(back.variance_factor)
+
+
+def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    record = plain_calibration()
+    write_calibration(record, path)
+    content = json.loads(path.read_text())
+    assert content['schema'] == 1
+    assert list(content['intrinsics']) == ['fx', 'skew', 'fy', 'cx', 'cy']
+    assert list(content['distortion']) == ['k1', 'k2', 'k3', 'p1', 'p2']
+    assert content['alignment']['parent'] == 'st'
+    assert content['alignment']['child'] == 'cam'
+    assert len(content['alignment']['quaternion_xyzw']) == 4
+    assert tuple(content['parameter_names']) == record.parameter_names
+    assert content['alignment_covariance_rad2'] == record.covariance[10:, 10:].tolist()
+    assert {
+        'method', 'estimated', 'residual_rms_px', 'images_used', 'images_refused', 'stars_used',
+        'stars_rejected', 'accepted', 'reasons', 'provenance', 'time_ns', 'variance_factor',
+        'alignment_scatter_arcsec', 'zero_skew_cost_px', 'iterations', 'termination',
+    } <= set(content)  # fmt: skip
+    assert content['image'] == {'width': 1296, 'height': 1024}
+    assert content['temperature'] is content['maps'] is content['correlation'] is None
+    write_calibration(calibration(), path)
+    assert list(json.loads(path.read_text())['temperature']) == [
+        'reference_degc', 'focal_per_degc', 'focal_per_degc_sigma',
+        'alignment_rate_rad_per_degc', 'alignment_rate_rad_per_degc_sigma', 'note',
+    ]  # fmt: skip
+
+
+def test_a_row_of_a_grid_is_a_line(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    provenance = {'note': 'a [\n 1,\n 2\n ] in a text'}
+    written = dataclasses.replace(calibration(), provenance=provenance)
+    write_calibration(written, path)
+    assert '   [0, 1, 2],\n   [3, 4, 5]\n' in path.read_text()
+    assert_same(written, read_calibration(path))
+
+
+def test_a_file_of_version_0_1_is_read() -> None:
+    """Written by that version from the sample record; keys have other names since."""
+    found = read_calibration(WRITTEN_BY_0_1 / 'calibration.json')
+    last = GateCheck(
+        'turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'no calibration was in force'
+    )
+    assert repr(found.gate[-1]) == repr(last)
+    assert_same(calibration_of_0_1(), dataclasses.replace(found, gate=found.gate[:-1]))
+
+
+def test_an_older_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration(), path)
+    content = json.loads(path.read_text())
+    del content['temperature'], content['maps'], content['correlation']
+    del (
+        content['gate'],
+        content['star_trackers'],
+        content['model_checks'],
+        content['field'],
+        content['sigma_budget'],
+    )
+    path.write_text(json.dumps(content))
+    assert_same(plain_calibration(), read_calibration(path))
+
+
+def test_a_file_with_the_covariance_of_a_field_itself_is_read(tmp_path: Path) -> None:
+    record = with_joint_covariance()
+    write_calibration(record, tmp_path / 'c.json')
+    content = json.loads((tmp_path / 'c.json').read_text())
+    for name in ('unresolved_px', 'covariance_factor', 'remainder_unit_px', 'remainder'):
+        del content['field'][name]
+    content['field'].update(length=0.4375, amplitude_px=0.02)  # keys of that time
+    (tmp_path / 'c.json').write_text(json.dumps(content))
+    found = read_calibration(tmp_path / 'c.json')
+    assert_same(record, found)
+    assert found.map_covariance.unresolved_px == 0.0
+    assert found.field is not None
+    np.testing.assert_array_equal(found.map_covariance.matrix, found.field.joint_covariance)
+
+
+def test_a_covariance_of_a_field_is_its_factor_and_remainder(tmp_path: Path) -> None:
+    write_calibration(calibration(), tmp_path / 'c.json')
+    found = read_calibration(tmp_path / 'c.json')
+    F = np.arange(38.0).reshape(19, 2) / 11
+    expected = F @ F.T
+    R = np.array([
+        [-10, 0, 0, 0, 0, 0], [-9, -8, 0, 0, 0, 0], [-7, -6, -5, 0, 0, 0], [-4, -3, -2, -1, 0, 0],
+        [0, 1, 2, 3, 4, 0], [5, 6, 7, 8, 9, 10],
+    ]) * np.arange(1.0, 7.0)[:, None] / 7e4  # fmt: skip
+    expected[13:, 13:] += R @ R.T
+    np.testing.assert_allclose(found.map_covariance.matrix, expected, rtol=1e-14)
+    assert found.map_covariance.unresolved_px == 0.0625
+
+
+def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> None:
+    path = tiny_products / 'calibration.json'
+    assert path.stat().st_size < 150_000
+    found = read_calibration(path)
+    assert found.field is not None and found.sigma_budget
+    message = calibration_to_message(found, make_message)
+    assert len(bytes(typestore().serialize_cdr(message, CALIBRATION_TYPE))) < 100_000
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        (lambda c: c.update(schema=2), 'schema 2 is not 1'),
+        (lambda c: c.pop('covariance'), "key 'covariance' is missing"),
+        (lambda c: c['intrinsics'].pop('fy'), "key 'intrinsics.fy' is missing"),
+        (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
+        (lambda c: c['distortion'].update(k1='a'), "distortion.k1: 'a' is not a number"),
+        (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
+        (lambda c: c['covariance'].pop(), 'covariance: 12 x 13 numbers, not 12 x 12'),
+        (lambda c: c['covariance'][0].pop(), 'covariance: rows of different length'),
+        (
+            lambda c: c['covariance'][0].__setitem__(2, 'a'),
+            r"ance\[0\]\[2\]: 'a' is not a num",
+        ),
+        (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
+        (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
+        (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
+        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not at least 0'),
+        (lambda c: c.update(images_used=2**70), 'images_used: .* is not within 64 bit'),
+        (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
+        (lambda c: c.update(residual_rms_px=True), 'residual_rms_px: True is not a number'),
+        (lambda c: c.update(star_tracker_sigma_arcsec=[1.0]), 'sigma_arcsec: 1 numbers, not 3'),
+        (lambda c: c.update(stars_used=1.5), 'stars_used: 1.5 is not a whole number'),
+        (lambda c: c.update(accepted=1), 'accepted: 1 is not true or false'),
+        (lambda c: c.update(reasons='none'), "reasons: 'none' is not a list"),
+        (lambda c: c.update(provenance=[]), r'provenance: \[\] is not an object'),
+        (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
+        (lambda c: c.update(intrinsics=3), 'intrinsics: 3 is not an object'),
+        (lambda c: c.update(temperature={}), "key 'temperature.reference_degc' is missing"),
+        (
+            lambda c: c['temperature'].update(alignment_rate_rad_per_degc=[1.0]),
+            'temperature.alignment_rate_rad_per_degc_sigma: 3 numbers, not 1',
+        ),
+        (lambda c: c['maps'].pop('stars'), "key 'maps.stars' is missing"),
+        (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: rows of different length'),
+        (lambda c: c['gate'][0].pop('unit'), r"key 'gate\[0\].unit' is missing"),
+        (lambda c: c['gate'][0].update(passed=1), r'gate\[0\].passed: 1 is not true or false'),
+        (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix: 1 x 2 numbers, not'),
+        (lambda c: c['model_checks'].pop('step'), "key 'model_checks.step' is missing"),
+        (
+            lambda c: c['model_checks']['held'][1].update(sigma='a'),
+            r"model_checks.held\[1\].sigma: 'a' is not a number",
+        ),
+        (lambda c: c['field'].update(degree=2), 'field.coefficients: 3 for an axis, not 6'),
+        (
+            lambda c: c['field'].update(joint_covariance=[[1.0]]),
+            'field: covariance of 1 rows, not 19',
+        ),
+        (lambda c: c['field']['remainder'].pop(), 'field.remainder: 20 numbers, not 21'),
+        (
+            lambda c: c['field']['remainder'].__setitem__(0, 40000),
+            'field.remainder: a number is out of the range of int16',
+        ),
+        (
+            lambda c: c['field'].update(remainder_unit_px=[1.0], remainder=[1]),
+            'field.remainder_unit_px: 1 numbers, not 6',
+        ),
+        (lambda c: c['field']['covariance_factor'].pop(), 'field: covariance of 18 rows, not 19'),
+        (
+            lambda c: c['sigma_budget'][1].update(map_arcsec='a'),
+            r"sigma_budget\[1\].map_arcsec: 'a' is not a number",
+        ),
+    ],
+)
+def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration(), path)
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ProductError, match=says) as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('content', [b'', b'{', b'[]', b'\xff\xfe\x00', b'3'])
+def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'c.json'
+    path.write_bytes(content)
+    with pytest.raises(ProductError, match='not') as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
+        read_calibration(tmp_path / 'none')
+    with pytest.raises(ProductError, match='cannot be read: Is a directory'):
+        read_calibration(tmp_path)
+    with pytest.raises(ProductError, match='cannot be written'):
+        write_calibration(calibration(), tmp_path / 'none' / 'c.json')

@@ -1,0 +1,139 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Pull of neighbours on centroids, against fits to mean images."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from starcal_ground.simulation.rendering import star_electrons
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.identification.blending import (
+    MAX_BLEND_SIGMA,
+    neighbour_pulls,
+    Pulls,
+    unlisted_pull_px,
+)
+from starcal_ros.stars.detection import Background
+from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.pixel_noise import PixelNoise
+from starcal_ros.stars.psf_field import uniform_width
+from starcal_ros.stars.psf_fit import fit_psf, stamp_radius_px
+
+SIGMA_PX = 0.95
+
+
+def pull_of_a_neighbour(
+    flux_dn: float, ratio: float, distance_px: float, noise_dn: float
+) -> tuple[float, float, float]:
+    """Error and 1-sigma (px), and flux (DN) of a fit to the mean image of two stars."""
+    pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
+    image = star_electrons(pair, flux_dn * np.array([1.0, ratio]), SIGMA_PX, (33, 33))
+    r = stamp_radius_px(SIGMA_PX)
+    stamp = image[None, 16 - r : 17 + r, 16 - r : 17 + r]
+    fit = fit_psf(stamp, SIGMA_PX, np.array([noise_dn]), PixelNoise(4.0, 0.0))
+    x_px, y_px, found_dn, _ = fit.parameters[0].tolist()
+    return math.hypot(x_px, y_px), math.sqrt(fit.covariance[0, 0, 0]), found_dn
+
+
+def image_model(noise_dn: float) -> ImageModel:
+    mesh = np.zeros((1, 1), np.float32)
+    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn, (0, 0))
+    noise = PixelNoise(4.0, 0.0)
+    psf = uniform_width(SIGMA_PX, 33, 33)
+    return ImageModel(background, psf, noise, 4095.0, np.zeros(3), np.zeros(3))
+
+
+def pulls_on(
+    xy_px: np.ndarray, magnitude: np.ndarray, flux_dn: np.ndarray, model: ImageModel
+) -> Pulls:
+    """Pulls on stars that are all measured, and none subtracted from another."""
+    none = np.zeros(len(xy_px), bool)
+    return neighbour_pulls(xy_px, magnitude, flux_dn, model, none, ~none)
+
+
+def pulls(
+    flux_dn: float, ratio: float, distance_px: float, noise_dn: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
+    magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
+    flux = flux_dn * np.array([1.0, ratio])
+    found = pulls_on(pair, magnitude, flux, image_model(noise_dn))
+    return found.pull_px, found.uncertain_px, found.swamped
+
+
+@pytest.mark.parametrize('flux_dn', [500.0, 20000.0])
+@pytest.mark.parametrize('ratio', [0.01, 0.1, 0.45])
+@pytest.mark.parametrize('distance_px', [0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
+def test_the_pull_of_a_neighbour_is_that_of_the_fit(
+    flux_dn: float, ratio: float, distance_px: float
+) -> None:
+    pull_px, sigma_px, measured_dn = pull_of_a_neighbour(flux_dn, ratio, distance_px, 2.1)
+    found, _, _ = pulls(measured_dn, ratio, distance_px, 2.1)
+    # How much of the neighbour is in the flux is told to a part of it; either fit ends within
+    # three hundredths of its sigma.
+    assert found[0, 0] == pytest.approx(pull_px, rel=0.12, abs=0.06 * sigma_px)
+    assert abs(found[0, 1]) < 1e-9
+
+
+def test_what_is_left_of_a_pull_that_is_let_pass_is_under_its_sigma() -> None:
+    worst = 0.0
+    for flux_dn, noise_dn in itertools.product((200.0, 500.0, 2000.0, 20000.0), (2.1, 10.0)):
+        for ratio in (0.01, 0.03, 0.1, 0.2, 0.3, 0.45):
+            for distance_px in np.arange(1.0, 8.0, 0.5).tolist():
+                pull_px, sigma_px, measured_dn = pull_of_a_neighbour(
+                    flux_dn, ratio, distance_px, noise_dn
+                )
+                found, uncertain, swamped = pulls(measured_dn, ratio, distance_px, noise_dn)
+                if not (swamped[0] or uncertain[0, 0] > MAX_BLEND_SIGMA * sigma_px):
+                    told_px = np.hypot(sigma_px, uncertain[0, 0])
+                    worst = max(worst, abs(pull_px - found[0, 0]) / told_px)
+    # The colour of the neighbour, which the uncertainty is for, is not in this.
+    assert worst < 0.3
+
+
+@pytest.mark.parametrize('ratio', [0.02, 0.1, 0.3, 0.5])
+def test_of_two_stars_that_look_like_one_the_centre_of_light_is_measured(ratio: float) -> None:
+    distance_px = 0.1 * SIGMA_PX
+    # What is measured is the flux of both.
+    total = 2000.0 * np.array([1.0 + ratio, 1.0 + ratio])
+    pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
+    magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
+    found = pulls_on(pair, magnitude, total, image_model(2.1)).pull_px
+    # To first order in the distance; the second is (distance / sigma)^2, 1 %.
+    assert found[0, 0] == pytest.approx(ratio / (1.0 + ratio) * distance_px, rel=0.02)
+
+
+def test_what_a_companion_that_the_catalog_has_not_may_pull() -> None:
+    # A star of V = 5 in a catalog to V = 9: the companion has a fortieth of its light or less,
+    # within 20 arcsec, here 2 px.
+    px_per_rad = 2.0 / (20.0 * ARCSECOND_RAD)
+    rng = np.random.default_rng(4)
+    share = 10 ** (-0.4 * (4.0 + rng.uniform(0.0, 1.0, 100000)))
+    away_px = 2.0 * rng.uniform(size=100000) * share
+    drawn_px = np.sqrt(np.mean(away_px**2) / 2)
+    found = unlisted_pull_px(np.array([5.0, 9.0, 9.5]), 9.0, px_per_rad)
+    assert found[0] == pytest.approx(drawn_px, rel=0.05)  # 0.58 and 0.65 are rounded
+    assert found[1] == found[2] == pytest.approx(10**1.6 * found[0])
+
+
+def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:
+    pair = np.array([[100.0, 100.0], [104.0, 100.0], [300.0, 300.0]])
+    flux = np.array([5000.0, 50.0, 800.0])
+    found = pulls_on(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1))
+    pull_px, swamped = found.pull_px, found.swamped
+    np.testing.assert_array_equal(swamped, [False, True, False])
+    np.testing.assert_array_equal(found.outshone, [False, True, False])
+    assert 0 < pull_px[0, 0] < 0.05 and not pull_px[2].any()
+
+
+def test_no_neighbours_no_pulls() -> None:
+    model = image_model(2.1)
+    none = pulls_on(np.empty((0, 2)), np.empty(0), np.empty(0), model)
+    pull_px, swamped = none.pull_px, none.swamped
+    assert pull_px.shape == (0, 2) and swamped.shape == (0,)
+    alone = np.array([[5.0, 5.0]])
+    assert not pulls_on(alone, np.array([3.0]), np.array([90.0]), model).pull_px.any()

@@ -1,0 +1,46 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Predicted stars against the simulated scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from starcal_ground.simulation.scenario import scenario, Scene, scene
+from starcal_ros.identification.prediction import in_image, predict, Prediction, within_image
+from starcal_ros.sky.catalog import load_catalog
+
+SCENARIO = scenario('tiny', seed=6)
+CATALOG = load_catalog(None, 9.0)
+
+
+def predicted(one: Scene, magnitude_limit: float = 9.0, margin_rad: float = 0.0) -> Prediction:
+    attitude = scene(SCENARIO, 2, attitude_noise=False).icrf_from_star_tracker_xyzw
+    return predict(SCENARIO.truth, attitude, one.time_ns, CATALOG, magnitude_limit, margin_rad)
+
+
+def test_prediction_at_the_truth_is_the_scene() -> None:
+    one = scene(SCENARIO, 2)
+    found = predicted(one, margin_rad=np.radians(1.5))
+    place = dict(zip(CATALOG.id[found.catalog_index].tolist(), found.xy_px, strict=True))
+    for number, pixel in zip(one.catalog_id.tolist(), one.pixel_px, strict=True):
+        np.testing.assert_allclose(place[number], pixel, rtol=0, atol=1e-6)
+    brightness = CATALOG.magnitude[found.catalog_index]
+    assert (np.diff(brightness) >= 0).all()
+
+
+def test_stars_beyond_magnitude_and_margin_are_left_out() -> None:
+    one = scene(SCENARIO, 2)
+    wide = predicted(one, margin_rad=np.radians(1.5))
+    few = predicted(one, magnitude_limit=7.0, margin_rad=np.radians(1.5))
+    np.testing.assert_array_equal(
+        few.catalog_index, wide.catalog_index[CATALOG.magnitude[wide.catalog_index] <= 7.0]
+    )
+    width, height = SCENARIO.truth.camera.width, SCENARIO.truth.camera.height
+    outside = ~in_image(wide.xy_px, width, height)
+    assert 0 < np.count_nonzero(outside) < len(outside)
+    exact = predicted(one)
+    np.testing.assert_array_equal(exact.catalog_index, wide.catalog_index[~outside])
+    shown = within_image(wide, width, height)
+    for column in ('catalog_index', 'direction_icrf', 'direction_camera', 'xy_px'):
+        np.testing.assert_array_equal(getattr(shown, column), getattr(exact, column))
+    assert shown.px_per_rad == exact.px_per_rad == SCENARIO.truth.camera.parameters[0]

@@ -1,0 +1,338 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Identification of simulated images: right stars or none, with wrong alignment or attitude."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from sample_sky import with_planets  # type: ignore[import-not-found]
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.simulation.rendering import render
+from starcal_ground.simulation.scenario import Detector, scenario, Scene, scene
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    realigned,
+    StarSearch,
+)
+from starcal_ros.records import (
+    CameraGeometry,
+    Image,
+    refused_image,
+    STAR_REFUSALS,
+    StarObservations,
+)
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.stars.image_model import CentroidOptions
+
+SCENARIO = scenario('tiny', seed=6)
+TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
+OPTIONS, CENTROIDS = IdentificationOptions(), CentroidOptions()
+
+
+@functools.cache
+def catalog() -> StarCatalog:
+    return load_catalog(None, OPTIONS.magnitude_limit)
+
+
+@functools.cache
+def shown(index: int) -> tuple[Scene, Image]:
+    one = scene(SCENARIO, index)
+    return one, render(SCENARIO, one, index)
+
+
+def observed(
+    image: Image,
+    icrf_from_star_tracker_xyzw: np.ndarray,
+    geometry: CameraGeometry = PRIOR,
+    options: IdentificationOptions = OPTIONS,
+) -> StarObservations:
+    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.5)
+    return observe_stars(exposure, geometry, StarSearch(catalog(), CENTROIDS, options))[0]
+
+
+def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
+    """Geometry with the camera rotated about its own axes."""
+    rotation = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
+    return CameraGeometry(geometry.camera, rotation.as_quat())
+
+
+def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
+    """Assert that every star is at the pixel of its catalog number."""
+    assert found.refusal == '' and len(found) >= least
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    true_px = np.array([place.get(number, [np.nan, np.nan]) for number in found.catalog_id])
+    uu, _, vv = found.covariance_px2.T
+    in_sigma = np.abs(found.measured_px - true_px) / np.sqrt(np.stack([uu, vv], axis=-1))
+    assert np.isfinite(in_sigma).all()
+    # Several hundred normal deviates, some of them pulled by a faint neighbour: a wrong star is
+    # some hundred sigma off.
+    assert in_sigma.max() < 6.0
+    assert np.sqrt((in_sigma**2).mean()) < 1.2
+    assert len(np.unique(found.catalog_id)) == len(found)
+
+
+@pytest.mark.parametrize('index', range(10))
+def test_every_star_is_the_right_one(index: int) -> None:
+    one, image = shown(index)
+    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    assert_right(found, one)
+    assert found.psf_sigma_px == pytest.approx(SCENARIO.detector.psf_sigma_px, rel=0.02)
+    assert found.catalog_digest == catalog().digest
+    assert found.time_ns == image.time_ns
+    magnitude = dict(zip(one.catalog_id.tolist(), one.magnitude, strict=True))
+    expected = [magnitude[number] for number in found.catalog_id]
+    np.testing.assert_allclose(found.magnitude, expected, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found.direction_icrf, axis=1), 1.0, rtol=1e-15)
+
+
+@pytest.mark.parametrize('tilt_deg', [0.1, 0.7, 1.45])
+@pytest.mark.parametrize('roll_deg', [-4.9, 0.0, 4.9])
+def test_an_alignment_that_launch_has_turned_is_acquired(tilt_deg: float, roll_deg: float) -> None:
+    for index in (0, 4, 8):
+        angle = np.random.default_rng(index).uniform(0, 2 * np.pi)
+        axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+        turn = Rotation.from_rotvec(np.radians(tilt_deg) * axis) * Rotation.from_rotvec(
+            [0.0, 0.0, np.radians(roll_deg)]
+        )
+        one, image = shown(index)
+        found = observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn))
+        assert_right(found, one)
+
+
+@pytest.mark.parametrize('scale', [0.98, 1.02])
+def test_a_focal_length_two_percent_off_is_acquired(scale: float) -> None:
+    fx, _, fy, _, _ = PRIOR.camera.intrinsics
+    prior = CameraGeometry(
+        PRIOR.camera.replace(fx=scale * fx, fy=scale * fy), PRIOR.star_tracker_from_camera_xyzw
+    )
+    for index in (1, 4):
+        one, image = shown(index)
+        assert_right(observed(image, one.icrf_from_star_tracker_xyzw, prior), one)
+
+
+@pytest.mark.slow
+def test_a_wrong_attitude_never_matches() -> None:
+    # Anywhere in the sky: that one of 100 comes within 1.5 degrees is a chance of 0.02.
+    refused = 0
+    for index in range(5):
+        _, image = shown(index)
+        for seed in range(20):
+            attitude = Rotation.random(random_state=100 * index + seed).as_quat()
+            with pytest.raises(ImageRefused) as refusal:
+                observed(image, attitude)
+            assert refusal.value.reason == 'no_match'
+            refused += 1
+    assert refused == 100
+
+
+@pytest.mark.parametrize('jump_deg', [0.5, 8.0, 180.0])
+def test_a_jump_of_the_star_tracker(jump_deg: float) -> None:
+    one, image = shown(3)
+    right = Rotation.from_quat(one.icrf_from_star_tracker_xyzw)
+    for axis in np.eye(3):
+        attitude = (right * Rotation.from_rotvec(np.radians(jump_deg) * axis)).as_quat()
+        if jump_deg < 1.0:
+            # Within the search: the stars are right, and the jump shows in the alignment.
+            assert_right(observed(image, attitude), one)
+        else:
+            with pytest.raises(ImageRefused, match='no_match'):
+                observed(image, attitude)
+
+
+def test_hot_pixels_and_missing_and_strange_stars() -> None:
+    one, _ = shown(1)
+    rng = np.random.default_rng(7)
+    seen = rng.uniform(size=len(one.catalog_id)) < 0.6
+    strange = rng.uniform([0, 0], [639, 511], (40, 2))
+    drawn = dataclasses.replace(
+        one,
+        pixel_px=np.concatenate([one.pixel_px[seen], strange]),
+        flux_electrons=np.concatenate([one.flux_electrons[seen], 10 ** rng.uniform(3, 4.5, 40)]),
+    )
+    detector = dataclasses.replace(SCENARIO.detector, hot_fraction=5e-3, cosmic_rays=20.0)
+    image = render(dataclasses.replace(SCENARIO, detector=detector), drawn, 1)
+    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    # Hardly any star that was not drawn is found: one of the strange ones stands in its place.
+    missing = set(one.catalog_id[~seen].tolist())
+    assert sum(number in missing for number in found.catalog_id.tolist()) <= 1
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    true_px = np.array([place[number] for number in found.catalog_id])
+    off_px = np.linalg.norm(found.measured_px - true_px, axis=1)
+    # A strange star beside a true one pulls it; the catalog knows nothing of it.
+    assert len(found) > 80 and (off_px < 1.0).mean() > 0.98
+
+
+@pytest.mark.parametrize('index', range(10))
+@pytest.mark.parametrize('turn_deg', [0.0, 1.0], ids=['near', 'searched'])
+def test_planets_are_no_stars(index: int, turn_deg: float) -> None:
+    one, _ = shown(index)
+    image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
+    turn = Rotation.from_rotvec(np.radians(turn_deg) * np.array([0.6, -0.8, 2.0]))
+    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn)), one)
+
+
+def reasons(found: StarObservations) -> dict[int, str]:
+    """Refusal reasons by catalog number."""
+    names = list(found.refused_stars)
+    pairs = zip(found.refused_catalog_id.tolist(), found.refused_reason.tolist(), strict=True)
+    return {number: names[code] for number, code in pairs}
+
+
+def moved_right(pixels: np.ndarray, u: int, v: int, shift: int) -> None:
+    """Shift the light around a pixel to the right."""
+    window = slice(v - 7, v + 8), slice(u - 7, u + 8)
+    pixels[window] = np.roll(pixels[window], shift, axis=1)
+
+
+def sharpened(pixels: np.ndarray, u: int, v: int) -> None:
+    """Keep only the three brightest pixels around a pixel."""
+    window = pixels[v - 4 : v + 5, u - 4 : u + 5]
+    window[window < np.sort(window.ravel())[-3]] = np.median(pixels)
+
+
+@pytest.mark.parametrize(
+    ('reason', 'centroid', 'spoil'),
+    [
+        # Another source stands where the star should, and too near to be told from it.
+        ('ambiguous', 'psf', functools.partial(moved_right, shift=1)),
+        ('ambiguous', 'moment', functools.partial(moved_right, shift=2)),
+        # The pixel next to the prediction is lit by something that stands elsewhere.
+        ('not_detected', 'psf', functools.partial(moved_right, shift=3)),
+        ('too_few_pixels', 'moment', sharpened),
+    ],
+)
+def test_one_spoilt_star_is_left_out_by_its_reason(
+    reason: str, centroid: str, spoil: Callable[..., None]
+) -> None:
+    one, image = shown(0)
+    options = CentroidOptions(centroid=centroid)
+
+    def seen(pixels: np.ndarray) -> StarObservations:
+        exposure = Exposure(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
+        return observe_stars(exposure, PRIOR, StarSearch(catalog(), options))[0]
+
+    before = seen(image.pixels)
+    apart = np.linalg.norm(one.pixel_px[:, None] - one.pixel_px[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    alone = set(one.catalog_id[apart.min(axis=1) > 15.0].tolist())
+    brightest = next(k for k in np.argsort(-before.flux_dn) if before.catalog_id[k] in alone)
+    star = int(before.catalog_id[brightest])
+    pixels = image.pixels.copy()
+    spoil(pixels, *np.rint(before.measured_px[brightest]).astype(int).tolist())
+    after = seen(pixels)
+    # Those at a limit may change from one refusal to another, as the noise is found anew.
+    fell_out = {
+        number: why for number, why in reasons(after).items() if number not in reasons(before)
+    }
+    assert fell_out == {star: reason}
+    assert reason in STAR_REFUSALS
+
+
+def test_an_empty_image_has_no_stars() -> None:
+    one, image = shown(0)
+    for level in (0, 4095):
+        pixels = np.full((512, 640), level).astype(np.uint16)
+        with pytest.raises(ImageRefused) as refusal:
+            observed(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw)
+        assert refusal.value.reason == 'no_stars'
+
+
+def test_noise_alone_matches_nothing() -> None:
+    one, image = shown(0)
+    rng = np.random.default_rng(8)
+    for _ in range(5):
+        noise = rng.normal(100, 5, image.pixels.shape).astype(np.uint16)
+        with pytest.raises(ImageRefused) as refusal:
+            observed(Image(image.time_ns, noise), one.icrf_from_star_tracker_xyzw)
+        assert refusal.value.reason in ('no_stars', 'no_match')
+
+
+def test_a_mirrored_image_matches_nothing() -> None:
+    one, image = shown(1)
+    mirrored = Image(image.time_ns, image.pixels[:, ::-1].copy())
+    with pytest.raises(ImageRefused, match='no_match'):
+        observed(mirrored, one.icrf_from_star_tracker_xyzw)
+
+
+def test_too_few_stars_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, image = shown(0)
+    used = observed(image, one.icrf_from_star_tracker_xyzw)
+    monkeypatch.setattr('starcal_ros.identification.star_finder._MIN_STARS', 1000)
+    refused = observed(image, one.icrf_from_star_tracker_xyzw)
+    assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
+    assert f'{len(used)} stars measured, 1000 needed' in refused.detail
+    # What became of the others is told all the same.
+    assert refused.refused_stars == used.refused_stars
+    np.testing.assert_array_equal(refused.refused_px, used.refused_px)
+
+
+def test_refused_stars_are_told_with_their_places() -> None:
+    one, image = shown(0)
+    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    assert not set(found.refused_catalog_id) & set(found.catalog_id)
+    counted = {reason: len(places) for reason, places in found.refused_places().items()}
+    assert counted == found.refused_stars and {'blend', 'faint'} <= set(counted)
+    where = {star: k for k, star in enumerate(one.catalog_id)}
+    true_px = one.pixel_px[[where[star] for star in found.refused_catalog_id]]
+    # The match refines the predictions to a fraction of the pixel in which a star is looked for.
+    assert np.abs(found.refused_px - true_px).max() < 0.5
+
+
+def test_the_geometry_is_tracked_from_image_to_image() -> None:
+    turn = Rotation.from_euler('xyz', [0.8, -0.6, 3.0], degrees=True)
+    off = turned(PRIOR, turn)
+    one, image = shown(5)
+    found = observed(image, one.icrf_from_star_tracker_xyzw, off)
+    after = realigned(off, found)
+    left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
+        after.star_tracker_from_camera_xyzw
+    )
+    # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
+    assert np.degrees(left.magnitude()) * 3600 < 200
+    np.testing.assert_array_equal(after.camera.parameters, off.camera.parameters)
+    lost = refused_image(image.time_ns, 640, 512, 'no_match', '')
+    assert realigned(off, lost) is off
+
+
+def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, image = shown(2)
+    marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
+    before = observed(image, one.icrf_from_star_tracker_xyzw)
+    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    after, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
+    monkeypatch.setattr('starcal_ros.identification.blending.MAX_BLEND_SIGMA', 0.1)
+    fewer, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
+    assert fewer.refused_stars['blend'] > after.refused_stars['blend']
+    both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
+    more_px2 = after.covariance_px2[j] - before.covariance_px2[i]
+    assert len(both) > 50 and (more_px2[:, [0, 2]] >= 0).all() and more_px2[:, 0].max() > 1e-6
+    # Stars whose companion is in the catalog have it taken off, mark or no mark.
+    np.testing.assert_array_equal(after.measured_px[j], before.measured_px[i])
+
+
+def test_stars_with_an_unknown_companion_are_told_by_their_shape() -> None:
+    # Each brighter star has a companion of half its light, 3 px away, that the catalog has not.
+    one, _ = shown(4)
+    bright = one.flux_electrons > 3000
+    companion = one.pixel_px[bright] + np.array([2.4, 1.8])
+    drawn = dataclasses.replace(
+        one,
+        pixel_px=np.concatenate([one.pixel_px, companion]),
+        flux_electrons=np.concatenate([one.flux_electrons, 0.5 * one.flux_electrons[bright]]),
+    )
+    quiet = Detector(cosmic_rays=0.0, hot_fraction=0.0, electrons_per_dn=8.0, offset_dn=32.0)
+    image = render(dataclasses.replace(SCENARIO, detector=quiet), drawn, 4)
+    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    doubled = set(one.catalog_id[bright].tolist())
+    kept = [number in doubled for number in found.catalog_id.tolist()]
+    assert len(doubled) > 10 and np.count_nonzero(kept) <= 2

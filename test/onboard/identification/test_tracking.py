@@ -1,0 +1,300 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Tracking: the same stars as a search, or a lost track."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_sky import with_planets  # type: ignore[import-not-found]
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.simulation.rendering import render
+from starcal_ground.simulation.scenario import scenario, Scene, scene
+from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification import star_finder
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    StarSearch,
+)
+from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.stars.image_model import CentroidOptions
+
+SCENARIO = scenario('tiny', seed=8)
+PRIOR = SCENARIO.prior
+OPTIONS = IdentificationOptions()
+CENTROIDS = CentroidOptions(max_saturated_pixels=0)
+
+
+@functools.cache
+def catalog() -> StarCatalog:
+    return load_catalog(None, OPTIONS.magnitude_limit)
+
+
+@functools.cache
+def shown(index: int) -> tuple[Scene, Image]:
+    one = scene(SCENARIO, index)
+    return one, render(SCENARIO, one, index)
+
+
+def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
+    """Image with its reported attitude rotated about an axis."""
+    one, image = shown(index)
+    turn = Rotation.from_rotvec(turn_rad * np.array([0.6, -0.8, 0.0]))
+    return Exposure(
+        image, (Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * turn).as_quat(), 0.5
+    )
+
+
+def searched(
+    index: int, geometry: CameraGeometry = PRIOR
+) -> tuple[StarObservations, TrackedCamera]:
+    observations, instrument = observe_stars(
+        exposure(index), geometry, StarSearch(catalog(), CENTROIDS, OPTIONS)
+    )
+    known = start_tracking(geometry, observations, instrument)
+    assert known is not None
+    return observations, known
+
+
+def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, TrackedCamera]:
+    return track_stars(image, before, StarSearch(catalog(), CENTROIDS, OPTIONS))
+
+
+def of_detector(seed: int, count: int, **changes: Any) -> Iterator[tuple[Scene, StarObservations]]:
+    """Scenes and observations with another detector, from the image that starts a track on."""
+    given = scenario('tiny', seed=seed)
+    other = dataclasses.replace(given, detector=dataclasses.replace(given.detector, **changes))
+    prior, known = other.prior, None
+    for index in range(count):
+        one = scene(other, index)
+        image = render(other, one, index)
+        exposed = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+        if known is not None:
+            observations, known = track_stars(exposed, known, StarSearch(catalog()))
+        else:
+            observations, instrument = observe_stars(exposed, prior, StarSearch(catalog()))
+            known = start_tracking(prior, observations, instrument)
+        if known is not None:
+            yield one, observations
+
+
+@pytest.mark.parametrize('index', [1, 2, 5])
+def test_tracking_gives_the_stars_of_a_search(index: int) -> None:
+    _, known = searched(0)
+    tracked, _ = followed(exposure(index), known)
+    whole, _ = searched(index)
+    assert tracked.refusal == ''
+    both, a, b = np.intersect1d(tracked.catalog_id, whole.catalog_id, return_indices=True)
+    # The noise that one image finds for itself moves the limit of faint stars by a tenth of them.
+    assert len(both) > 0.97 * min(len(tracked), len(whole))
+    assert len(both) > 0.8 * max(len(tracked), len(whole))
+    apart = tracked.measured_px[a] - whole.measured_px[b]
+    sigma = np.sqrt(whole.covariance_px2[b][:, [0, 2]])
+    # The same pixels; width and noise are known a little otherwise.  A star whose neighbour is at
+    # the limit of being measured itself moves by what that pulls, which is in its covariance.
+    off2 = np.sort(((apart / sigma) ** 2).mean(axis=1))
+    assert np.sqrt(off2[:-1].mean()) < 0.05 and off2[-1] < 9.0
+    assert tracked.noise_dn == pytest.approx(whole.noise_dn, rel=0.1)
+    assert tracked.background_dn == pytest.approx(whole.background_dn, abs=0.5)
+
+
+def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
+    _, known = searched(0)
+    for index in range(1, 10):
+        _, known = followed(exposure(index), known)
+    noise = known.instrument.noise.pixel_noise()
+    detector = SCENARIO.detector
+    # Some 500 bright stars tell: the gain to 3 %, the width to 0.2 %.
+    assert noise.gain_e_per_dn == pytest.approx(detector.electrons_per_dn, rel=0.10)
+    assert noise.background == pytest.approx(1.0, abs=0.1) and noise.psf_error < 0.03
+    width = known.instrument.psf_width()
+    assert width.sigma_px == pytest.approx(detector.psf_sigma_px, rel=0.006)
+    assert not width.coefficients[1:].any()  # the same all over the field
+
+
+@pytest.mark.slow
+def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
+    errors = []
+    for seed in (8, 9, 10, 11):
+        cut = of_detector(seed, 10, zero_point_electrons=2.5e4, psf_sigma_px=0.55, offset_dn=0.0)
+        for one, observations in cut:
+            apart_px, nearest = cKDTree(one.pixel_px).query(observations.measured_px)
+            assert apart_px.max() < 3.0
+            sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
+            errors.append((observations.measured_px - one.pixel_px[nearest]) / sigma_px)
+    of_sigma = np.concatenate(errors)
+    # 3,000 errors tell their RMS to 0.013.  A Gaussian for a PSF of half a pixel costs 0.04; with
+    # the small scatter of the pixels at 0 DN it was 1.13.
+    assert float(np.sqrt((of_sigma**2).mean())) < 1.09
+
+
+def test_stars_left_out_as_too_faint_are_listed_as_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole, _ = searched(1)
+    used = np.flatnonzero(np.isin(catalog().id, whole.catalog_id))
+    refused = np.flatnonzero(np.isin(catalog().id, whole.refused_catalog_id))
+    # All that were used, and half of those that are fainter: the catalog is sorted by magnitude.
+    fainter = int((refused > used.max()).sum())
+    count = len(used) + len(refused) - fainter // 2
+    assert fainter > 100
+    monkeypatch.setattr(star_finder, 'detectable_count', lambda *_: count)
+    part, _ = searched(1)
+    assert part.catalog_id.tolist() == whole.catalog_id.tolist()
+    assert set(part.refused_catalog_id) == set(whole.refused_catalog_id)
+    # Light of the faint ones that the fits found is no longer subtracted.
+    sigma_px = np.sqrt(whole.covariance_px2[:, [0, 2]])
+    assert np.median(np.abs(part.measured_px - whole.measured_px) / sigma_px) < 1e-3
+
+
+def test_a_width_that_changes_over_the_field_is_learnt() -> None:
+    detector = dataclasses.replace(SCENARIO.detector, psf_growth=0.3)
+    soft = dataclasses.replace(SCENARIO, detector=detector)
+    known: TrackedCamera | None = None
+    for index in range(5):
+        one = scene(soft, index)
+        image = Exposure(render(soft, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
+        if known is None:
+            observations, instrument = observe_stars(
+                image, PRIOR, StarSearch(catalog(), CENTROIDS, OPTIONS)
+            )
+            known = start_tracking(PRIOR, observations, instrument)
+            assert known is not None
+        else:
+            observations, known = followed(image, known)
+    assert known is not None
+    camera = PRIOR.camera
+    grid = pixel_grid(camera, 7, 5)
+    true_px = detector.psf_sigma_at(grid, (camera.height, camera.width))
+    found_px = known.instrument.psf_width().at(grid)
+    # 30 % wider in the corners; some 250 bright stars tell it to a few percent there.
+    assert np.abs(found_px / true_px - 1.0).max() < 0.06
+    # And no star's error is larger than it says.
+    order = np.argsort(one.catalog_id)
+    row = order[np.searchsorted(one.catalog_id[order], observations.catalog_id)]
+    error = observations.measured_px - one.pixel_px[row]
+    sigma = np.sqrt(observations.covariance_px2[:, [0, 2]])
+    # 300 stars, two axes: known to 3 %, and some have companions fainter than the catalog.
+    assert 0.85 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.15
+    assert observations.refused_stars.get('elongated', 0) < 0.3 * len(observations)
+
+
+@pytest.mark.parametrize(('scale', 'k1'), [(1.02, 0.0), (1.0, 0.05)])
+def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
+    camera = PRIOR.camera
+    wrong = camera.replace(
+        fx=camera.intrinsics[0] * scale,
+        fy=camera.intrinsics[2] * scale,
+        k1=camera.distortion[0] + k1,
+    )
+    _, known = searched(0, CameraGeometry(wrong, PRIOR.star_tracker_from_camera_xyzw))
+    tracked, known = followed(exposure(1), known)
+    assert len(tracked) > 0.95 * len(searched(1)[0])
+    grid = pixel_grid(camera, 9, 7)
+    turn, _ = Rotation.align_vectors(
+        line_of_sight(known.geometry.camera, grid), line_of_sight(SCENARIO.truth.camera, grid)
+    )
+    off = project(known.geometry.camera, turn.apply(line_of_sight(SCENARIO.truth.camera, grid)))
+    # What stars of one image tell of the corners, where it was 7 px off.
+    assert np.abs(off - grid).max() < 1.0
+
+
+def test_noise_of_the_star_tracker_is_tracked() -> None:
+    _, known = searched(0)
+    quiet, _ = followed(exposure(1), known)
+    # 8 px, where the window reaches 12.
+    jumped, after = followed(exposure(1, np.radians(0.25)), known)
+    _, before = followed(exposure(1, np.radians(-0.25)), known)
+    np.testing.assert_array_equal(jumped.catalog_id, quiet.catalog_id)
+    # Fits that start from elsewhere end within what their last step leaves: 0.1 sigma.
+    sigma_px = np.sqrt(quiet.covariance_px2[:, [0, 2]])
+    assert np.abs((jumped.measured_px - quiet.measured_px) / sigma_px).max() < 0.1
+    one, other = (
+        Rotation.from_quat(each.geometry.star_tracker_from_camera_xyzw) for each in (before, after)
+    )
+    assert (one.inv() * other).magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
+
+
+@pytest.mark.slow
+def test_a_drifting_alignment_is_tracked() -> None:
+    _, known = searched(0)
+    first = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
+    focal_px = PRIOR.camera.intrinsics[0]
+    kept = []
+    for turned_px in np.arange(0.0, 4.0, 0.4):
+        before = known
+        observations, known = followed(exposure(1, turned_px / focal_px), known)
+        assert len(observations) > 0.95 * len(searched(1)[0])
+        kept.append(known.geometry is before.geometry)
+    # Under a pixel nothing is corrected, as the next image finds its turn anyway; beyond it is.
+    assert 4 <= kept.count(True) <= 8
+    last = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
+    # Of 3.6 px one may be left, and the star tracker's noise has turned the first image by 0.9.
+    assert abs((first.inv() * last).magnitude() * focal_px - 3.6) < 2.0
+
+
+@pytest.mark.parametrize('turn_deg', [0.6, 1.5, 40.0])
+def test_a_jump_loses_the_track(turn_deg: float) -> None:
+    _, known = searched(0)
+    with pytest.raises(ImageRefused, match='brightest stars'):
+        followed(exposure(1, np.radians(turn_deg)), known)
+
+
+def test_no_window_of_another_sky_is_believed() -> None:
+    _, known = searched(0)
+    lost = 0
+    for index in range(10):
+        for other in range(10):
+            if index == other:
+                continue
+            one, image = exposure(index), shown(other)[1]
+            with pytest.raises(ImageRefused):
+                followed(dataclasses.replace(one, image=image), known)
+            lost += 1
+    assert lost == 90
+
+
+@pytest.mark.parametrize('index', range(1, 10))
+def test_planets_are_no_stars(index: int) -> None:
+    _, known = searched(0)
+    one = shown(index)[0]
+    image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
+    found, _ = followed(dataclasses.replace(exposure(index), image=image), known)
+    # The brightest of them raise the noise over some percent of this small field.
+    assert found.refusal == '' and len(found) > 0.8 * len(followed(exposure(index), known)[0])
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    true_px = np.array([place[number] for number in found.catalog_id.tolist()])
+    off = (found.measured_px - true_px) / np.sqrt(found.covariance_px2[:, [0, 2]])
+    # Several hundred normal deviates; a wrong star is some hundred sigma off.
+    assert np.abs(off).max() < 6.0 and np.sqrt((off**2).mean()) < 1.2
+
+
+def test_an_image_without_psf_starts_no_track() -> None:
+    observations, known = searched(0)
+    assert start_tracking(PRIOR, observations, None) is None
+    refused = dataclasses.replace(observations, refusal='no_match')
+    assert start_tracking(PRIOR, refused, known.instrument) is None
+
+
+@pytest.mark.parametrize(('plateau', 'refused'), [(1.0, 1), (0.9, 0)])
+def test_the_saturation_that_images_before_have_shown(plateau: float, refused: int) -> None:
+    _, known = searched(0)
+    tracked, _ = followed(exposure(1), known)
+    brightest = np.rint(tracked.measured_px[tracked.flux_dn.argmax()]).astype(int)
+    u, v = brightest
+    peak = float(shown(1)[1].pixels[v - 1 : v + 2, u - 1 : u + 2].max())
+    # One pixel at the level is no plateau of its own; one above it shows that it was none.
+    instrument = dataclasses.replace(known.instrument, saturation_dn=0.98 * plateau * peak)
+    again, _ = followed(exposure(1), dataclasses.replace(known, instrument=instrument))
+    assert again.refused_stars.get('saturated', 0) == refused

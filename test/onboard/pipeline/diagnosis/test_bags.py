@@ -1,0 +1,88 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The diagnosis of bags: the alignment that they show, and a process of its own for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.bag import reader
+from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes
+from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
+from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import Image
+from starcal_ros.ros.unmatched import Unmatched
+
+TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+
+
+@pytest.fixture(scope='module')
+def unaligned() -> Setup:
+    """The set-up of the tiny bag without a prior alignment or a star tracker sigma."""
+    return load_setup({'camera_info_url': str(TINY / 'camera.yaml')})
+
+
+@pytest.mark.slow
+def test_an_alignment_not_given_is_found(unaligned: Setup) -> None:
+    assert not unaligned.is_aligned
+    found, sentence = aligned_by_bags([TINY], Topics(), unaligned)
+    assert found.is_aligned and 'prior_alignment is not given: found [' in sentence
+    assert 'from 8 images that agree' in sentence
+    true = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
+    shown = Rotation.from_quat(found.prior.star_tracker_from_camera_xyzw)
+    # The mounting is off by 150 arcsec an axis, the principal point by up to its prior.
+    assert (shown.inv() * true).magnitude() < math.radians(0.2)
+    assert aligned_by_bags([TINY], Topics(), found) == (found, '')
+
+
+def test_two_images_are_too_few_for_an_alignment() -> None:
+    two = Diagnosis('prior_alignment', [0.0, 0.0, 0.0, 1.0], 'x', images=2)
+    assert found_alignment(two) == (None, '2 images agree, 3 are needed.')
+    assert found_alignment(dataclasses.replace(two, images=3))[0] == [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.slow
+def test_an_alignment_not_found_is_said(unaligned: Setup) -> None:
+    options = dataclasses.replace(unaligned.attitude, attitude_direction='inertial_to_st')
+    wrong = dataclasses.replace(unaligned, attitude=options)
+    with pytest.raises(OptionError, match='prior_alignment: not given, and not found: The atti'):
+        aligned_by_bags([TINY], Topics(), wrong)
+
+
+def test_attitudes_that_are_no_rotation_are_left_out() -> None:
+    numbers = [np.array(q) for q in ([0, 0, 0, 1.0], [0, 0, 0, 0.5], [np.nan] * 4, [1.0, 0, 0, 0])]
+    kept = wire_attitudes([30, 20, 15, 10], numbers)
+    assert kept.time_ns.tolist() == [10, 30]
+    assert len(wire_attitudes([], []).quaternion) == 0
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own(
+    unaligned: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In the folder of an untrusted bag: nothing that lies there is imported.
+    (tmp_path / 'cv2.py').write_text('raise SystemExit(9)')
+    monkeypatch.chdir(tmp_path)
+    images = reader.read_images([TINY], '/opnav/image_raw', 0.0)
+    three = tuple(i for _, i in zip(range(3), images, strict=False) if isinstance(i, Image))
+    attitude = dataclasses.replace(unaligned.attitude, attitude_direction='inertial_to_st')
+    answers: list[Diagnosis] = []
+    unmatched = Unmatched(dataclasses.replace(unaligned, attitude=attitude), answers.append)
+    for image in three:
+        unmatched.add(image)
+    assert unmatched._thread is not None
+    unmatched._thread.join()
+    assert [found.cause for found in answers] == ['unknown']
+    assert answers[0].evidence[0].startswith('3 of 3 images identified without attitude')
+    unmatched.close()
+    unmatched.add(three[0])
+    unmatched._thread.join()
+    assert len(answers) == 1

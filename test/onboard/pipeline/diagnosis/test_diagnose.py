@@ -1,0 +1,397 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Each mistake of a set-up, made on rendered images and on real ones, is named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from starcal_ground.simulation import rendering
+from starcal_ground.simulation import scenario as synthetic
+from starcal_ros.camera import CameraModel
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
+from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
+from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.sky.attitude import AttitudeOptions
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
+
+pytestmark = pytest.mark.slow
+
+GRANASAT = Path(__file__).parents[5] / 'shared' / 'realsky' / 'granasat'
+START_NS = 1778829600_000000000
+
+
+@dataclass(frozen=True)
+class Night:
+    """Images, attitudes and a set-up that fit each other."""
+
+    images: tuple[Image, ...]
+    attitudes: WireAttitudes
+    setup: Setup
+
+
+def set_up(geometry: CameraGeometry) -> Setup:
+    return load_setup({}, prior=geometry)
+
+
+def slewing_night() -> Night:
+    """
+    Four images, 20 s apart, of a spacecraft that slews 1 to 3 degrees a second about no one axis.
+
+    The attitude is reported each half second for 100 s before and after, without noise.
+    """
+    rng = np.random.default_rng(7)
+    step_s, around_s, count = 20.0, 100.0, 4
+    knots_s = np.arange(-around_s - step_s, (count - 1) * step_s + around_s + 2 * step_s, step_s)
+    turns = Rotation.from_rotvec(rng.normal(size=(len(knots_s), 3)) * math.radians(25.0))
+    icrf_from_camera = [Rotation.random(random_state=rng)]
+    for turn in turns[1:]:
+        icrf_from_camera.append(icrf_from_camera[-1] * turn)
+    path = Slerp(knots_s, Rotation.concatenate(icrf_from_camera))
+    at_s = np.arange(count) * step_s + 3.0
+    fields = []
+    for z in path(at_s).as_matrix():
+        ra = math.degrees(math.atan2(z[1, 2], z[0, 2])) % 360
+        dec = math.degrees(math.asin(z[2, 2]))
+        upright = Rotation.from_euler('ZXZ', np.radians([ra + 90, 90 - dec, 0.0])).as_matrix()
+        rolled = upright.T @ z
+        fields.append((ra, dec, math.degrees(math.atan2(rolled[1, 0], rolled[0, 0]))))
+    scenario = dataclasses.replace(
+        synthetic.scenario('tiny', seed=3),
+        pointing=synthetic.Inertial(tuple(fields)),
+        image_count=count,
+        cadence_s=step_s,
+        start_ns=START_NS + 3_000000000,
+    )
+    camera_from_tracker = Rotation.from_quat(scenario.truth.star_tracker_from_camera_xyzw).inv()
+    reported_s = np.arange(-around_s, (count - 1) * step_s + around_s, 0.5)
+    stamps_ns = START_NS + np.rint(reported_s * 1e9).astype(np.int64)
+    sent = (path(reported_s) * camera_from_tracker).as_quat()
+    prior = scenario.prior
+    return Night(
+        tuple(rendering.images(scenario)),
+        WireAttitudes(stamps_ns, sent),
+        set_up(prior),
+    )
+
+
+def granasat_night() -> Night:
+    if not GRANASAT.exists():
+        pytest.skip('the real sky is not here')
+    paths = [GRANASAT]
+    images = [i for i in reader.read_images(paths, '/opnav/image_raw') if isinstance(i, Image)]
+    sent = [
+        attitude_from_message(reader.decode(raw))
+        for raw in reader.read_raw(paths, ['/star_tracker/attitude'])
+    ]
+    prior = json.loads(GRANASAT.with_name('granasat.prior.json').read_text())
+    camera = CameraModel(
+        prior['width'], prior['height'], np.array([*prior['k_prior'], *prior['d_prior']])
+    )
+    stamps_ns = np.array([stamp for stamp, _ in sent])
+    order = np.argsort(stamps_ns)
+    quaternions = np.array([quaternion for _, quaternion in sent])[order]
+    return Night(
+        tuple(images[2:6]),  # the first two carry an attitude of something else
+        WireAttitudes(stamps_ns[order], quaternions),
+        set_up(CameraGeometry(camera, np.array(prior['align_prior_xyzw']))),
+    )
+
+
+@pytest.fixture(scope='module', params=[slewing_night, granasat_night])
+def night(request: pytest.FixtureRequest) -> Any:
+    return request.param()
+
+
+@pytest.fixture(scope='module')
+def catalog() -> StarCatalog:
+    return load_catalog(None, 9.0)
+
+
+def with_quaternions(night: Night, change: Callable[[Any], Any]) -> Night:
+    attitudes = WireAttitudes(night.attitudes.time_ns, change(night.attitudes.quaternion))
+    return dataclasses.replace(night, attitudes=attitudes)
+
+
+def with_pixels(night: Night, change: Callable[[Any], Any]) -> Night:
+    images = tuple(Image(i.time_ns, np.ascontiguousarray(change(i.pixels))) for i in night.images)
+    return dataclasses.replace(night, images=images)
+
+
+def with_alignment(night: Night, turn: Rotation) -> Night:
+    turned = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw) * turn
+    prior = CameraGeometry(night.setup.prior.camera, turned.as_quat())
+    return with_setup(night, prior=prior)
+
+
+def with_stamps(night: Night, late_s: float) -> Night:
+    images = tuple(Image(i.time_ns + round(late_s * 1e9), i.pixels) for i in night.images)
+    return dataclasses.replace(night, images=images)
+
+
+def with_setup(night: Night, **changes: Any) -> Night:
+    return dataclasses.replace(night, setup=dataclasses.replace(night.setup, **changes))
+
+
+def found_in(night: Night, catalog: StarCatalog) -> Diagnosis:
+    setup = dataclasses.replace(night.setup, catalog=catalog)
+    found = diagnose(night.images, night.attitudes, setup)
+    assert found.cause in CAUSES and found.sentence.endswith('.')
+    return found
+
+
+def test_nothing_is_wrong(night: Night, catalog: StarCatalog) -> None:
+    assert found_in(night, catalog).cause == 'none'
+
+
+def test_w_first(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_quaternions(night, lambda q: q[:, [3, 0, 1, 2]]), catalog)
+    assert (found.cause, found.found) == ('quaternion_order', 'wxyz')
+
+
+def test_conjugated(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_quaternions(night, lambda q: q * [-1, -1, -1, 1]), catalog)
+    assert (found.cause, found.found) == ('attitude_direction', 'inertial_to_st')
+    assert found.mend[0] == 'attitude_direction: inertial_to_st'
+
+
+def test_wrong_attitude_direction(night: Night, catalog: StarCatalog) -> None:
+    options = AttitudeOptions(attitude_direction='inertial_to_st')
+    found = found_in(with_setup(night, attitude=options), catalog)
+    assert (found.cause, found.found) == ('attitude_direction', 'st_to_inertial')
+
+
+@pytest.mark.parametrize('missing', [False, True])
+def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
+    right = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw)
+    if missing:
+        wrong = unaligned(night)
+    else:
+        wrong = with_alignment(night, Rotation.from_euler('x', 10.0, degrees=True))
+    found = found_in(wrong, catalog)
+    assert found.cause == 'prior_alignment'
+    # The prior of the rendered night is off by 150 arcsec an axis; a lost principal point of 1 px
+    # would be 100 arcsec. Within the degree and a half that is searched, it will do.
+    assert isinstance(found.found, list)
+    assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.0)
+
+
+@pytest.mark.parametrize('degrees', [90.0, 180.0])
+def test_rolled_alignment(night: Night, catalog: StarCatalog, degrees: float) -> None:
+    wrong = with_alignment(night, Rotation.from_euler('z', -degrees, degrees=True))
+    found = found_in(wrong, catalog)
+    assert (found.cause, found.found) == ('rotated', degrees)
+
+
+@pytest.mark.parametrize(
+    ('how', 'change'),
+    [('left to right', lambda p: p[:, ::-1]), ('top to bottom', lambda p: p[::-1])],
+)
+def test_mirrored(night: Night, catalog: StarCatalog, how: str, change: Any) -> None:
+    found = found_in(with_pixels(night, change), catalog)
+    assert (found.cause, found.found) == ('mirrored', how)
+
+
+def test_rotated_image(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_pixels(night, lambda p: p[::-1, ::-1]), catalog)
+    assert (found.cause, found.found) == ('rotated', 180.0)
+
+
+@pytest.mark.parametrize('share', [0.8, 1.2])
+def test_focal_length(night: Night, catalog: StarCatalog, share: float) -> None:
+    camera = night.setup.prior.camera
+    fx, _, fy = camera.intrinsics[:3]
+    wide = camera.replace(fx=share * float(fx), fy=share * float(fy))
+    wrong = with_setup(night, prior=dataclasses.replace(night.setup.prior, camera=wide))
+    found = found_in(wrong, catalog)
+    assert found.cause == 'focal_length'
+    # One image tells it to a few parts in a thousand, its distortion being unknown.
+    assert found.found == pytest.approx(float(fx), rel=0.01)
+
+
+@pytest.mark.parametrize('late_s', [-47.0, -1.5, 3.0, 58.0])
+def test_clock(catalog: StarCatalog, late_s: float) -> None:
+    night = with_stamps(slewing_night(), late_s)
+    found = found_in(night, catalog)
+    assert found.cause == 'clock'
+    # A tenth of a second of 2 degrees a second is what the star tracker's mounting would hide.
+    assert found.found == pytest.approx(-late_s, abs=0.1)
+
+
+@pytest.mark.parametrize('late_s', [-41.0, 33.0])
+def test_clock_of_a_camera_that_rests(catalog: StarCatalog, late_s: float) -> None:
+    found = found_in(with_stamps(granasat_night(), late_s), catalog)
+    assert found.cause == 'clock'
+    # The attitudes are known for half a second before and after each image, at rest: the middle.
+    assert found.found == pytest.approx(-late_s, abs=0.1)
+
+
+def test_no_stars(night: Night, catalog: StarCatalog) -> None:
+    rng = np.random.default_rng(1)
+    dark = with_pixels(night, lambda p: rng.poisson(50, p.shape).astype(p.dtype))
+    assert found_in(dark, catalog).cause == 'no_stars'
+
+
+def test_images_without_stars_before_those_with(night: Night, catalog: StarCatalog) -> None:
+    cap_on = tuple(
+        Image(night.images[0].time_ns - 1000 * (k + 1), np.zeros_like(night.images[0].pixels))
+        for k in range(12)
+    )
+    assert found_in(dataclasses.replace(night, images=cap_on + night.images), catalog).cause == (
+        'none'
+    )
+
+
+@pytest.mark.parametrize('length', [10, 40])
+def test_smear(night: Night, catalog: StarCatalog, length: int) -> None:
+    def smeared(pixels: Any) -> Any:
+        level = np.median(pixels)
+        light = np.stack([np.roll(pixels, k, axis=1) for k in range(length)]).astype(float)
+        streaks = level + (light - level).sum(axis=0) / 6
+        return streaks.clip(0, np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else 4095)
+
+    made = with_pixels(night, lambda p: smeared(p).astype(p.dtype))
+    found = found_in(made, catalog)
+    assert found.cause == 'smear'
+    # A streak longer than the window of 13 px is cut: so much is stated as a lower bound.
+    assert found.found == pytest.approx(min(length, 13), abs=2)
+    assert ('at least' in found.sentence) == (length > 13)
+
+
+def test_tone_curve(night: Night, catalog: StarCatalog) -> None:
+    def curved(pixels: Any) -> Any:
+        light = np.maximum(pixels.astype(float) - np.median(pixels), 0.0) / pixels.max()
+        return (10 + 0.8 * pixels.max() * light ** (1 / 2.2)).astype(pixels.dtype)
+
+    found = found_in(with_pixels(night, curved), catalog)
+    assert found.cause == 'not_linear'
+
+
+@pytest.mark.parametrize(('turns', 'way'), [(1, 'counterclockwise'), (-1, 'clockwise')])
+def test_sides_exchanged(night: Night, catalog: StarCatalog, turns: int, way: str) -> None:
+    found = found_in(with_pixels(night, lambda p: np.rot90(p, turns)), catalog)
+    assert (found.cause, found.found) == ('rotated', 90.0)
+    assert found.sentence.endswith(f'degrees {way}.')
+
+
+def test_another_size_is_no_cause_that_is_known(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_pixels(night, lambda p: p[::2, ::2]), catalog)
+    assert found.cause == 'unknown' and 'The images are' in found.sentence
+
+
+def turned(night: Night, degrees: float) -> Night:
+    axis = np.array([0.6, -0.64, 0.48])
+    return with_alignment(night, Rotation.from_rotvec(np.radians(degrees) * axis))
+
+
+def w_first(night: Night) -> Night:
+    return with_quaternions(night, lambda q: q[:, [3, 0, 1, 2]])
+
+
+def conjugated(night: Night) -> Night:
+    return with_quaternions(night, lambda q: q * [-1, -1, -1, 1])
+
+
+def half_turned(night: Night) -> Night:
+    return with_alignment(night, Rotation.from_euler('z', 180.0, degrees=True))
+
+
+def unaligned(night: Night) -> Night:
+    return with_setup(night, is_aligned=False)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'causes'),
+    [
+        ((conjugated, lambda n: turned(n, 40)), ['attitude_direction', 'prior_alignment']),
+        ((conjugated, half_turned), ['attitude_direction', 'rotated']),
+        ((conjugated, unaligned), ['attitude_direction', 'prior_alignment']),
+        ((conjugated, w_first), ['quaternion_order', 'attitude_direction']),
+        ((w_first, lambda n: turned(n, 6)), ['quaternion_order', 'prior_alignment']),
+        ((w_first, unaligned), ['quaternion_order', 'prior_alignment']),
+        ((half_turned, lambda n: turned(n, 12)), ['prior_alignment']),
+        ((lambda n: with_stamps(n, 20.0), conjugated), ['attitude_direction', 'clock']),
+        ((lambda n: with_stamps(n, 20.0), unaligned), ['clock', 'prior_alignment']),
+    ],
+)
+def test_two_mistakes(night: Night, catalog: StarCatalog, changes: Any, causes: list[str]) -> None:
+    for change in changes:
+        night = change(night)
+    found = found_in(night, catalog)
+    assert [found.cause, *found.also] == causes
+
+
+def test_two_mistakes_of_which_one_is_in_the_images(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_pixels(conjugated(night), lambda p: p[:, ::-1]), catalog)
+    assert [found.cause, *found.also] == ['mirrored', 'attitude_direction']
+
+
+def test_attitudes_of_something_else(night: Night, catalog: StarCatalog) -> None:
+    rng = np.random.default_rng(3)
+    others = with_quaternions(night, lambda q: Rotation.random(len(q), random_state=rng).as_quat())
+    assert found_in(others, catalog).cause == 'unknown'
+
+
+def at_rest(count: int) -> Night:
+    """Images of one attitude, which all ways to read the quaternions fit."""
+    scenario = dataclasses.replace(
+        synthetic.scenario('tiny', seed=3),
+        pointing=synthetic.Inertial(((250.0, 32.0, 10.0),)),
+        image_count=count,
+    )
+    samples = [s for k in range(count) for s in synthetic.attitude_samples(scenario, k)]
+    stamps_ns = np.array([sample.time_ns for sample in samples])
+    sent = np.array([sample.icrf_from_star_tracker_xyzw for sample in samples])
+    prior = scenario.prior
+    return Night(
+        tuple(rendering.images(scenario)),
+        WireAttitudes(stamps_ns, sent),
+        set_up(prior),
+    )
+
+
+@pytest.mark.parametrize('count', [1, 4])
+def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
+    resting = at_rest(count)
+    assert found_in(resting, catalog).cause == 'none'
+    assert found_in(conjugated(resting), catalog).cause == 'attitude_direction'
+    assert found_in(turned(resting, 10), catalog).cause == 'prior_alignment'
+    # Which of the two is wrong cannot be seen: neither is blamed.
+    assert found_in(turned(conjugated(resting), 30), catalog).cause == 'unknown'
+
+
+@pytest.mark.parametrize(
+    ('shape', 'words', 'remedy'),
+    [
+        # Pixel 0 of 2 x 2 is at 0.5 of the detector.
+        ((256, 320), 'binned 2 x 2 (binning_x, binning_y of CameraInfo)', 'fx, fy, cx, cy = '),
+        ((128, 160), 'binned 4 x 4 (binning_x, binning_y of CameraInfo)', 'fx, fy, cx, cy = '),
+        ((400, 600), 'a part of the detector (roi of CameraInfo)', '- x_offset, cy = '),
+        ((1024, 1280), 'The images are 1280 x 1024, the prior', 'focal length in their pixels'),
+    ],
+)
+def test_images_of_another_size_are_named_with_their_remedy(
+    shape: tuple[int, int], words: str, remedy: str
+) -> None:
+    setup = read_setup(Path(__file__).parents[4] / 'bags' / 'tiny' / 'params.yaml')
+    pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)
+    found = diagnose([Image(k, pixels) for k in range(3)], wire_attitudes([], []), setup)
+    assert words in found.sentence and remedy in found.mend[0]
+    assert f'image_width: {shape[1]}, image_height: {shape[0]}' in found.mend[0]
+    if found.found == 2:
+        fx, _, _, cx, _ = setup.prior.camera.intrinsics.tolist()
+        numbers = [float(n) for n in found.mend[0].rpartition('= ')[2].split(', ')]
+        assert numbers[0] == pytest.approx(fx / 2, abs=0.01)
+        assert numbers[2] == pytest.approx((cx + 0.5) / 2 - 0.5, abs=0.01)

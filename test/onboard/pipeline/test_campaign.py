@@ -1,0 +1,154 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Every program that reads a bag calibrates by one recipe; for the nodes see `test/nodes`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+
+from mission_files import images, TINY  # type: ignore[import-not-found]
+import numpy as np
+import pytest
+import yaml
+
+from starcal_ground.cli.main import main
+from starcal_ground.images.night_sky import calibrate_images
+from starcal_ground.mission.trend import fleet
+from starcal_ground.mission.trend.fleet import Cameras
+from starcal_ground.mission.trend.rows import Row
+import starcal_ros
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.records import Calibration
+
+pytestmark = pytest.mark.slow
+
+UNSOUND = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
+"""A bag of the scenario tiny, of whose images two match only with the calibration of the rest."""
+
+
+def unsound(folder: Path) -> Path:
+    """A bag whose set-up is wrong."""
+    assert main(['simulate', '--scenario', 'tiny', *UNSOUND, '-o', str(folder / 'bag')]) == 0
+    return folder / 'bag'
+
+
+def unaligned(folder: Path) -> Path:
+    """A bag without a prior alignment."""
+    bag = Path(shutil.copytree(TINY, folder / 'bag'))
+    content = yaml.safe_load((bag / 'params.yaml').read_text())
+    del content['/**']['ros__parameters']['prior_alignment']
+    (bag / 'params.yaml').write_text(yaml.safe_dump(content))
+    return bag
+
+
+@pytest.fixture(scope='module', params=[unsound, unaligned], ids=['unsound', 'unaligned'])
+def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag with its parameter file."""
+    make: Callable[[Path], Path] = request.param
+    return make(tmp_path_factory.mktemp(make.__name__))
+
+
+@pytest.fixture(scope='module')
+def expected(bag: Path) -> Calibration:
+    """The calibration of `starcal calibrate`, from all images."""
+    out = bag.parent / 'out'
+    params = str(bag / 'params.yaml')
+    assert main(['calibrate', str(bag), '--params', params, '-o', str(out)]) == 0
+    written = starcal_ros.read_calibration(out)
+    assert written.accepted and written.images_used == 10
+    return written
+
+
+def by_python(bag: Path) -> Mapping[str, Any]:
+    """Numbers of `calibrate_bag`."""
+    return numbers_of(starcal_ros.calibrate_bag(bag, bag / 'params.yaml'))
+
+
+def by_trend(bag: Path) -> Mapping[str, Any]:
+    """Numbers of the row of `starcal trend`."""
+    (task,) = fleet.find(str(bag), Cameras(params=str(bag / 'params.yaml')))
+    row = fleet.compute(task).row
+    assert isinstance(row, Row) and not row.error, row
+    sigmas = dict(zip(row.names, row.sigmas, strict=False))
+    return {'images': row.images, 'values': row.values, 'sigma of fx': sigmas['fx']}
+
+
+def by_plan(bag: Path, capsys: pytest.CaptureFixture[str]) -> Mapping[str, Any]:
+    """The sigma from which a plan starts."""
+    capsys.readouterr()
+    wanted = ['--images', '1', '--minimise', 'fx', '--json']
+    assert main(['plan', str(bag), '--params', str(bag / 'params.yaml'), *wanted]) == 0
+    return {'sigma of fx': json.loads(capsys.readouterr().out)['sigma']}
+
+
+def numbers_of(calibration: Calibration) -> Mapping[str, Any]:
+    """Numbers of a calibration that entrances have in common."""
+    parameters = calibration.geometry.camera.parameters
+    sigmas = dict(
+        zip(calibration.geometry.camera.parameter_names, calibration.sigma, strict=False)
+    )
+    images = calibration.images_used
+    return {'images': images, 'values': parameters, 'sigma of fx': sigmas['fx']}
+
+
+@pytest.mark.parametrize('entrance', [by_python, by_trend, by_plan])
+def test_all_entrances_give_one_calibration(
+    bag: Path,
+    expected: Calibration,
+    entrance: Callable[..., Mapping[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = (bag, capsys) if entrance is by_plan else (bag,)
+    for name, number in entrance(*given).items():
+        # JSON and Parquet keep all digits; the process has solved it with one BLAS thread.
+        np.testing.assert_allclose(number, numbers_of(expected)[name], rtol=1e-9, err_msg=name)
+
+
+def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
+    bag, params = tmp_path / 'images.mcap', tmp_path / 'params.yaml'
+    with BagWriter(bag) as writer:
+        for image in images():
+            writer.write_image('/camera/image_raw', image, 'camera')
+    params.write_text('/**:\n  ros__parameters:\n    observer: space\n')
+    by_tool = ['calibrate', str(bag), '--params', str(params), '-o', str(tmp_path / 'out')]
+    assert main([*by_tool, '--no-report']) in (0, 3)
+    written = starcal_ros.read_calibration(tmp_path / 'out')
+    calibration = calibrate_images(bag, observer='space')
+    assert not calibration.has_alignment
+    with pytest.raises(starcal_ros.OptionError, match='starcal_ground.calibrate_images'):
+        starcal_ros.calibrate_bag(bag, params)
+    for name, number in numbers_of(calibration).items():
+        np.testing.assert_allclose(number, numbers_of(written)[name], rtol=1e-9, err_msg=name)
+
+
+def test_an_inspection_reads_as_a_calibration(
+    bag: Path, expected: Calibration, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the images that matched nothing are measured again."""
+    capsys.readouterr()
+    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), '--json']) == 0
+    shown = capsys.readouterr()
+    contents = json.loads(shown.out)
+    unmatched = {group['reason']: group['count'] for group in contents['refused']}
+    assert set(unmatched) <= {'no_match'}
+    assert contents['status']['images'] + sum(unmatched.values()) == expected.images_used
+    assert ('prior_alignment is not given: found [' in shown.err) == (not unmatched)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'problem'),
+    [
+        (('--attitude-topic', 'other'), 'no topic other of type'),
+        (('--observations-topic', 'other'), 'no topic other of type'),
+    ],
+)
+def test_an_inspection_lists_the_topics_where_one_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, str], problem: str
+) -> None:
+    bag = unaligned(tmp_path)
+    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
+    shown = capsys.readouterr().out
+    assert '/opnav/image_raw' in shown and problem in shown

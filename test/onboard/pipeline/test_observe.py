@@ -1,0 +1,481 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A sequence of images: what is measured, what is refused, and where it stands after."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import erfa
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_campaign import attitudes, image, SCENARIO, TRUTH, values, write_png  # type: ignore[import-not-found]
+
+from starcal_ground.simulation.rendering import render, star_electrons
+from starcal_ground.simulation.scenario import attitude_samples, Inertial, scene
+from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.camera import project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.formats.bag.frames import read_telemetry
+from starcal_ros.formats.bag.reader import read_images, Topics
+from starcal_ros.pipeline import observe, solve, topics
+from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
+from starcal_ros.records import (
+    AttitudeSample,
+    CameraGeometry,
+    Ensemble,
+    Image,
+    refused_image,
+    StarObservations,
+)
+from starcal_ros.sky.astrometry import apparent_directions, through_the_air
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
+
+S = 1_000_000_000
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
+
+
+@pytest.fixture(scope='module')
+def setup(camera_yaml: Path) -> Setup:
+    return load_setup(values(camera_yaml))
+
+
+def test_stars_are_observed(setup: Setup) -> None:
+    found = observe.observe(image(), attitudes(), setup, setup.prior)
+    assert found.refusal == '' and len(found) > 100
+    assert found.attitude_gap_s == 0.5
+    assert found.time_ns == image().time_ns
+    one = scene(SCENARIO, 1)
+    attitude_error = (
+        Rotation.from_quat(found.icrf_from_star_tracker_xyzw).inv()
+        * Rotation.from_quat(one.icrf_from_star_tracker_xyzw)
+    ).magnitude()
+    # One error for all samples of an image, which do not move: the interpolation adds nothing.
+    assert attitude_error < 1e-9
+
+
+def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) -> None:
+    drawn = scene(SCENARIO, 1)
+    # A site that sees the middle of the image 20 degrees above its northern or southern horizon.
+    _, _, ahead = drawn.camera_from_icrf
+    sidereal_rad = erfa.era00(2440587.5, drawn.time_ns / (86400 * S))
+    longitude = np.degrees(np.arctan2(ahead[1], ahead[0]) - sidereal_rad) % 360
+    declination = np.degrees(np.arcsin(ahead[2]))
+    ground = {
+        'observer': 'ground',
+        'latitude_deg': declination - np.copysign(70.0, declination),
+        'longitude_deg': longitude,
+        'height_m': 500.0,
+    }
+    made = load_setup(values(camera_yaml, **ground))
+    bent_icrf, elevation_rad = through_the_air(drawn.direction_icrf, drawn.time_ns, made.site)
+    assert np.degrees(np.median(elevation_rad)) == pytest.approx(20.0, abs=2.0)
+    pixel_px = project(TRUTH.camera, bent_icrf @ drawn.camera_from_icrf.T)
+    moved_px = pixel_px - drawn.pixel_px
+    assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
+    seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
+    found = observe.observe(seen, attitudes(), made, TRUTH)
+    place = {
+        number: (pixel, direction)
+        for number, pixel, direction in zip(
+            drawn.catalog_id.tolist(), pixel_px, bent_icrf, strict=True
+        )
+    }
+    assert found.refusal == '' and len(found) > 100
+    uu, _, vv = found.covariance_px2.T
+    off_px = found.measured_px - [place[number][0] for number in found.catalog_id.tolist()]
+    in_sigma = off_px / np.sqrt(np.stack([uu, vv], axis=-1))
+    assert np.sqrt((in_sigma**2).mean()) < 1.2  # as of stars in space
+    # What is recorded is the bent direction, so that a calibration from the record is the same.
+    recorded = [place[number][1] for number in found.catalog_id.tolist()]
+    np.testing.assert_allclose(found.direction_icrf, recorded, rtol=0, atol=1e-12)
+    # Ten degrees lower, half of the stars are too near to the horizon.
+    low = load_setup(
+        values(
+            camera_yaml, **ground | {'latitude_deg': declination - np.copysign(80, declination)}
+        )
+    )
+    bent_icrf, elevation_rad = through_the_air(drawn.direction_icrf, drawn.time_ns, low.site)
+    pixel_px = project(TRUTH.camera, bent_icrf @ drawn.camera_from_icrf.T)
+    seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
+    upper = observe.observe(seen, attitudes(), low, TRUTH)
+    used = np.isin(drawn.catalog_id, upper.catalog_id)
+    assert 30 < len(upper) < len(found) and np.degrees(elevation_rad[used].min()) >= 10.0
+
+
+def test_an_image_of_another_size_is_refused(setup: Setup) -> None:
+    small = Image(image().time_ns, image().pixels[:-2].copy())
+    found = observe.observe(small, attitudes(), setup, setup.prior)
+    assert (found.refusal, found.detail) == (
+        'wrong_size',
+        'image of 640 x 510, prior camera of 640 x 512',
+    )
+    assert (found.width, found.height) == (640, 510)
+    assert len(found) == 0
+
+
+def test_an_image_without_attitude_is_refused(setup: Setup) -> None:
+    samples = attitude_samples(SCENARIO, 1)
+    wide = AttitudeHistory()
+    for sign in (-5, 5):
+        time_ns = image().time_ns + sign * S
+        wide.add(time_ns, attitude_sample(time_ns, np.array([0, 0, 0, 1.0]), 'st_to_inertial'))
+    half = AttitudeHistory()
+    half.add(samples[0].time_ns, samples[0])
+    spoilt = AttitudeHistory()
+    spoilt.add(image().time_ns, None)
+    for held, reason in (
+        (AttitudeHistory(), 'no_attitude'),
+        (half, 'no_attitude'),
+        (wide, 'attitude_gap'),
+        (spoilt, 'bad_attitude'),
+    ):
+        found = observe.observe(image(), held, setup, setup.prior)
+        assert found.refusal == reason and found.detail
+        assert np.isnan(found.attitude_gap_s)
+
+
+def test_an_image_that_nothing_explains_keeps_its_attitude(setup: Setup) -> None:
+    noise = np.random.default_rng(5).normal(40.0, 3.0, image().pixels.shape)
+    found = observe.observe(
+        Image(image().time_ns, noise.astype(np.uint16)), attitudes(), setup, setup.prior
+    )
+    assert found.refusal == 'no_stars'
+    assert found.attitude_gap_s == 0.5
+    assert found.catalog_digest == setup.catalog.digest
+    assert abs(found.icrf_from_star_tracker_xyzw[3]) < 1.0
+
+
+def test_out_of_order_images_say_by_how_much(setup: Setup) -> None:
+    track = observe.Track(setup.prior, image().time_ns + 250_000_000)
+    found, after = observe.observe_next(image(), attitudes(), setup, track)
+    assert found.refusal == 'out_of_order'
+    assert found.detail == '0.250000 s before the last image used'
+    assert (after.geometry, after.latest_ns) == (track.geometry, track.latest_ns)
+
+
+def passed(setup: Setup, track: observe.Track, *offsets_s: int) -> list[str]:
+    """Refusals of one image at several times about that of the last used; no attitudes come."""
+    found = []
+    for offset_s in offsets_s:
+        one = dataclasses.replace(image(), time_ns=image().time_ns + offset_s * 10**9)
+        observations, track = observe.observe_next(one, AttitudeHistory(), setup, track)
+        found.append(observations.refusal)
+    return found
+
+
+def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: Setup) -> None:
+    """A clock set back costs two images; two that have changed places do not start anything."""
+    late, taken = 'out_of_order', 'no_attitude'
+    track = observe.Track(setup.prior, image().time_ns)
+    assert passed(setup, track, -90, -80, -70, -60) == [late, late, taken, taken]
+    assert passed(setup, track, -90, -80, -85, -70) == [late, late, late, late]
+    assert passed(setup, track, -90, -80, 5, -70, -60, 6) == [late, late, taken, late, late, taken]
+
+
+def test_a_recording_that_plays_twice_counts_once(setup: Setup) -> None:
+    first, _ = observe.observe_next(image(), attitudes(), setup, observe.Track(setup.prior))
+    assert not first.refusal
+    later = dataclasses.replace(first, time_ns=first.time_ns + 1)
+    ensemble = Ensemble().add(first).add(later)
+    again = dataclasses.replace(first, attitude_gap_s=0.125)
+    ensemble = ensemble.add(again)
+    assert ensemble.images == (first, later) and dict(ensemble.refused) == {'duplicate': 1}
+
+
+def test_a_refused_image_does_not_put_those_after_it_out_of_order(
+    setup: Setup,
+) -> None:
+    track = observe.Track(setup.prior)
+    future = dataclasses.replace(image(2), time_ns=image().time_ns + 10**15)
+    refused, track = observe.observe_next(future, attitudes(), setup, track)
+    assert refused.refusal == 'no_attitude'
+    found, track = observe.observe_next(image(), attitudes(), setup, track)
+    assert found.refusal == '' and track.latest_ns == image().time_ns
+
+
+@pytest.mark.parametrize('jump_deg', [1.0, 6.0])
+def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float) -> None:
+    turned = CameraGeometry(
+        setup.prior.camera,
+        (
+            Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
+            * Rotation.from_euler('xyz', [0.7, -0.5, 3.0], degrees=True)
+        ).as_quat(),
+    )
+    off = np.array([0.6, -0.8, 0.0]) * np.radians(jump_deg)
+    track, lengths, seen = observe.Track(turned), [], []
+    for index in range(5):
+        held = AttitudeHistory()
+        for sample in attitude_samples(SCENARIO, index):
+            right = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
+            reported = right * Rotation.from_rotvec(off) if index == 2 else right
+            held.add(
+                sample.time_ns,
+                attitude_sample(sample.time_ns, reported.as_quat(), 'st_to_inertial'),
+            )
+        before = track
+        found, track = observe.observe_next(image(index), held, setup, track)
+        lengths.append(len(found))
+        seen.append(found.refusal)
+        if found.refusal:
+            assert (
+                track.geometry is before.geometry and track.tracked_camera is before.tracked_camera
+            )
+            assert track.latest_ns == before.latest_ns
+    # Beyond the search the jump is refused, within it the stars are still the right ones.
+    assert seen == ['', '', '' if jump_deg < 1.5 else 'no_match', '', '']
+    used = [length for length, refusal in zip(lengths, seen, strict=True) if not refusal]
+    assert min(used) > 60
+    # What the first image found of the turned alignment has carried to the last.
+    left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
+        track.geometry.star_tracker_from_camera_xyzw
+    )
+    # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
+    assert left.magnitude() < 200 * ARCSECOND_RAD
+
+
+@pytest.mark.slow
+def test_a_bag_read_once_gives_what_two_passes_give(camera_yaml: Path) -> None:
+    """The tiny bag, all telemetry read before the first image, to the last bit."""
+    setup = load_setup(values(camera_yaml))
+    found = list(topics.read([TINY], Topics(IMAGE_TOPIC, ATTITUDE_TOPIC), setup))
+    held = read_telemetry([TINY], Topics('', ATTITUDE_TOPIC), setup.attitude).attitudes
+    track, expected = observe.Track(setup.prior), []
+    for one in read_images([TINY], IMAGE_TOPIC):
+        assert isinstance(one, Image)
+        observations, track = observe.observe_next(one, held, setup, track)
+        expected.append(observations)
+    assert len(found) == 10
+    for one_pass, two_passes in zip(found, expected, strict=True):
+        assert not one_pass.refusal
+        for field in dataclasses.fields(StarObservations):
+            np.testing.assert_array_equal(
+                getattr(one_pass, field.name), getattr(two_passes, field.name), field.name
+            )
+
+
+def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) -> None:
+    # Every second row 30 DN up, and hot pixels in many stars.
+    rng = np.random.default_rng(9)
+    pattern = np.full((512, 640), 40.0)
+    pattern[::2] += 30.0
+    pattern.flat[rng.choice(pattern.size, 3000, replace=False)] += 300.0
+    one = scene(SCENARIO, 1)
+    light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 8.0
+    noise = rng.normal(0, 1.2, pattern.shape)
+    pixels = np.clip(np.rint(pattern + light + noise), 0, 4095).astype(np.uint16)
+    dark = np.rint(pattern).astype(np.uint16)
+    one_image = Image(image().time_ns, pixels)
+    without = load_setup(values(camera_yaml))
+    url = write_png(tmp_path / 'dark.png', dark)
+    with_dark = load_setup(values(camera_yaml, dark_frame='file://' + url))
+    np.testing.assert_array_equal(with_dark.dark, dark)
+    spoilt = observe.observe(one_image, attitudes(), without, without.prior)
+    found = observe.observe(one_image, attitudes(), with_dark, with_dark.prior)
+    assert found.refusal == '' and len(found) > max(150, 2 * len(spoilt))
+    # The noise of the image alone is left, and nothing is cut off at zero below the dark level.
+    assert found.noise_dn == pytest.approx(1.2, rel=0.1)
+    assert found.background_dn == pytest.approx(np.median(dark), abs=0.3)
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    off_px = found.measured_px - np.array([place[number] for number in found.catalog_id])
+    sigma_px = np.sqrt(found.covariance_px2[:, [0, 2]])
+    assert np.sqrt(np.mean((off_px / sigma_px) ** 2)) < 1.3
+
+
+def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
+    url = write_png(tmp_path / 'dark.png', np.full((512, 640), 7, np.uint8))
+    made = load_setup(values(camera_yaml, dark_frame=url))
+    assert made.dark is not None and made.dark.dtype == np.uint8
+    found = observe.observe(image(), attitudes(), made, made.prior)
+    assert found.refusal == 'bad_encoding'
+    assert found.detail == 'uint16 image, the dark frame is uint8'
+    one = scene(SCENARIO, 1)
+    light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 100.0
+    noise = np.random.default_rng(1).normal(0, 1.0, light.shape)
+    pixels = np.clip(np.rint(light + 7 + noise), 0, 255).astype(np.uint8)
+    byte = observe.observe(Image(image().time_ns, pixels), attitudes(), made, made.prior)
+    assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_frame_that_is_shown_again_is_refused_once_its_stamp_is_new(
+    setup: Setup,
+) -> None:
+    held = attitudes(1)
+    for sample in attitude_samples(SCENARIO, 2):
+        held.add(sample.time_ns, sample)
+    first, track = observe.observe_next(image(1), held, setup, observe.Track(setup.prior))
+    stuck = Image(image(2).time_ns, image(1).pixels)
+    again, track = observe.observe_next(stuck, held, setup, track)
+    assert (first.refusal, again.refusal) == ('', 'frozen')
+    assert again.attitude_gap_s == 0.5
+    next_one, _ = observe.observe_next(image(2), held, setup, track)
+    assert next_one.refusal == ''
+
+
+def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
+    setup: Setup,
+) -> None:
+    """One is put under a star of the third image: bright or dim, the star is left out for it."""
+    track = observe.Track(setup.prior)
+    held = AttitudeHistory()
+    for index in range(1, 4):
+        for sample in attitude_samples(SCENARIO, index):
+            held.add(sample.time_ns, sample)
+    plain = observe.observe(image(3), held, setup, setup.prior)
+    star = np.argsort(plain.snr)[len(plain) // 2]
+    u, v = np.rint(plain.measured_px[star] + [1.0, 0.0]).astype(int)
+    for index in (1, 2, 3):
+        pixels = image(index).pixels.copy()
+        # 15 sigma, one pixel off the centre of a star, pull it by several of its own sigma.
+        pixels[v, u] += round(15.0 * plain.noise_dn)
+        found, track = observe.observe_next(
+            dataclasses.replace(image(index), pixels=pixels), held, setup, track
+        )
+        assert found.refusal == ''
+    assert plain.catalog_id[star] not in found.catalog_id
+    reason = found.refused_reason[found.refused_catalog_id == plain.catalog_id[star]]
+    assert [list(found.refused_stars)[code] for code in reason] == ['hot_pixel']
+
+
+def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
+    camera_yaml: Path, tmp_path: Path, setup: Setup
+) -> None:
+    plain = observe.observe(image(), attitudes(), setup, setup.prior)
+    u, v = np.rint(plain.measured_px[0]).astype(int)
+    dark = np.full(image().pixels.shape, 32, np.uint16)
+    dark[v, u] = 60
+    cv2.imwrite(str(tmp_path / 'dark.png'), dark)
+    made = load_setup(values(camera_yaml, dark_frame=str(tmp_path / 'dark.png')))
+    found = observe.observe(image(), attitudes(), made, made.prior)
+    assert found.refused_stars['hot_pixel'] == 1
+    assert plain.catalog_id[0] not in found.catalog_id
+
+
+def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    """What the dark frame takes away must not hide that the converter was at its end."""
+    dark = np.random.default_rng(4).normal(32.0, 2.0, image().pixels.shape).astype(np.uint16)
+    path = write_png(tmp_path / 'dark.png', dark)
+    made = load_setup(values(camera_yaml, dark_frame=path, max_saturated_pixels=0))
+    pixels = image().pixels.copy()
+    plain = observe.observe(image(), attitudes(), made, made.prior)
+    u, v = np.rint(plain.measured_px[plain.snr.argmax()]).astype(int)
+    pixels[v - 1 : v + 2, u - 1 : u + 2] = 4095
+    found = observe.observe(
+        dataclasses.replace(image(), pixels=pixels), attitudes(), made, made.prior
+    )
+    brightest = plain.catalog_id[plain.snr.argmax()]
+    reason = found.refused_reason[found.refused_catalog_id == brightest]
+    assert [list(found.refused_stars)[code] for code in reason] == ['saturated']
+
+
+def _observed(setup: Setup, step_arcsec: float, is_hung: bool) -> list[str]:
+    """Refusals of five images, each turned by a step; the star tracker may hang at the first."""
+    dec_deg = [20.0 + k * step_arcsec / 3600.0 for k in range(5)]
+    fields = tuple((250.0, dec, 10.0) for dec in dec_deg)
+    drift = dataclasses.replace(SCENARIO, pointing=Inertial(fields))
+    hung = scene(drift, 0).icrf_from_star_tracker_xyzw
+    history = AttitudeHistory()
+    for k in range(5):
+        for sample in attitude_samples(drift, k):
+            xyzw = hung if is_hung else sample.icrf_from_star_tracker_xyzw
+            history.add(sample.time_ns, AttitudeSample(sample.time_ns, xyzw))
+    track, refusals = observe.Track(setup.prior), []
+    for k in range(5):
+        found, track = observe.observe_next(
+            render(drift, scene(drift, k), k), history, setup, track
+        )
+        refusals.append(found.refusal)
+    return refusals
+
+
+def test_a_hung_star_tracker_is_refused_once_the_stars_have_turned(setup: Setup) -> None:
+    """By twice the largest sigma of the star tracker and a tenth of a pixel: 91 arcsec."""
+    ok, frozen = '', 'frozen_attitude'
+    assert _observed(setup, 72.0, is_hung=True) == [ok, ok, frozen, frozen, frozen]
+    assert _observed(setup, 72.0, is_hung=False) == [ok] * 5
+    # A spacecraft that holds its attitude, with a star tracker without noise.
+    assert _observed(setup, 0.0, is_hung=True) == [ok] * 5
+
+
+def test_the_rate_of_the_star_tracker_is_recorded(setup: Setup) -> None:
+    """Two samples half a second before and after the image, 0.02 degrees apart."""
+    step = Rotation.from_rotvec(np.radians([0.0, 0.01, 0.0]))
+    held = AttitudeHistory()
+    middle = Rotation.from_quat(scene(SCENARIO, 1).icrf_from_star_tracker_xyzw)
+    for time_s, turned in ((-0.5, middle * step.inv()), (0.5, middle * step)):
+        time_ns = image().time_ns + round(time_s * S)
+        held.add(time_ns, attitude_sample(time_ns, turned.as_quat(), 'st_to_inertial'))
+    found = observe.observe(image(), held, setup, setup.prior)
+    assert not found.refusal
+    expected = np.radians([0.0, 0.02, 0.0])
+    np.testing.assert_allclose(found.star_tracker_rate_rad_s, expected, atol=1e-12)
+
+
+def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> None:
+    rate_rad_s = np.array([0.01, 0.0, 0.0])
+    held = AttitudeHistory()
+    for time_s in (0.0, 1.0):
+        turned = Rotation.from_rotvec(time_s * rate_rad_s).as_quat()
+        held.add(round(time_s * S), attitude_sample(round(time_s * S), turned, 'st_to_inertial'))
+    mounted = Mounting('second', Rotation.from_euler('z', 90, degrees=True).as_quat())
+    (found,) = attitudes_at(S // 2, AttitudeHistory(), [held], [mounted], 2.0, {})
+    np.testing.assert_allclose(found.rate_rad_s, [0.0, 0.01, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('others', 'measured_m_s', 'sigma_m_s'),
+    [
+        ({}, None, np.nan),
+        ({}, [0.0, 3e4, 0.0], 10.0),
+        ({'observer_velocity_m_s': [0.0, 3e4, 0.0]}, None, 10.0),
+        ({'observer_velocity_m_s': [9e4, 0.0, 0.0]}, [0.0, 3e4, 0.0], 10.0),
+        ({'observer': 'ground', 'latitude_deg': 30.0}, [0.0, 3e4, 0.0], 0.0),
+    ],
+)
+def test_the_sigma_of_the_velocity_is_recorded(
+    camera_yaml: Path,
+    others: dict[str, object],
+    measured_m_s: list[float] | None,
+    sigma_m_s: float,
+) -> None:
+    """Of used and of refused images; a message stands before the constant of the options."""
+    setup = load_setup(values(camera_yaml, **others))
+    given = None if measured_m_s is None else np.array(measured_m_s)
+    blank = Image(image().time_ns, np.full_like(image().pixels, 32))
+    for one in (image(), blank):
+        found = observe.observe(one, attitudes(), setup, setup.prior, given)
+        np.testing.assert_equal(found.velocity_sigma_m_s, sigma_m_s)
+    if sigma_m_s == 10.0:
+        found = observe.observe(image(), attitudes(), setup, setup.prior, given)
+        stars = setup.catalog.select(np.flatnonzero(np.isin(setup.catalog.id, found.catalog_id)))
+        expected = apparent_directions(stars, image().time_ns, np.array([0.0, 3e4, 0.0]))
+        order, by_id = np.argsort(found.catalog_id), np.argsort(stars.id)
+        np.testing.assert_allclose(
+            found.direction_icrf[order], expected[by_id], rtol=0, atol=1e-15
+        )
+
+
+@pytest.mark.slow
+def test_an_image_without_a_match_is_measured_with_the_calibration() -> None:
+    setup = read_setup(TINY / 'params.yaml')
+    chosen = topics.choose_topics([TINY], Topics(), setup)
+    seen = list(topics.read([TINY], chosen, setup))
+    width, height = seen[0].width, seen[0].height
+    lost = refused_image(seen[2].time_ns, width, height, 'no_match', 'lost')
+    smeared = refused_image(seen[5].time_ns, width, height, 'no_stars', 'smeared')
+    before = [*seen[:2], lost, *seen[3:5], smeared, *seen[6:]]
+    ensemble = Ensemble()
+    for record in before:
+        ensemble = solve.add_to_ensemble(ensemble, record, setup)
+    geometry = solve.solve(ensemble, setup).geometry
+    again = topics.measured_again([TINY], chosen, setup, geometry, before)
+    assert [record.refusal for record in again] == [''] * 5 + ['no_stars'] + [''] * 4
+    assert all(a is b for k, (a, b) in enumerate(zip(again, before, strict=True)) if k != 2)
+    # The same stars at the same places, by a search in place of a track.
+    common = np.isin(again[2].catalog_id, seen[2].catalog_id)
+    assert common.sum() > 0.95 * len(seen[2])

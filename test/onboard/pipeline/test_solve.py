@@ -1,0 +1,223 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""From an ensemble to a calibration: statistics, verdict, and what cannot be solved."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: ignore[import-not-found]
+
+from starcal_ground.simulation.scenario import attitude_samples, Detector
+from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.formats.bag.reader import Topics
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.pipeline import observe, solve, topics
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image
+from starcal_ros.sky.attitude import AttitudeHistory
+
+S = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def setup(camera_yaml: Path) -> Setup:
+    return load_setup(values(camera_yaml))
+
+
+def test_refused_images_are_counted(setup: Setup) -> None:
+    collected = Ensemble()
+    for observations in (
+        ensemble().images[0],
+        refused_image(image().time_ns, 640, 512, 'out_of_order', ''),
+        ensemble().images[1],
+        refused_image(image().time_ns, 640, 512, 'out_of_order', ''),
+    ):
+        collected = solve.add_to_ensemble(collected, observations, setup)
+    assert collected.images == ensemble().images[:2]
+    assert collected.refused == {'out_of_order': 2}
+    status = solve.ensemble_status(collected, setup)
+    assert (status.images, status.refused) == (2, {'out_of_order': 2})
+
+
+def test_a_constellation_that_no_camera_shows_is_counted(setup: Setup) -> None:
+    """Negated, mirrored or mixed-up directions have unit length: only their places show them."""
+    sound = ensemble().images[0]
+    mixed = np.random.default_rng(1).permutation(len(sound))
+    for directions in (
+        -sound.direction_icrf,
+        sound.direction_icrf * [1, 1, -1],
+        sound.direction_icrf[mixed],
+    ):
+        wrong = dataclasses.replace(sound, direction_icrf=directions)
+        collected = solve.add_to_ensemble(Ensemble(), wrong, setup)
+        assert (collected.images, collected.refused) == ((), {'bad_observations': 1})
+
+
+def test_at_the_limit_an_image_goes_for_each_that_comes(camera_yaml: Path) -> None:
+    limited = load_setup(values(camera_yaml, max_images=4))
+    collected = Ensemble()
+    for observations in ensemble().images:
+        collected = solve.add_to_ensemble(collected, observations, limited)
+    assert len(collected.images) == 4
+    stars = sorted(len(i) for i in ensemble().images)
+    assert min(len(i) for i in collected.images) > stars[2]
+
+
+def test_a_solution_with_its_statistics(setup: Setup) -> None:
+    found = solve.solve(ensemble(), setup)
+    assert found.accepted and found.reasons == ()
+    assert found.termination == 'converged'
+    assert found.method == CalibrationOptions().method
+    assert found.estimated == estimated_parameters(CalibrationOptions(), 'plumb_bob')
+    assert found.images_used == 10 and found.stars_rejected <= 4
+    assert found.stars_used + found.stars_rejected == ensemble().star_count
+    assert found.time_ns == ensemble().images[-1].time_ns
+    assert found.variance_factor == pytest.approx(1.0, abs=0.1)
+    assert (found.parent_frame, found.child_frame) == (
+        'star_tracker',
+        'camera_optical_frame',
+    )
+    # Skew of 0.1 px or so, sheared over half the height.
+    assert 0 < found.zero_skew_cost_px < 0.2
+    error = found.geometry.camera.parameters - TRUTH.camera.parameters
+    free = [PARAMETER_NAMES.index(name) for name in found.estimated]
+    assert np.abs(error[free] / found.sigma[free]).max() < 5
+    turn = (
+        Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw).inv()
+        * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw)
+    ).magnitude()
+    # Ten images of 10, 10 and 40 arcsec: 13 in the mean, and 36 of the principal point, whose 0.3
+    # px the alignment takes up.
+    assert turn / ARCSECOND_RAD < 50
+
+
+def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
+    # With the principal point held: one that is estimated trades with pitch and yaw.
+    found = solve.solve(ensemble(), setup, estimate=('fx', 'skew', 'fy', 'distortion'))
+    maps, correlation = found.maps, found.correlation
+    assert maps is not None and correlation is not None
+    assert maps.stars.shape == (8, 10) and maps.stars.sum() == found.stars_used
+    whole, shape = maps.line_of_sight_sigma_arcsec, maps.shape_sigma_arcsec
+    assert whole.shape == shape.shape == (16, 20)
+    # The centre is as good as the alignment: pitch and yaw of the 13 x 13 covariance; the two
+    # middle rows and columns are half a cell off it.
+    pitch_yaw_arcsec = np.hypot(*found.sigma[10:12]) / ARCSECOND_RAD
+    np.testing.assert_allclose(whole[7:9, 9:11], pitch_yaw_arcsec, rtol=0.05)
+    assert (shape < whole).all() and whole.argmin() not in (0, 19, 300, 319)
+    assert correlation.names == (*found.estimated, *ALIGNMENT_NAMES)
+    np.testing.assert_allclose(np.diag(correlation.matrix), 1.0, rtol=1e-12)
+    rows = [found.parameter_names.index(name) for name in correlation.names]
+    np.testing.assert_allclose(
+        correlation.matrix * np.outer(found.sigma[rows], found.sigma[rows]),
+        found.covariance[np.ix_(rows, rows)],
+        rtol=1e-9,
+    )
+
+
+@pytest.mark.slow
+def test_method_and_names_can_be_said_for_one_solution(setup: Setup) -> None:
+    found = solve.solve(ensemble(), setup, method='single', estimate=['fx', 'fy', 'k1'])
+    assert (found.method, found.estimated) == ('single', ('fx', 'fy', 'k1'))
+    prior, after = setup.prior.camera.parameters, found.geometry.camera.parameters
+    changed = [n for n, a, b in zip(PARAMETER_NAMES, prior, after, strict=True) if a != b]
+    assert changed == ['fx', 'fy', 'k1']
+    options = json.loads(found.provenance['options'])
+    assert options['method'] == 'single' and options['estimate'] == ['fx', 'fy', 'k1']
+    assert setup.calibration.method == CalibrationOptions().method
+    with pytest.raises(OptionError, match="method: 'best' is not one of"):
+        solve.solve(ensemble(), setup, method='best')
+    with pytest.raises(OptionError, match=r"estimate\[0\]: 'fz' is not one of fx, skew"):
+        solve.solve(ensemble(), setup, estimate=['fz'])
+
+
+def test_too_few_images_cannot_be_solved(setup: Setup) -> None:
+    with pytest.raises(TooFewObservations, match='1 more images are needed'):
+        solve.solve(Ensemble(ensemble().images[:2]), setup)
+
+
+@pytest.mark.slow
+def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
+    strict = load_setup(values(camera_yaml, max_map_sigma_px=1e-6))
+    found = solve.solve(ensemble(), strict)
+    assert not found.accepted
+    assert len(found.reasons) == 1 and 'max_map_sigma_px' in found.reasons[0]
+    refused = [check for check in found.gate if check.passed is False]
+    assert [check.option for check in refused] == ['max_map_sigma_px']
+    assert refused[0].limit == 1e-6 and found.reasons[0].startswith(refused[0].name)
+
+
+@pytest.mark.slow
+def test_the_gate_counts_the_stars_that_were_used(setup: Setup) -> None:
+    """Those left out as outliers cover nothing."""
+    found = solve.solve(ensemble(), setup)
+    assert found.maps is not None
+    covered = next(check for check in found.gate if check.option == 'min_coverage')
+    assert covered.found == (found.maps.stars > 0).mean()
+
+
+@pytest.mark.slow
+def test_equal_inputs_give_equal_numbers(setup: Setup) -> None:
+    one, other = (solve.solve(ensemble(), setup) for _ in range(2))
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
+    assert one.provenance == other.provenance
+
+
+@pytest.mark.slow
+def test_from_pixels_to_a_calibration_that_is_true(setup: Setup) -> None:
+    held = AttitudeHistory()
+    for index in range(10):
+        for sample in attitude_samples(SCENARIO, index):
+            held.add(sample.time_ns, sample)
+    collected = Ensemble()
+    for index in range(10):
+        found = observe.observe(image(index), held, setup, setup.prior)
+        collected = solve.add_to_ensemble(collected, found, setup)
+    assert len(collected.images) == 10
+    calibration = solve.solve(collected, setup)
+    assert calibration.accepted
+    free = [PARAMETER_NAMES.index(name) for name in calibration.estimated]
+    error = (calibration.geometry.camera.parameters - TRUTH.camera.parameters)[free]
+    assert np.abs(error / calibration.sigma[free]).max() < 4.5
+    assert calibration.residual_rms_px < 0.25
+    assert Detector().psf_sigma_px == pytest.approx(collected.images[0].psf_sigma_px, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_bag_with_temperatures_to_a_calibration_with_terms(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    with BagWriter(tmp_path / 'warm') as writer:
+        for index in range(4):
+            for sample in attitude_samples(SCENARIO, index):
+                quaternion = sample.icrf_from_star_tracker_xyzw
+                writer.write_attitude('/attitude', sample.time_ns, quaternion, 'icrf')
+            one = image(index)
+            writer.write_temperature('/box', one.time_ns - S, 10.0 + 5.0 * index, 'camera')
+            writer.write_temperature('/box', one.time_ns + 1, 99.0, 'camera')
+            writer.write_image('/image', one, 'camera')
+    warm = load_setup(values(camera_yaml, focal_temperature_order=1, alignment_temperature=True))
+    paths = [tmp_path / 'warm']
+    found = list(topics.read(paths, Topics('/image', '/attitude', temperature='/box'), warm))
+    assert [one.temperature_degc for one in found] == [10.0, 15.0, 20.0, 25.0]
+    plain = list(topics.read(paths, Topics('/image', '/attitude'), warm))
+    assert all(np.isnan(one.temperature_degc) for one in plain)
+    # The simulated camera does not change with temperature, and that is what is found.
+    terms = solve.solve(Ensemble(tuple(found)), warm).temperature
+    assert terms is not None and terms.reference_degc == 20.0
+    assert terms.note == ''
+    for values_found, sigma in (
+        (terms.focal_per_degc, terms.focal_per_degc_sigma),
+        (terms.alignment_rate_rad_per_degc, terms.alignment_rate_rad_per_degc_sigma),
+    ):
+        assert values_found and (np.abs(values_found) < 4 * np.array(sigma)).all()
+    terms = solve.solve(Ensemble(tuple(plain)), warm).temperature
+    assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'

@@ -1,0 +1,171 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A star tracker that is stated and not in the bag: an error, alike in all commands."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from starcal_ground.cli.main import main
+from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import (
+    make_header,
+    Message,
+    quaternion_to_message,
+    vector_to_message,
+)
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.records import Image
+
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
+ODOMETRY, POSE, TF = (
+    'nav_msgs/msg/Odometry',
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'tf2_msgs/msg/TFMessage',
+)
+XYZ = np.zeros(3)
+
+
+def attitude(kind: str, time_ns: int, xyzw: np.ndarray) -> Message:
+    """Return a message of a type that starcal does not read, with an attitude in it."""
+    header, orientation = (
+        make_header(time_ns, 'icrf', make_message),
+        quaternion_to_message(xyzw, make_message),
+    )
+    if kind == TF:
+        place = vector_to_message(XYZ, make_message)
+        transform = make_message(
+            'geometry_msgs/msg/Transform', translation=place, rotation=orientation
+        )
+        stamped = make_message(
+            'geometry_msgs/msg/TransformStamped',
+            header=header,
+            child_frame_id='star_tracker',
+            transform=transform,
+        )
+        return make_message(TF, transforms=[stamped])
+    point = make_message('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0)
+    pose = make_message('geometry_msgs/msg/Pose', position=point, orientation=orientation)
+    wide = make_message('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=np.zeros(36))
+    if kind == POSE:
+        return make_message(POSE, header=header, pose=wide)
+    still = vector_to_message(XYZ, make_message)
+    twist = make_message('geometry_msgs/msg/Twist', linear=still, angular=still)
+    speed = make_message(
+        'geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=np.zeros(36)
+    )
+    return make_message(ODOMETRY, header=header, child_frame_id='body', pose=wide, twist=speed)
+
+
+def write_bag(path: Path, kind: str) -> Path:
+    """Write the tiny bag with its attitudes in messages of a type; none for an empty one."""
+    with BagWriter(path) as writer:
+        for image in reader.read_images([TINY], IMAGE_TOPIC):
+            assert isinstance(image, Image)
+            writer.write_image(IMAGE_TOPIC, image, 'camera')
+        for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC] if kind else []):
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            writer._write('/gnc/state', kind, time_ns, attitude(kind, time_ns, xyzw))
+    return path
+
+
+def params(folder: Path, **options: object) -> Path:
+    path = folder / 'params.yaml'
+    values = {'camera_info_url': str(TINY / 'camera.yaml'), **options}
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    return path
+
+
+STATED = {
+    'prior_alignment': [0.0, 0.0, 0.0, 1.0],
+    'star_tracker_sigma_arcsec': [10.0, 10.0, 20.0],
+}
+
+
+@pytest.mark.parametrize('stated', STATED)
+@pytest.mark.parametrize('kind', [ODOMETRY, POSE, TF, ''])
+def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_command(
+    kind: str, stated: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path / 'bag.mcap', kind)
+    given = ['--params', str(params(tmp_path, **{stated: STATED[stated]}))]
+    for command, status in (
+        (['calibrate', str(bag), *given, '-o', str(tmp_path / 'out')], 2),
+        (['inspect', str(bag), *given], 3),
+        (['diagnose', str(bag), *given], 2),
+    ):
+        assert main(command) == status
+        said = ' '.join(' '.join(capsys.readouterr()).split())
+        assert 'record the attitudes of the star tracker' in said
+        assert 'starcal calibrate --camera-alone' in said
+        if kind:
+            name = kind.rpartition('/')[2]
+            assert f'/gnc/state is a {name}, which is not read: publish its orientation' in said
+
+
+@pytest.mark.parametrize(
+    ('kind', 'options'),
+    [
+        ('', []),
+        (ODOMETRY, []),
+        ('', ['PARAMS']),
+        (TF, ['PARAMS', '--camera-alone']),
+    ],
+)
+def test_inspect_takes_images_without_attitudes_where_calibrate_does(
+    kind: str, options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path / 'bag.mcap', kind)
+    stated = STATED if '--camera-alone' in options else {}
+    words = {'PARAMS': ['--params', str(params(tmp_path, **stated))]}
+    given = [word for option in options for word in words.get(option, [option])]
+    assert main(['inspect', str(bag), *given]) == 0
+    said = capsys.readouterr().out
+    assert '10 of 10 images' in said and 'the camera alone, without attitudes' in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('with_attitudes', [False, True])
+def test_the_camera_alone_is_calibrated_where_it_is_requested(
+    with_attitudes: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = TINY if with_attitudes else write_bag(tmp_path / 'bag.mcap', ODOMETRY)
+    command = ['calibrate', str(bag), '--camera-alone', '-o', str(tmp_path / 'out')]
+    assert main([*command, '--params', str(TINY / 'params.yaml')]) in (0, 3)
+    assert not read_calibration(tmp_path / 'out' / 'calibration.json').has_alignment
+    assert 'not used, since the attitudes are those of the stars: prior' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('command', ['inspect', 'inspect --params', 'calibrate --params'])
+def test_a_clock_that_was_never_set_is_named(
+    command: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reader.log_damage.cache_clear()
+    bag = tmp_path / 'bag.mcap'
+    start_ns = next(reader.read_images([TINY], IMAGE_TOPIC)).time_ns
+    with BagWriter(bag) as writer:
+        for image in itertools.islice(reader.read_images([TINY], IMAGE_TOPIC), 2):
+            assert isinstance(image, Image)
+            unset = Image(image.time_ns - start_ns + 5 * 10**9, image.pixels)
+            writer.write_image(IMAGE_TOPIC, unset, 'camera')
+        for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC]):
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            if time_ns - start_ns > -5 * 10**9:
+                after_ns = time_ns - start_ns + 5 * 10**9
+                writer.write_attitude(ATTITUDE_TOPIC, after_ns, xyzw, 'icrf')
+    name, *with_params = command.split()
+    given = [*with_params, str(TINY / 'params.yaml')] if with_params else []
+    out = ['-o', str(tmp_path / 'out'), '--no-report'] if name == 'calibrate' else []
+    main([name, str(bag), *given, *out])
+    words = [
+        record.message for record in caplog.records if 'the clock was not set' in record.message
+    ]
+    assert len(words) == 1 and 'stamp images and attitudes in UTC' in words[0]

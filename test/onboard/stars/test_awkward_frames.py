@@ -1,0 +1,166 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Frames that are no textbook: cut off at black, masked borders, undersampled stars, slopes."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcal_ground.simulation.rendering import expose, star_electrons
+from starcal_ground.simulation.scenario import Detector
+from starcal_ros.formats.bag import reader
+from starcal_ros.records import Image, StarRefusal
+from starcal_ros.stars.centroiding import Centroids, measure_stars
+from starcal_ros.stars.detection import (
+    Background,
+    detect,
+    measure_background,
+    sample_background,
+    sample_mesh,
+)
+from starcal_ros.stars.frame_checks import fingerprint, sample_rows, screen, ScreeningOptions
+from starcal_ros.stars.image_model import CentroidOptions, model_image
+from starcal_ros.stars.pixel_noise import NoiseSums
+
+SHAPE = (512, 640)
+QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
+OPTIONS = CentroidOptions()
+WISPR = Path(__file__).parents[4] / 'shared' / 'realsky' / 'wispr_i_2022'
+
+
+def star_grid(seed: int, spacing: int = 32) -> np.ndarray:
+    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
+    v, u = np.mgrid[spacing : SHAPE[0] - spacing : spacing, spacing : SHAPE[1] - spacing : spacing]
+    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
+    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
+
+
+def measured(pixels: np.ndarray, xy: np.ndarray) -> Centroids:
+    background = measure_background(pixels)
+    sources = detect(pixels, background)
+    model = model_image(pixels, background, sources, OPTIONS)
+    return measure_stars(pixels, xy, model, OPTIONS)
+
+
+@pytest.mark.parametrize('measure', [measure_background, sample_background])
+def test_noise_cut_off_at_black_is_that_of_its_upper_half(measure: object) -> None:
+    # Noise of 2 DN about a pedestal of -1 DN: 60 % of the pixels are at zero.
+    noise = np.random.default_rng(1).normal(-1.0, 2.0, SHAPE)
+    pixels = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
+    background: Background = measure(pixels)  # type: ignore[operator]
+    # The 2-sigma quantile is 3 DN, above a median of 0.
+    assert 1.3 <= background.noise_dn <= 2.1
+
+
+def test_a_black_sky_has_few_false_sources() -> None:
+    # A sky at -2 sigma: one pixel in 20 is above black.
+    noise = np.random.default_rng(2).normal(-1.0, 0.9, SHAPE)
+    pixels = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
+    sources = detect(pixels, measure_background(pixels))
+    assert len(sources.snr) <= 10
+
+
+def test_a_masked_border_does_not_raise_the_noise() -> None:
+    pixels = np.random.default_rng(3).normal(1000.0, 20.0, SHAPE).round().astype(np.uint16)
+    whole = measure_background(pixels)
+    masked = pixels.copy()
+    masked[:14], masked[-9:], masked[:, -20:] = 0, 0, 0
+    found = measure_background(masked)
+    at_edges = np.array([[300.0, 16.0], [610.0, 250.0], [300.0, 500.0]])
+    for mesh, sound in (
+        (found.noise_mesh, whole.noise_mesh),
+        (found.level_mesh, whole.level_mesh),
+    ):
+        # A cell of 200 samples tells its noise to 5 % and its level to 1.4 DN.
+        assert sample_mesh(mesh, SHAPE, at_edges) == pytest.approx(
+            sample_mesh(sound, SHAPE, at_edges), rel=0.15
+        )
+
+
+def test_undersampled_stars_are_found_and_their_covariance_holds() -> None:
+    # Half of the light of a star in the middle of a pixel is in that pixel.
+    detector = dataclasses.replace(QUIET, psf_sigma_px=0.47)
+    squared, found_share = [], []
+    for seed in range(4):
+        xy = star_grid(seed)
+        mean = star_electrons(xy, np.full(len(xy), 6000.0), detector.psf_sigma_px, SHAPE)
+        rng = np.random.default_rng([seed, 1])
+        pixels = expose(mean + detector.background_electrons, detector, rng)
+        sources = detect(pixels, measure_background(pixels))
+        nearest = np.linalg.norm(xy[:, None] - sources.xy_px[None], axis=2).min(axis=1)
+        found_share.append((nearest < 1.0).mean())
+        found = measured(pixels, xy)
+        good = found.refusal == StarRefusal.NONE
+        assert good.mean() > 0.95
+        error = found.xy_px - xy
+        squared.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    assert min(found_share) > 0.97
+    # 1000 stars: 1.6 %.  The width of the PSF itself is known to 2 %.
+    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.parametrize('slope', [0.1, 0.5])
+def test_a_steady_slope_is_subtracted(slope: float) -> None:
+    # In noise per pixel: without it, a slope of 0.5 pulls every star by two of its sigmas.
+    detector = dataclasses.replace(QUIET, psf_sigma_px=1.0, bits=16)
+    normalised, signed = [], []
+    for seed in range(3):
+        xy = star_grid(seed)
+        mean = star_electrons(xy, np.full(len(xy), 2500.0), detector.psf_sigma_px, SHAPE)
+        noise_e = measure_background(
+            expose(np.full(SHAPE, detector.background_electrons), detector,
+                   np.random.default_rng(0))
+        ).noise_dn * detector.electrons_per_dn  # fmt: skip
+        sky = detector.background_electrons + slope * noise_e * np.arange(SHAPE[1])
+        pixels = expose(mean + sky, detector, np.random.default_rng([seed, 1]))
+        found = measured(pixels, xy)
+        good = found.refusal == StarRefusal.NONE
+        assert good.mean() > 0.8
+        error = (found.xy_px - xy)[good] / np.sqrt(found.covariance_px2[good][:, [0, 2]])
+        normalised.append(error**2)
+        signed.append(error[:, 0])
+    # 600 stars: a mean to 0.04 sigma, an rms to 2 %.
+    assert abs(np.concatenate(signed).mean()) < 0.15
+    assert np.sqrt(np.concatenate(normalised).mean()) == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_gain_is_no_refuge_for_an_error_of_the_psf() -> None:
+    # Two regressors that nearly coincide: the one that shows less is left out.
+    rng = np.random.default_rng(5)
+    signal = rng.uniform(500.0, 3000.0, 400)
+    columns = np.stack([np.full(400, 25.0), signal, signal * 9000.0])
+    truth = np.array([1.0, 0.0, 0.0004])
+    variance = truth @ columns
+    weight = 1.0 / variance
+    squared = variance * rng.chisquare(1, 400)
+    A = columns * weight
+    noise = NoiseSums(A @ A.T, A @ (squared * weight)).pixel_noise()
+    modelled = 25.0 * noise.background + signal / noise.gain_e_per_dn
+    modelled += noise.psf_error**2 * signal * 9000.0
+    # Either explains the pixels; their variance is what must be right, to 7 % of 400 squares.
+    assert (modelled / variance).mean() == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_steep_sky_is_measured_in_small_cells() -> None:
+    v, u = np.mgrid[:1024, :960]
+    corona = 60000.0 / (1.0 + np.hypot(u + 100.0, v - 512.0) / 150.0) ** 2
+    electrons = np.random.default_rng(6).poisson(20.0 * (corona + 500.0))
+    pixels = np.rint(electrons / 20.0).astype(np.uint16)
+    small = measure_background(pixels).level_mesh
+    assert (sample_background(pixels).level_mesh == small).all()
+    flat = np.random.default_rng(7).normal(500.0, 5.0, pixels.shape).astype(np.uint16)
+    assert sample_background(flat).level_mesh.size < small.size
+
+
+@pytest.mark.skipif(not WISPR.exists(), reason='images of others, not part of the tree')
+def test_stars_beside_the_corona_are_measured() -> None:
+    """Two images of a telescope near the Sun, whose sky spans a factor of 200."""
+    for image in reader.read_images([WISPR], '/opnav/image_raw'):
+        assert isinstance(image, Image)
+        sample = sample_rows(image.pixels)
+        screen(sample, fingerprint(image, sample), None, 0.0, None, ScreeningOptions())
+        found = detect(image.pixels, measure_background(image.pixels))
+        assert len(found.snr) > 300

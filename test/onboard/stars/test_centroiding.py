@@ -1,0 +1,582 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Centroids of rendered stars: the Cramer-Rao bound, true covariances, no bias, good refusals."""
+
+from __future__ import annotations
+
+from collections import Counter
+import dataclasses
+
+import numpy as np
+import pytest
+
+from starcal_ground.simulation.centroids import centroid_bound
+from starcal_ground.simulation.rendering import expose, star_electrons
+from starcal_ground.simulation.scenario import Detector
+from starcal_ros.records import StarRefusal
+from starcal_ros.stars.centroiding import Centroids, measure_stars
+from starcal_ros.stars.detection import detect, measure_background, sample_mesh
+from starcal_ros.stars.image_model import (
+    CentroidOptions,
+    ImageModel,
+    model_image,
+    saturation_level,
+)
+from starcal_ros.stars.pixel_noise import PixelNoise
+from starcal_ros.stars.psf_fit import fit_psf, noise_sums
+
+SHAPE = (512, 640)
+QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
+PSF, MOMENT = CentroidOptions(), CentroidOptions(centroid='moment')
+
+
+def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
+    v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
+    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
+    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
+
+
+def unlike_fluxes(seed: int, n: int) -> np.ndarray:
+    """Electrons (n,) of stars over four magnitudes."""
+    return np.asarray(300.0 * 50.0 ** np.random.default_rng([seed, 2]).uniform(size=n))
+
+
+def exposed(
+    seed: int, xy: np.ndarray, flux: np.ndarray, detector: Detector, more: float | np.ndarray = 0.0
+) -> np.ndarray:
+    """An image of stars of a flux (n,) in electrons, with more light added."""
+    mean = star_electrons(xy, np.asarray(flux, float), detector.psf_sigma_px, SHAPE)
+    return expose(
+        mean + detector.background_electrons + more, detector, np.random.default_rng([seed, 1])
+    )
+
+
+def modelled(pixels: np.ndarray, options: CentroidOptions = PSF) -> ImageModel:
+    background = measure_background(pixels)
+    return model_image(pixels, background, detect(pixels, background), options)
+
+
+def measured(pixels: np.ndarray, xy: np.ndarray, options: CentroidOptions = PSF) -> Centroids:
+    return measure_stars(pixels, xy, modelled(pixels, options), options)
+
+
+def field(
+    seed: int, detector: Detector, options: CentroidOptions = PSF
+) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
+    """Errors (n, 2), centroids, bound variances (n, 2), snr (n,) of one image of unlike stars."""
+    xy = star_grid(seed)
+    # The same contrast for any width: the area of the PSF.
+    area = (detector.psf_sigma_px / 0.95) ** 2
+    flux = area * unlike_fluxes(seed, len(xy))
+    found = measured(exposed(seed, xy, flux, detector), xy, options)
+    bound, snr = centroid_bound(xy, flux, detector, SHAPE)
+    return found.xy_px - xy, found, bound[:, [0, 1], [0, 1]], snr
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
+@pytest.mark.parametrize('bits', [8, 12])
+def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) -> None:
+    detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
+    if bits == 8:  # the same stars on 256 steps: 16000 electrons peak at 3100
+        detector = dataclasses.replace(detector, bits=8, electrons_per_dn=20.0, offset_dn=12.0)
+    over_bound, over_sigma, refused = [], [], Counter[int]()
+    for seed in range(6):
+        error, found, bound, snr = field(seed, detector)
+        bright = snr > 10
+        good = bright & (found.refusal == StarRefusal.NONE)
+        refused.update(found.refusal[bright & ~good].tolist())
+        over_bound.append(error[good] ** 2 / bound[good])
+        over_sigma.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    stars = sum(map(len, over_bound))
+    assert stars > 2000 and refused.total() < 0.005 * stars, refused
+    # Two coordinates of 2400 stars: the ratios are known to 1 %; three of those below 1.
+    ratio = np.sqrt(np.concatenate(over_bound).mean())
+    assert 0.97 < ratio < 1.05
+    truth = np.sqrt(np.concatenate(over_sigma).mean())
+    assert 0.96 < truth < 1.04
+
+
+def test_the_covariance_is_true_where_the_gain_is_given() -> None:
+    options = CentroidOptions(gain_e_per_dn=QUIET.electrons_per_dn)
+    squared = []
+    for seed in range(6):
+        error, found, _, snr = field(seed, QUIET, options)
+        good = (snr > 10) & (found.refusal == StarRefusal.NONE)
+        squared.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    # Known to 1 %.
+    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
+def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
+    # So bright (16 bit) that a single centroid is good to 1.5e-3 sigma.
+    detector = dataclasses.replace(
+        QUIET, psf_sigma_px=psf_sigma_px, bits=16, electrons_per_dn=10.0, offset_dn=500.0
+    )
+    error, phase = [], []
+    for seed in range(4):
+        xy = star_grid(10 + seed)
+        found = measured(exposed(seed, xy, np.full(len(xy), 4e5), detector), xy)
+        good = found.refusal == StarRefusal.NONE
+        assert good.mean() > 0.99
+        error.append((found.xy_px - xy)[good])
+        phase.append((xy - np.rint(xy))[good])
+    bins = np.digitize(np.concatenate(phase).ravel(), np.linspace(-0.5, 0.5, 11)) - 1
+    bias = np.bincount(bins, np.concatenate(error).ravel()) / np.bincount(bins)
+    # 330 centroids in each of ten bins: means good to 2e-4 px.
+    assert len(bias) == 10 and np.abs(bias).max() < 0.002
+
+
+@pytest.mark.parametrize('flux', [6e2, 1e3, 2e4])
+def test_no_bias_with_the_phase_at_any_signal(flux: float) -> None:
+    """Signal-to-noise of about 14, 21 and 130: the amplitude of one wave over the pixel."""
+    error, phase = [], []
+    for seed in range(4):
+        xy = star_grid(30 + seed)
+        found = measured(exposed(seed, xy, np.full(len(xy), flux), QUIET), xy)
+        good = found.refusal == StarRefusal.NONE
+        assert good.mean() > 0.95
+        error.append((found.xy_px - xy)[good])
+        phase.append(2 * np.pi * xy[good])
+    wave = np.exp(1j * np.concatenate(phase).ravel())
+    squared = np.concatenate(error).ravel() ** 2
+    amplitude_px = 2 * np.abs(np.mean(np.concatenate(error).ravel() * wave))
+    # The noise of the stars alone gives a wave of this size.
+    by_chance_px = 2 * np.sqrt(squared.mean() / len(squared))
+    assert by_chance_px < 0.004
+    assert amplitude_px < 0.01
+
+
+@pytest.mark.parametrize('known', [True, False], ids=['known', 'unknown'])
+def test_a_hot_pixel_takes_no_part_in_a_fit(known: bool) -> None:
+    squared = []
+    for seed in range(4):
+        xy = star_grid(40 + seed)
+        pixels = exposed(seed, xy, unlike_fluxes(seed, len(xy)), QUIET)
+        model = modelled(pixels)
+        u, v = np.rint(xy + np.array([2.0, -1.0])).astype(int).T
+        pixels[v, u] += 400
+        hot = np.sort(v * pixels.shape[1] + u) if known else np.empty(0, np.int64)
+        found = measure_stars(pixels, xy, model, PSF, hot)
+        good = (found.refusal == StarRefusal.NONE) & (found.snr > 10)
+        assert good.mean() > 0.75
+        squared.append((found.xy_px - xy)[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    # Two coordinates of more than 1200 stars: known to 1.4 %.
+    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_moments_are_pulled_to_the_middle_of_the_pixel() -> None:
+    # The paper's method cuts the wings off, at 3 px and at its threshold.
+    detector = dataclasses.replace(QUIET, bits=16, electrons_per_dn=10.0, offset_dn=500.0)
+    for flux, bias_px in ((4e5, 0.03), (8e3, 0.08)):
+        xy = star_grid(20)
+        found = measured(exposed(20, xy, np.full(len(xy), flux), detector), xy, MOMENT)
+        good = found.refusal == StarRefusal.NONE
+        assert good.mean() > 0.95
+        error = (found.xy_px - xy)[good]
+        phase = (xy - np.rint(xy))[good]
+        bins = np.digitize(phase.ravel(), np.linspace(-0.5, 0.5, 11)) - 1
+        bias = np.bincount(bins, error.ravel()) / np.bincount(bins)
+        assert np.abs(bias).max() < bias_px
+        assert np.sqrt((error**2).mean()) < 1.5 * bias_px
+
+
+def test_moments_are_worse_than_the_fit_but_no_more_than_twice() -> None:
+    rms = {}
+    for name, options in (('psf', PSF), ('moment', MOMENT)):
+        squared = []
+        for seed in range(3):
+            error, found, _, snr = field(seed, QUIET, options)
+            squared.append(error[(found.refusal == StarRefusal.NONE) & (snr > 20)] ** 2)
+        rms[name] = np.sqrt(np.concatenate(squared).mean())
+    assert rms['psf'] < rms['moment'] < 2.0 * rms['psf']
+
+
+def test_background_and_noise_under_stars_and_a_gradient() -> None:
+    xy = star_grid(3)
+    flux = unlike_fluxes(3, len(xy))
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    glow = 0.15 * u + 0.1 * v  # electrons: 24 DN across, 13 DN down
+    pixels = exposed(3, xy, flux, QUIET, glow)
+    background = measure_background(pixels)
+    places = np.stack([u[::37, ::41].ravel(), v[::37, ::41].ravel()], axis=-1).astype(float)
+    glow_there = 0.15 * places[:, 0] + 0.1 * places[:, 1]
+    level_dn = QUIET.offset_dn + (glow_there + QUIET.background_electrons) / 4.0
+    noise_dn = np.sqrt(QUIET.noise_electrons**2 + glow_there) / 4.0
+    level = sample_mesh(background.level_mesh, SHAPE, places) - level_dn
+    noise = sample_mesh(background.noise_mesh, SHAPE, places) / noise_dn
+    inner = (np.abs(places - [320, 256]) < [280, 216]).all(axis=1)
+    # A cell of 256 samples knows its mean to 0.06 sigma; wings of stars lift it by as much more.
+    assert np.abs(level[inner]).max() < 0.5 * noise_dn.max()
+    assert np.abs(level[inner].mean()) < 0.2 * noise_dn.mean()
+    # The gradient itself, 1.4 DN across a cell, adds 2 % to the spread; wings of stars the rest.
+    assert 0.95 < np.median(noise[inner]) < 1.10
+    assert background.noise_dn == pytest.approx(np.median(noise_dn), rel=0.10)
+
+
+@pytest.mark.parametrize('read_noise', [2.0, 8.0, 40.0])
+def test_noise_of_a_dark_image(read_noise: float) -> None:
+    detector = dataclasses.replace(QUIET, read_noise_electrons=read_noise)
+    pixels = expose(np.full(SHAPE, 4.5), detector, np.random.default_rng(4))
+    background = measure_background(pixels)
+    # A fourth of 327,680 pixels: 0.25 %; half a rounding step more where steps are coarse.
+    assert background.noise_dn == pytest.approx(pixels.std(), rel=0.02)
+    assert background.level_dn == pytest.approx(pixels.mean(), abs=0.03 * background.noise_dn)
+
+
+def test_a_constant_image_has_the_noise_of_its_rounding() -> None:
+    background = measure_background(np.full(SHAPE, 77, np.uint8))
+    assert background.level_dn == 77
+    assert background.noise_dn == pytest.approx(np.sqrt(1 / 12))
+    assert len(detect(np.full(SHAPE, 77, np.uint8), background).snr) == 0
+
+
+@pytest.mark.parametrize('shape', [(5, 7), (31, 33), (64, 40), (100, 1000)])
+def test_images_of_any_size(shape: tuple[int, int]) -> None:
+    pixels = np.random.default_rng(5).normal(100, 3, shape).astype(np.uint16)
+    background = measure_background(pixels)
+    assert background.level_dn == pytest.approx(99.5, abs=2.0)
+    sources = detect(pixels, background)
+    model = model_image(pixels, background, sources, PSF)
+    assert model.psf_sigma_px == 0.0  # no stars to tell
+
+
+def test_all_stars_above_eight_sigma_are_detected() -> None:
+    found_all, total = 0, 0
+    for seed in range(5):
+        xy = star_grid(seed)
+        flux = np.random.default_rng([seed, 2]).uniform(150, 1500, len(xy))
+        pixels = exposed(seed, xy, flux, QUIET)
+        sources = detect(pixels, measure_background(pixels))
+        _, snr = centroid_bound(xy, flux, QUIET, SHAPE)
+        distance = np.linalg.norm(xy[snr > 8][:, None] - sources.xy_px[None], axis=2)
+        found_all += int((distance.min(axis=1) < 1.0).sum())
+        total += len(distance)
+        near = distance.min(axis=1)
+        # At the faint end 0.2 px is one sigma of what a star of 8 sigma can say.
+        assert np.sqrt(np.mean(near[near < 1.0] ** 2)) < 0.25
+    # 8 less 5 is three sigma: one in 700, and most of these stars are brighter.
+    assert total > 1500 and found_all > 0.998 * total
+
+
+@pytest.mark.parametrize(('threshold', 'images'), [(3.5, 3), (5.0, 20)])
+def test_noise_alone_gives_no_more_detections_than_it_should(
+    threshold: float, images: int
+) -> None:
+    # Local maxima of a Gaussian field above t sigma: (2 pi)^-3/2 L t exp(-t^2 / 2) per pixel with
+    # L = 1 / (2 s^2) of the filter: 80 per image at 3.5 sigma, 0.2 at 5.
+    density = (2 * np.pi) ** -1.5 * 0.5 * threshold * np.exp(-0.5 * threshold**2)
+    expected = density * SHAPE[0] * SHAPE[1] * images
+    detector = dataclasses.replace(QUIET, electrons_per_dn=1.0, offset_dn=100.0)
+    count = 0
+    for seed in range(images):
+        pixels = expose(np.full(SHAPE, 4.5), detector, np.random.default_rng([seed, 6]))
+        count += len(detect(pixels, measure_background(pixels), threshold).snr)
+    # Poisson; the noise, 1 % off, changes the count by 12 % at 3.5 sigma and 25 % at 5.
+    assert count < 1.25 * expected + 3 * np.sqrt(expected)
+    assert count > 0.75 * expected - 3 * np.sqrt(expected)
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
+def test_gain_and_width_are_found_from_the_image(psf_sigma_px: float) -> None:
+    detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
+    gains, widths = [], []
+    for seed in range(6):
+        xy = star_grid(seed)
+        flux = unlike_fluxes(seed, len(xy))
+        model = modelled(exposed(seed, xy, flux, detector))
+        gains.append(model.pixel_noise.gain_e_per_dn)
+        widths.append(model.psf_sigma_px)
+    # One image knows it to 6 %.
+    assert np.mean(gains) == pytest.approx(4.0, rel=0.08)
+    assert np.mean(widths) == pytest.approx(psf_sigma_px, rel=0.005)
+
+
+def test_a_given_gain_is_kept() -> None:
+    xy = star_grid(1)
+    pixels = exposed(1, xy, np.full(len(xy), 8000.0), QUIET)
+    model = modelled(pixels, CentroidOptions(gain_e_per_dn=3.3))
+    assert model.pixel_noise.gain_e_per_dn == pytest.approx(3.3)
+
+
+def one_star(
+    at: tuple[float, float] = (300.3, 200.6), flux: float = 8000.0, more: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """An image of the grid with the star nearest to a place moved there, and its place (1, 2)."""
+    place = np.array([at])
+    xy = star_grid(7)
+    xy = xy[np.linalg.norm(xy - place, axis=1) > 24]
+    fluxes = np.r_[np.full(len(xy), 4000.0), flux]
+    more_light = np.zeros(SHAPE) if more is None else more
+    return exposed(7, np.concatenate([xy, place]), fluxes, QUIET, more_light), place
+
+
+both_methods = pytest.mark.parametrize('options', [PSF, MOMENT], ids=['psf', 'moment'])
+
+
+@both_methods
+def test_an_ordinary_star_is_measured(options: CentroidOptions) -> None:
+    pixels, place = one_star()
+    found = measured(pixels, place, options)
+    assert found.refusal[0] == StarRefusal.NONE
+    assert np.abs(found.xy_px - place).max() < 0.1
+    # A moment mask misses some of the wings.
+    assert found.flux_dn[0] == pytest.approx(2000.0, rel=0.12)
+    # The prediction need not be right to the pixel.
+    off = measured(pixels, place + np.array([0.9, -0.8]), options)
+    np.testing.assert_allclose(off.xy_px, found.xy_px, rtol=0, atol=0.01)
+
+
+@both_methods
+def test_a_saturated_star_is_refused(options: CentroidOptions) -> None:
+    pixels, place = one_star(flux=3e5)
+    assert pixels.max() == 4095
+    none = dataclasses.replace(options, max_saturated_pixels=0)
+    assert measured(pixels, place, none).refusal[0] == StarRefusal.SATURATED
+
+
+def test_a_saturated_star_can_be_measured_by_what_is_left_of_it() -> None:
+    pixels, place = one_star(flux=2e5)
+    found = measured(pixels, place, PSF)
+    saturated = (pixels[195:206, 295:306] >= 0.98 * 4095).sum()
+    assert 1 <= saturated <= 9
+    assert found.refusal[0] == StarRefusal.NONE
+    # Full flux, and a place as good as its own covariance says.
+    assert found.flux_dn[0] == pytest.approx(5e4, rel=0.03)
+    sigma = np.sqrt(found.covariance_px2[0, [0, 2]])
+    assert (np.abs(found.xy_px - place)[0] < 4 * sigma + 0.005).all()
+
+
+@pytest.mark.parametrize('off', [(0.4, 0.4), (-0.4, 0.4), (0.4, -0.4)])
+def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, float]) -> None:
+    """No pixel of a plateau is the brightest: a window moved to one of them may lose the star."""
+    wide = dataclasses.replace(QUIET, psf_sigma_px=1.6)
+    at = np.array([[300.3, 200.6]])
+    xy = np.concatenate([at, [p for p in star_grid(3) if np.abs(p - at).max() > 25.0]])
+    flux = np.r_[1.2e6, unlike_fluxes(3, len(xy) - 1)]
+    pixels = exposed(3, xy, flux, wide)
+    assert (pixels[195:206, 295:306] == 4095).sum() >= 9
+    found = measured(pixels, at + np.array(off), PSF)
+    assert found.refusal[0] == StarRefusal.NONE
+    sigma_px = np.sqrt(found.covariance_px2[0, [0, 2]])
+    assert (np.abs(found.xy_px - at)[0] < 4.0 * sigma_px + 0.005).all()
+
+
+@pytest.mark.parametrize(
+    ('dtype', 'peak', 'count', 'expected'),
+    [
+        (np.uint8, 255, 1, 0.98 * 255),
+        (np.uint8, 254, 1, 0.0),
+        (np.uint8, 200, 4, 0.98 * 200),
+        (np.uint16, 4095, 1, 0.98 * 4095),
+        (np.uint16, 16383, 1, 0.98 * 16383),
+        (np.uint16, 65535, 1, 0.98 * 65535),
+        (np.uint16, 3000, 1, 0.0),
+        (np.uint16, 3000, 3, 0.0),
+        (np.uint16, 3000, 4, 0.98 * 3000),
+    ],
+)
+def test_the_saturation_level(dtype: type, peak: int, count: int, expected: float) -> None:
+    pixels: np.ndarray = np.random.default_rng(8).integers(20, 60, SHAPE).astype(dtype)
+    pixels.flat[:count] = peak
+    assert saturation_level(pixels, PSF) == pytest.approx(expected)
+    assert saturation_level(pixels, CentroidOptions(saturation_dn=123.0)) == 123.0
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 2.0])
+def test_of_a_star_at_the_border_the_fit_takes_what_is_in_the_image(psf_sigma_px: float) -> None:
+    detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
+    height, width = SHAPE
+    over_bound, over_sigma = [], []
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 7])
+        along = np.arange(30.0, height - 30.0, 20.0)
+        across = rng.uniform(0.6, 6.0, (4, len(along)))
+        rim = np.concatenate(
+            [
+                np.stack([across[0], along], axis=-1),
+                np.stack([width - 1 - across[1], along], axis=-1),
+                np.stack([along, across[2]], axis=-1),
+                np.stack([along, height - 1 - across[3]], axis=-1),
+            ]
+        )
+        corners = np.array([[1.3, 2.2], [width - 2.4, 1.1], [width - 3.2, height - 2.4]])
+        inner = star_grid(seed, 40)
+        xy = np.concatenate([rim, corners, inner[(abs(inner - [320, 256]) < [280, 216]).all(1)]])
+        flux = np.full(len(xy), 3000.0) * (psf_sigma_px / 0.95) ** 2
+        found = measured(exposed(seed, xy, flux, detector), xy)
+        edge = np.arange(len(xy)) < len(rim) + len(corners)
+        bound, _ = centroid_bound(xy, flux, detector, SHAPE)
+        good = edge & (found.refusal == StarRefusal.NONE)
+        assert good.sum() > 0.97 * edge.sum(), Counter(found.refusal[edge].tolist())
+        squared = (found.xy_px - xy)[good] ** 2
+        over_bound.append(squared / bound[good][:, [0, 1], [0, 1]])
+        over_sigma.append(squared / found.covariance_px2[good][:, [0, 2]])
+    # 800 centroids of two coordinates: known to 1.8 %. The bound knows the background, the fit
+    # finds it in a stamp that is cut; and a star on the rim is a little fainter in its luck.
+    assert 0.94 < np.sqrt(np.concatenate(over_bound).mean()) < 1.08
+    assert 0.94 < np.sqrt(np.concatenate(over_sigma).mean()) < 1.06
+
+
+@both_methods
+def test_a_star_whose_core_leaves_the_image_is_refused(options: CentroidOptions) -> None:
+    pixels, _ = one_star()
+    height, width = SHAPE
+    edge = np.array(
+        [
+            [0.4, 200.0], [width - 1.4, 200.0], [300.0, 0.4], [300.0, height - 1.4],
+            [-50.0, 10.0], [1e9, 1e9], [np.nan, 5.0],
+        ]
+    )  # fmt: skip
+    assert (measured(pixels, edge, options).refusal == StarRefusal.BORDER).all()
+
+
+@both_methods
+def test_where_no_star_is_none_is_measured(options: CentroidOptions) -> None:
+    pixels, _ = one_star()
+    # Between the stars of the grid.
+    empty = star_grid(7)[5:200] + 12.0
+    found = measured(pixels, empty, options)
+    refused = Counter(found.refusal.tolist())
+    # The moments count what stands above their threshold alone: one in 200 is noise.
+    assert refused[StarRefusal.NONE] <= (0 if options is PSF else 2), refused
+    assert set(refused) <= set(StarRefusal)
+
+
+@pytest.mark.parametrize(
+    'options',
+    [PSF, MOMENT],
+)
+def test_no_star_asked_for_none_measured(options: CentroidOptions) -> None:
+    pixels, _ = one_star()
+    found = measured(pixels, np.empty((0, 2)), options)
+    assert found.xy_px.shape == (0, 2) and found.covariance_px2.shape == (0, 3)
+    assert len(found.refusal) == 0
+
+
+def test_lit_single_pixels_are_no_sources() -> None:
+    hot = np.zeros(SHAPE)
+    rng = np.random.default_rng(9)
+    hot.flat[rng.choice(hot.size, 200, replace=False)] = rng.uniform(300, 6000, 200)
+    pixels = expose(hot + QUIET.background_electrons, QUIET, rng)
+    sources = detect(pixels, measure_background(pixels))
+    # Two side by side may pass for a source, and one of 200 whose neighbours' noise helps: half of
+    # the light of an undersampled star is in one pixel, and such stars must not be left out.
+    assert len(sources.snr) <= 3
+
+
+@pytest.mark.parametrize('offset', [(1, 0), (1, 1)])
+def test_a_star_with_a_hot_pixel_in_its_core_is_refused(offset: tuple[int, int]) -> None:
+    hot = np.zeros(SHAPE)
+    hot[201 + offset[1], 300 + offset[0]] = 1500.0
+    pixels, place = one_star(more=hot)
+    assert measured(pixels, place).refusal[0] == StarRefusal.ELONGATED
+
+
+@pytest.mark.parametrize(('flux', 'lit'), [(3000.0, 2e4), (2e5, 3000.0)])
+@pytest.mark.parametrize('away', [(2, 0), (-2, 1), (-1, -2)])
+def test_a_star_beside_a_single_lit_pixel_is_measured(
+    away: tuple[int, int], flux: float, lit: float
+) -> None:
+    """Lit far above a faint star, and as bright as the flank of a bright one."""
+    ray = np.zeros(SHAPE)
+    ray[201 + away[1], 300 + away[0]] = lit
+    clean = measured(*one_star(flux=flux))
+    found = measured(*one_star(flux=flux, more=ray))
+    assert found.refusal[0] == StarRefusal.NONE
+    # Without one pixel of its flank a star is hardly worse, and where it was.
+    sigma_px = np.sqrt(found.covariance_px2[0, [0, 2]])
+    assert (sigma_px < 1.3 * np.sqrt(clean.covariance_px2[0, [0, 2]])).all()
+    assert (np.abs(found.xy_px - clean.xy_px)[0] < 2.0 * sigma_px).all()
+
+
+def test_a_star_with_a_cosmic_ray_through_it_is_refused() -> None:
+    track = np.zeros(SHAPE)
+    for k in range(-5, 6):
+        track[200 + k // 2, 300 + k] = 700.0
+    pixels, place = one_star(more=track)
+    assert measured(pixels, place).refusal[0] == StarRefusal.ELONGATED
+
+
+@both_methods
+def test_a_smeared_star_is_refused(options: CentroidOptions) -> None:
+    # Four exposures on a line of 4 px: sigma 1.8 px along it.
+    line = np.array([[299.0, 200.0], [300.0, 200.4], [301.0, 200.8], [302.0, 201.2]])
+    light = star_electrons(line, np.full(4, 2500.0), QUIET.psf_sigma_px, SHAPE)
+    pixels, _ = one_star(at=(400.0, 400.0), more=light)
+    # The grid has a star of its own there or not: ask where the line is brightest.
+    xy = np.array([[300.5, 200.6]])
+    assert measured(pixels, xy, options).refusal[0] in (StarRefusal.ELONGATED, StarRefusal.BLEND)
+
+
+def test_stars_that_all_are_elongated_alike_are_measured() -> None:
+    # A lens with astigmatism, 10 % more variance along u: every star, so none is suspect.
+    xy = star_grid(11)
+    half = np.array([0.3, 0.0])
+    pairs = np.concatenate([xy + half, xy - half])
+    pixels = exposed(11, pairs, np.full(len(pairs), 4000.0), QUIET)
+    found = measured(pixels, xy)
+    assert (found.refusal == StarRefusal.NONE).mean() > 0.98
+    # A symmetric change of shape moves no centroid.
+    assert np.abs((found.xy_px - xy)[found.refusal == StarRefusal.NONE].mean(axis=0)).max() < 0.005
+
+
+def test_without_enough_bright_stars_the_width_is_not_known() -> None:
+    xy = star_grid(12)[:3]
+    pixels = exposed(12, xy, np.full(3, 8000.0), QUIET)
+    model = modelled(pixels)
+    assert model.psf_sigma_px == 0.0
+    found = measure_stars(pixels, xy, model, PSF)
+    assert (found.refusal == StarRefusal.NONE).all() and np.abs(found.xy_px - xy).max() < 0.2
+
+
+def test_the_fit_itself_is_exact_on_its_own_model() -> None:
+    rng = np.random.default_rng(13)
+    centre = rng.uniform(-0.7, 0.7, (50, 2))
+    flux, level = rng.uniform(500, 5000, 50), rng.uniform(0, 100, 50)
+    stamps = np.array(
+        [
+            star_electrons(c[None] + 5, np.array([f]), 1.1, (11, 11)) + b
+            for c, f, b in zip(centre, flux, level, strict=True)
+        ]
+    )
+    fit = fit_psf(stamps, 1.1, np.full(50, 2.0), PixelNoise(4.0, 0.0))
+    expected = np.concatenate([centre, flux[:, None], level[:, None]], axis=1)
+    # The last step leaves some thousandth of a sigma, which is 0.01 px here, and the residual is
+    # followed through it to first order: a tenth of the noise is left.
+    np.testing.assert_allclose(fit.parameters, expected, rtol=1e-5, atol=1e-5)
+    assert np.abs(fit.residual_dn).max() < 0.1 * 2.0
+    assert np.abs(fit.shape_change).max() < 1e-4
+
+
+@pytest.mark.parametrize('gain', [0.5, 2.0, 8.0])
+def test_a_lens_whose_stars_are_no_gaussians(gain: float) -> None:
+    """Three lobes of one star are no noise: the core is trusted, and the gain is still found."""
+    rng = np.random.default_rng(3)
+    count, side = 80, 9
+    place_px = rng.uniform(-0.5, 0.5, (count, 2))
+    flux_dn = 10 ** rng.uniform(2.3, 3.9, count)
+    lobes_px = np.array([[0.0, 0.0], [0.9, 0.5], [-0.3, 1.1]])
+    share = np.array([0.75, 0.15, 0.10])
+    light = np.array(
+        [
+            star_electrons(4 + place + lobes_px, flux * share, 0.55, (side, side))
+            for place, flux in zip(place_px, flux_dn, strict=True)
+        ]
+    )
+    stamps = 20.0 + rng.poisson(light * gain) / gain + rng.normal(0.0, 1.5, light.shape)
+    noise_dn, noise = np.full(count, 1.5), PixelNoise(1.0, 0.02)
+    for _ in range(5):
+        fit = fit_psf(stamps, 0.65, noise_dn, noise)
+        noise = noise_sums(fit, noise_dn, noise).pixel_noise()
+    off_px = fit.parameters[:, :2] - place_px
+    off_px -= np.median(off_px, axis=0)  # the lobes' own centre: a turn of the camera
+    sigma_px = np.sqrt(np.stack([fit.covariance[:, 0, 0], fit.covariance[:, 1, 1]], axis=-1))
+    # 80 stars that the Gaussian misses by 4 % know the gain to a factor of two.
+    assert gain / 2.2 < noise.gain_e_per_dn < 2.2 * gain and noise.psf_error > 0.02
+    # Of 0.65 px over root N, and 0.006 px that change with the phase of the star in its pixel.
+    bright = flux_dn > 1500
+    expected_px = np.hypot(1.3 * 0.65 / np.sqrt(gain * flux_dn[bright]), 0.006)
+    assert np.sqrt((off_px[bright] ** 2).mean() / (expected_px**2).mean()) < 1.15
+    # What the PSF may be wrong by is taken as worse than it is, never as better.
+    assert np.sqrt(((off_px / sigma_px) ** 2).mean()) < 1.0

@@ -1,0 +1,223 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Frames that are unfit as a whole are refused by name; sound ones of any kind are not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+from starcal_ground.simulation import rendering, scenario
+from starcal_ros.arrays import Pixels
+from starcal_ros.errors import ImageRefused
+from starcal_ros.records import Image
+from starcal_ros.stars.frame_checks import (
+    Fingerprint,
+    fingerprint,
+    sample_rows,
+    screen,
+    ScreeningOptions,
+    slope_left,
+)
+
+SCENARIO = scenario.scenario('tiny', seed=3)
+HEIGHT, WIDTH = SCENARIO.truth.camera.height, SCENARIO.truth.camera.width
+HALF = HEIGHT // 2
+S = 1_000_000_000
+
+
+@functools.cache
+def frame(index: int = 0) -> NDArray[np.uint16]:
+    """A frame of the simulator."""
+    return rendering.render(SCENARIO, scenario.scene(SCENARIO, index), index).pixels  # type: ignore[return-value]
+
+
+def refusal(
+    pixels: Pixels,
+    before: Fingerprint | None = None,
+    time_ns: int = S,
+    saturation_dn: float = 0.0,
+    dark: Pixels | None = None,
+    **options: float,
+) -> str:
+    """The reason for which a frame is refused; empty for a sound one."""
+    sample = sample_rows(pixels)
+    seen = fingerprint(Image(time_ns, pixels), sample)
+    try:
+        screen(sample, seen, before, saturation_dn, dark, ScreeningOptions(**options))
+    except ImageRefused as refused:
+        return refused.reason if refused.detail else 'without a word'
+    return ''
+
+
+def known(pixels: Pixels, time_ns: int = 0) -> Fingerprint:
+    """What a frame before leaves behind."""
+    return fingerprint(Image(time_ns, pixels), sample_rows(pixels))
+
+
+@pytest.mark.parametrize('index', range(SCENARIO.image_count))
+def test_sound_frames_pass(index: int) -> None:
+    before = known(frame(index - 1)) if index else None
+    assert refusal(frame(index), before) == ''
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (2, 3), (63, 70), (64, 64), (129, 1000)])
+def test_frames_of_any_size_are_judged(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(1).poisson(100.0, shape).astype(np.uint16)
+    assert refusal(noise) in ('', 'blank')
+    assert refusal(np.zeros(shape, np.uint8)) == 'blank'
+
+
+def part(value: int, rows: slice = slice(None), columns: slice = slice(None)) -> Pixels:
+    """A frame of which a part has one value."""
+    pixels = frame().copy()
+    pixels[rows, columns] = value
+    return pixels
+
+
+def placed(where: slice, source: Pixels) -> Pixels:
+    """A frame of which some rows are replaced."""
+    pixels = frame().copy()
+    pixels[where] = source
+    return pixels
+
+
+LOWER, UPPER = slice(HALF, None), slice(None, HALF)
+
+
+@pytest.mark.parametrize(
+    ('reason', 'made'),
+    [
+        ('blank', lambda: np.zeros((HEIGHT, WIDTH), np.uint8)),
+        ('blank', lambda: np.full((HEIGHT, WIDTH), 300, np.uint16)),
+        ('overexposed', lambda: np.full((HEIGHT, WIDTH), 255, np.uint8)),
+        ('overexposed', lambda: np.full((HEIGHT, WIDTH), 4095, np.uint16)),
+        ('overexposed', lambda: part(65535, rows=slice(None, HEIGHT // 3))),
+        ('incomplete', lambda: part(0, rows=LOWER)),
+        ('incomplete', lambda: part(0, rows=UPPER)),
+        ('incomplete', lambda: part(0, columns=slice(WIDTH // 2, None))),
+        # A value like the sky's own is no sky either: it has no noise.
+        ('incomplete', lambda: part(int(np.median(frame())), rows=LOWER)),
+        ('incomplete', lambda: part(0, rows=slice(100, 100 + HEIGHT // 20))),
+        ('incomplete', lambda: placed(LOWER, frame()[HALF - 1])),
+        ('incomplete', lambda: placed(LOWER, frame()[:HALF])),
+    ],
+)
+def test_a_lost_frame_is_refused(reason: str, made: Callable[[], Pixels]) -> None:
+    assert refusal(made()) == reason
+
+
+def test_packets_lost_at_a_regular_distance_are_noticed() -> None:
+    """Two rows in sixteen: an eighth, wherever the sampled rows fall."""
+    for first in range(16):
+        pixels = frame().copy()
+        pixels[first::16] = pixels[first + 1 :: 16] = 0
+        assert refusal(pixels) == 'incomplete'
+
+
+def test_a_frame_shown_again_is_frozen() -> None:
+    assert refusal(frame(), known(frame())) == 'frozen'
+    assert refusal(frame(), known(frame(), time_ns=S)) == ''  # delivered twice
+    assert refusal(frame(1), known(frame())) == ''
+    assert refusal(frame()[:100], known(frame())) == ''
+
+
+def test_a_frame_without_noise_is_known_again() -> None:
+    """Eight bits, no light but the stars: only all pixels tell two frames apart."""
+    one, other = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
+    one[::50, ::70], other[::50, 3::70] = 200, 200
+    assert refusal(one, known(one)) == 'frozen'
+    assert refusal(other, known(one)) == ''
+
+
+def test_a_frame_half_of_the_one_before_is_incomplete() -> None:
+    assert refusal(placed(LOWER, frame(1)[HALF:]), known(frame(1))) == 'incomplete'
+    # Whichever stamp it carries.
+    assert refusal(placed(LOWER, frame(1)[HALF:]), known(frame(1), S)) == 'incomplete'
+
+
+@pytest.mark.parametrize('noise_dn', [0.3, 1.0, 4.0])
+def test_a_dark_sky_cut_off_at_zero_is_sound(noise_dn: float) -> None:
+    """An eight-bit camera without offset: darker corners read zero, without a fault."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    falls = 1.5 * noise_dn * np.hypot(u - WIDTH / 2, v - HEIGHT / 2) / HALF
+    sky = np.random.default_rng(2).normal(noise_dn - falls, noise_dn)
+    assert refusal(np.clip(np.rint(sky), 0, 255).astype(np.uint8)) == ''
+
+
+def test_a_bright_disc_is_no_loss() -> None:
+    """The Moon over a tenth of the field: constant, but saturated, and the rest is sound."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    pixels = frame().copy()
+    pixels[np.hypot(u - WIDTH / 2, v - HALF) < 0.178 * np.sqrt(HEIGHT * WIDTH)] = 4095
+    assert refusal(pixels) == ''
+    assert refusal(pixels, saturation_dn=4200.0) == 'incomplete'
+
+
+def ramp(slope: float) -> Pixels:
+    """Noise of 5 DN on a sky that rises by a slope in that noise per pixel, across."""
+    noise = np.random.default_rng(4).normal(200.0, 5.0, (HEIGHT, WIDTH))
+    return np.rint(noise + 5.0 * slope * np.arange(WIDTH)).astype(np.uint16)
+
+
+@pytest.mark.parametrize('slope', [0.0, 0.03, 0.5, 3.0])
+def test_a_steady_slope_of_the_sky_is_no_glare(slope: float) -> None:
+    # It is subtracted before the stars are fitted.  Means of 128 pixels give the change of a slope
+    # from one cell to the next to 0.003 noise per pixel.
+    assert slope_left(sample_rows(ramp(slope)), 65536) < 0.006
+    assert refusal(ramp(slope)) == ''
+
+
+def bent(slope: float) -> Pixels:
+    """As `ramp`, with waves of 256 px whose slope has that amplitude."""
+    u = np.arange(WIDTH)
+    waves = 256.0 / (2 * np.pi) * np.sin(2 * np.pi * u / 256.0)
+    noise = np.random.default_rng(4).normal(900.0, 5.0, (HEIGHT, WIDTH))
+    pixels: np.ndarray = np.rint(noise + 5.0 * slope * waves).astype(np.uint16)
+    return pixels
+
+
+@pytest.mark.parametrize(('slope', 'refused'), [(0.02, ''), (0.5, 'glare')])
+def test_a_bent_sky_is_glare(slope: float, refused: str) -> None:
+    assert refusal(bent(slope)) == refused
+
+
+def test_what_the_dark_frame_explains_is_no_glare() -> None:
+    assert refusal(bent(0.5)) == 'glare'
+    glow = bent(0.5).astype(np.int64) - ramp(0.0)
+    assert refusal(bent(0.5), dark=np.maximum(glow - glow.min(), 0).astype(np.uint16)) == ''
+
+
+def test_dead_rows_and_stuck_columns_are_no_glare() -> None:
+    """One per cent of the rows and columns: cells are judged by the rest of their pixels."""
+    rng = np.random.default_rng(5)
+    pixels = rng.normal(200.0, 5.0, (2048, 1024)).astype(np.uint16)
+    pixels[rng.choice(2048, 20, replace=False)] = 0
+    pixels[:, rng.choice(1024, 10, replace=False)] = 4095
+    assert slope_left(sample_rows(pixels), 4095) < 0.006
+    assert refusal(pixels) == ''
+
+
+def test_a_corona_is_no_glare() -> None:
+    """A sky that falls off from one side, as beside the Sun, is subtracted cell by cell."""
+    v, u = np.mgrid[:1024, :960]
+    corona = 60000.0 / (1.0 + np.hypot(u + 100.0, v - 512.0) / 150.0) ** 2
+    electrons = np.random.default_rng(6).poisson(20.0 * (corona + 500.0))
+    assert refusal(np.rint(electrons / 20.0).astype(np.uint16)) == ''
+
+
+@pytest.mark.parametrize('quality', [60, 75])
+@pytest.mark.parametrize('offset_dn', [-20, 0, 20])
+def test_a_compressed_sky_is_complete(quality: int, offset_dn: int) -> None:
+    """JPEG leaves blocks without noise, and rows of blocks that are equal."""
+    bytes_ = np.clip(frame().astype(np.int64) + offset_dn, 0, 255).astype(np.uint8)
+    coded = cv2.imencode('.jpg', bytes_, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    pixels: Pixels = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)  # type: ignore[assignment]
+    assert refusal(pixels) == ''
+    lost = pixels.copy()
+    lost[LOWER] = 0
+    assert refusal(lost) == 'incomplete'

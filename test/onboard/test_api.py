@@ -1,0 +1,179 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The public functions: from arrays, from a bag, lines of sight, and how they refuse bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
+
+import starcal_ros
+from starcal_ros import api
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.records import Ensemble, StarObservations
+
+SIGMA_ARCSEC = (10.0, 10.0, 40.0)
+TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
+
+
+def arrays(image: StarObservations) -> dict[str, Any]:
+    """The arguments of `observations_of` beside the camera."""
+    uu, uv, vv = image.covariance_px2.T
+    return {
+        'time_ns': image.time_ns,
+        'measured_px': image.measured_px,
+        'covariance_px2': np.array([[uu, uv], [uv, vv]]).transpose(2, 0, 1),
+        'direction_icrf': image.direction_icrf,
+        'icrf_from_star_tracker_xyzw': image.icrf_from_star_tracker_xyzw,
+        'catalog_id': image.catalog_id,
+        'star_tracker_rate_rad_s': image.star_tracker_rate_rad_s,
+        'velocity_sigma_m_s': image.velocity_sigma_m_s,
+    }
+
+
+def test_public_names_are_those_of_the_api() -> None:
+    assert sorted(starcal_ros.__all__) == sorted([*api.__all__, '__version__'])
+    for name in api.__all__:
+        assert getattr(starcal_ros, name) is getattr(api, name)
+    assert starcal_ros.__version__.count('.') == 2
+    assert set(dir(starcal_ros)) >= set(starcal_ros.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        _ = starcal_ros.calibrat  # type: ignore[attr-defined]
+
+
+def test_the_import_alone_loads_nothing() -> None:
+    show = 'import sys; import starcal_ros; print(*sys.modules)'
+    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
+    assert not {'numpy', 'cv2', 'starcal_ros.api'} & set(done.stdout.split())
+
+
+@pytest.mark.slow
+def test_arrays_give_the_estimate_of_the_records() -> None:
+    images = [
+        starcal_ros.observations_of(SCENARIO.prior.camera, **arrays(image))
+        for image in ensemble().images
+    ]
+    found = starcal_ros.calibrate(images, SCENARIO.prior, star_tracker_sigma_arcsec=SIGMA_ARCSEC)
+    options = CalibrationOptions(star_tracker_sigma_arcsec=SIGMA_ARCSEC)
+    # Arrays have no magnitudes, by which the variances would be told apart.
+    dark = Ensemble(
+        tuple(
+            dataclasses.replace(image, magnitude=np.full(len(image), np.nan, np.float32))
+            for image in ensemble().images
+        )
+    )
+    expected = estimate_calibration(dark, SCENARIO.prior, options)
+    assert found.accepted and found.stars_used == expected.kept.sum()
+    # Directions are scaled to unit length once more, which moves their last bit.
+    np.testing.assert_allclose(
+        found.geometry.camera.parameters, expected.geometry.camera.parameters, rtol=1e-7
+    )
+    np.testing.assert_allclose(found.sigma**2, np.diag(expected.covariance), rtol=1e-6)
+    assert found.provenance['catalog'] == ''
+
+
+def test_stars_of_equal_directions_are_one_star() -> None:
+    image = dict(arrays(ensemble().images[0]), catalog_id=None)
+    later = dict(image, time_ns=image['time_ns'] + 1)
+    first, second = (
+        starcal_ros.observations_of(SCENARIO.prior.camera, **one) for one in (image, later)
+    )
+    assert np.array_equal(first.catalog_id, second.catalog_id)
+    assert len(np.unique(first.catalog_id)) == len(first)
+
+
+def test_one_covariance_serves_all_stars() -> None:
+    image = dict(arrays(ensemble().images[0]), covariance_px2=[[0.04, 0.01], [0.01, 0.09]])
+    stars = starcal_ros.observations_of(SCENARIO.prior.camera, **image)
+    assert np.array_equal(stars.covariance_px2, np.tile([0.04, 0.01, 0.09], (len(stars), 1)))
+
+
+@pytest.mark.parametrize(
+    ('argument', 'value', 'complaint'),
+    [
+        ('measured_px', np.zeros(4), 'measured_px: 4 numbers, not n x 2'),
+        ('measured_px', [[np.nan, 0.0]], r'measured_px\[0\]\[0\]: nan is not a finite number'),
+        ('covariance_px2', np.zeros((3, 3)), r'covariance_px2: shape \(3, 3\) is not'),
+        ('covariance_px2', -np.eye(2), 'covariance_px2: not symmetric and positive definite'),
+        ('covariance_px2', [[1.0, 0.1], [0.0, 1.0]], 'covariance_px2: not symmetric'),
+        ('direction_icrf', [[0.0, 0.0, 1.0]], r'direction_icrf: 1 x 3 numbers, not [0-9]+ x 3'),
+        ('icrf_from_star_tracker_xyzw', [0.0, 0.0, 0.0, 2.0], 'xyzw: length 2 is not 1'),
+        ('catalog_id', [1, 2], 'catalog_id: 2 numbers, not [0-9]+'),
+    ],
+)
+def test_a_bad_array_is_named(argument: str, value: Any, complaint: str) -> None:
+    image = dict(arrays(ensemble().images[0]), **{argument: value})
+    with pytest.raises(ValueError, match=complaint):
+        starcal_ros.observations_of(SCENARIO.prior.camera, **image)
+
+
+def test_options_are_checked_by_name() -> None:
+    with pytest.raises(starcal_ros.OptionError, match='did you mean method'):
+        starcal_ros.calibrate(ensemble().images, SCENARIO.prior, methd='single')
+    with pytest.raises(starcal_ros.OptionError, match='method: .* is not one of'):
+        starcal_ros.calibrate(ensemble().images, SCENARIO.prior, method='best')
+    with pytest.raises(starcal_ros.OptionError, match='prior_alignment: no such parameter'):
+        starcal_ros.calibrate(ensemble().images, SCENARIO.prior, prior_alignment=(0, 0, 0, 1))
+
+
+def test_too_few_images_are_refused() -> None:
+    with pytest.raises(starcal_ros.TooFewObservations, match='1 more images are needed'):
+        starcal_ros.calibrate(ensemble().images[:2], SCENARIO.prior)
+
+
+@pytest.mark.slow
+def test_a_bag_gives_what_the_tool_gives(tiny_bag: Path, tiny_products: Path) -> None:
+    found = starcal_ros.calibrate_bag(tiny_bag, tiny_bag / 'params.yaml')
+    written = starcal_ros.read_calibration(tiny_products)
+    assert found.provenance == written.provenance
+    assert np.array_equal(found.geometry.camera.parameters, written.geometry.camera.parameters)
+    assert np.array_equal(found.covariance, written.covariance)
+    again = starcal_ros.calibrate_bag(
+        [tiny_products / 'observations.mcap'], str(tiny_bag / 'params.yaml')
+    )
+    assert again.stars_used == found.stars_used
+
+
+def test_a_calibration_is_written_and_read(tiny_products: Path, tmp_path: Path) -> None:
+    calibration = starcal_ros.read_calibration(tiny_products)
+    starcal_ros.write_calibration(calibration, tmp_path)
+    starcal_ros.write_calibration(calibration, tmp_path / 'other.json')
+    text = (tiny_products / 'calibration.json').read_text()
+    assert (tmp_path / 'calibration.json').read_text() == text
+    assert (tmp_path / 'other.json').read_text() == text
+
+
+def test_lines_of_sight_are_of_either_frame() -> None:
+    geometry = SCENARIO.truth
+    pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
+    in_camera = starcal_ros.lines_of_sight(geometry, pixels)
+    assert in_camera.shape == (2, 2, 3)
+    # 1e-8 px: Newton's iteration stops at 4e-11 px, and arithmetic adds some more.
+    np.testing.assert_allclose(
+        starcal_ros.project(geometry.camera, in_camera), pixels, rtol=0, atol=1e-8
+    )
+    star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
+    expected = star_tracker_from_camera.apply(in_camera.reshape(-1, 3)).reshape(2, 2, 3)
+    found = starcal_ros.lines_of_sight(geometry, pixels, frame='star_tracker')
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match="frame: 'icrf' is not"):
+        starcal_ros.lines_of_sight(geometry, pixels, frame='icrf')  # type: ignore[arg-type]
+
+
+def test_records_are_not_changed_by_the_caller() -> None:
+    image = arrays(ensemble().images[0])
+    stars = starcal_ros.observations_of(SCENARIO.prior.camera, **image)
+    held = stars.measured_px.copy()
+    mine = image['measured_px'].copy()
+    stars = starcal_ros.observations_of(SCENARIO.prior.camera, **dict(image, measured_px=mine))
+    mine += 1.0
+    assert np.array_equal(stars.measured_px, held)
+    assert dataclasses.is_dataclass(stars)

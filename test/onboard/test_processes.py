@@ -1,0 +1,84 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Nothing in the current folder is imported, by the tool nor by what it starts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from starcal_ros.processes import module_command
+
+ROOT = Path(__file__).parents[2]
+TOOL = 'starcal_ground.cli.main'
+# Modules of the standard library and of others that the tool imports, and one it may not.
+PLANTED = ('yaml', 'typing', 'argparse', 'json', 'pickle', 'dataclasses', 'numpy', 'dask', 'rclpy')
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """A folder with modules that leave a mark when they are imported."""
+    for name in PLANTED:
+        mark = f"open({str(tmp_path / 'marks')!r}, 'a').write({name!r} + '\\n')\n"
+        (tmp_path / f'{name}.py').write_text(mark)
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    'start',
+    [
+        [sys.executable, '-m', TOOL],
+        module_command(TOOL),
+    ],
+    ids=['python -m', 'child process'],
+)
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['--version'],
+        ['inspect', str(ROOT / 'bags' / 'tiny')],
+        [
+            *('trend', str(ROOT / 'bags'), '-o', 'out', '--workers', '1'),
+            *('--params', str(ROOT / 'bags' / 'tiny' / 'params.yaml')),
+        ],
+    ],
+    ids=['version', 'inspect', 'trend'],
+)
+def test_modules_of_the_current_folder_are_not_run(
+    hostile: Path, start: list[str], arguments: list[str]
+) -> None:
+    done = subprocess.run(
+        [*start, *arguments],
+        cwd=hostile,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (hostile / 'marks').exists(), (hostile / 'marks').read_text()
+
+
+def test_the_marks_are_left_without_the_safe_path(hostile: Path) -> None:
+    """The test above could fail."""
+    subprocess.run([sys.executable, '-c', 'import yaml'], cwd=hostile, check=True)
+    assert (hostile / 'marks').read_text() == 'yaml\n'
+
+
+def test_other_programs_keep_their_path(tmp_path: Path) -> None:
+    (tmp_path / 'program.py').write_text('import starcal_ros, beside; print(beside.NAME)')
+    (tmp_path / 'beside.py').write_text("NAME = 'beside'")
+    for command in (['-m', 'program'], ['program.py']):
+        done = subprocess.run(
+            [sys.executable, *command],
+            cwd=tmp_path,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.stdout == 'beside\n', done.stderr
