@@ -121,6 +121,7 @@ def test_the_documents_are_there() -> None:
         'docs/icd.md',
         'docs/algorithm.md',
         'docs/design.md',
+        'docs/experiments.md',
         'docs/performance.md',
         'docs/tutorial.md',
         'QUALITY_DECLARATION.md',
