@@ -450,8 +450,8 @@ def write_comparison(found: Comparison, path: Path) -> None:
 
 def _difference(camera: CameraModel, found: DifferenceMap, title: str) -> Drawing:
     """Length in pixels as colours from zero, direction as arrows with a scale."""
-    known = found.sigmas[np.isfinite(found.sigmas)]
-    in_sigmas = f', {significant(known.max(), 2)} sigma' if known.size else ''
+    sigmas, _ = found.worst_and_rms_sigmas
+    in_sigmas = f', {significant(sigmas, 2)} sigma' if np.isfinite(sigmas) else ''
     drawn = detector_map(
         found.length_px[::2, ::2], camera, ' px', shift_px=found.difference_px[::2, ::2]
     )

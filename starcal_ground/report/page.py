@@ -22,8 +22,6 @@ from starcal_ground.report.svg import Chart, light
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import utc_text
 from starcal_ros.errors import ProductError
-from starcal_ros.estimation.problem import alignment_summary
-from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json, product_folder
@@ -135,18 +133,18 @@ def _context(found: Found) -> Mapping[str, object]:
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
         'active_since': utc_text(calibration.active_since_ns),
-        'parameters': page_sections.parameter_rows(calibration, prior),
-        'alignment': page_sections.alignment_rows(calibration, prior)
-        if calibration.has_alignment
-        else [],
+        'parameters': page_sections.typeset(verdict.parameter_rows(calibration, prior)),
+        'alignment': page_sections.typeset(verdict.alignment_rows(calibration, prior)),
         'tiles': page_sections.tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
         'precision': verdict.precision_sentences(calibration),
         'next_step': verdict.next_step(calibration),
         'signed': _signed(calibration),
-        'star_trackers': [alignment_summary(one) for one in calibration.star_trackers],
-        'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
+        'star_trackers': [verdict.alignment_summary(one) for one in calibration.star_trackers],
+        'thermal': verdict.thermal_summary(calibration.temperature)
+        if calibration.temperature
+        else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
         'slider': page_sections.slider(calibration, residuals),

@@ -6,43 +6,24 @@ from __future__ import annotations
 import base64
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple
 import math
 
 from markupsafe import Markup
 import numpy as np
 
 from starcal_ground.report.thumbnails import star_of, Thumbnail
-from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.assessment.observability import movement_px
+from starcal_ground.report.verdict import Row
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
-from starcal_ros.records import (
-    Calibration,
-    CameraGeometry,
-    IMAGE_REFUSALS,
-    STAR_REFUSALS,
-    StarObservations,
-    TOTAL,
-)
-from starcal_ros.text import significant, to_sigma
+from starcal_ros.records import Calibration, IMAGE_REFUSALS, STAR_REFUSALS, StarObservations, TOTAL
+from starcal_ros.text import significant
 
 
-@dataclass(frozen=True)
-class Row:
-    """Row of the parameter table; numbers as text, empty if absent."""
-
-    name: str
-    unit: str
-    sigma: str
-    change: str
-    change_sigmas: str
-    value: str = ''
-    prior: str = ''
-    moves_px: str = ''
-    sigma_px: str = ''
+def typeset(rows: Sequence[Row]) -> list[Row]:
+    """Rows with minus signs in place of hyphens."""
+    return [Row(*(text.replace('-', '\N{MINUS SIGN}') for text in astuple(row))) for row in rows]
 
 
 def _none(count: int) -> str:
@@ -83,59 +64,6 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
                 note = f'1-sigma, rms over the detector, {text}; {worst}'
                 results.append((name, f'{significant(rms, 2)}″', note))
     return results
-
-
-def _minus(number: str) -> str:
-    return number.replace('-', '\N{MINUS SIGN}')
-
-
-def parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
-    """Value, sigma and change of each camera parameter."""
-    camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
-    if prior and prior.camera.model != camera.model:
-        prior = None  # parameters of another lens model are no start of these
-    changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
-    moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
-    rows = []
-    for k, name in enumerate(camera.parameter_names):
-        known, changed = sigma[k] > 0, prior and changes[k]
-        held = '' if name in calibration.estimated else 'held, ' if known else 'held'
-        rows.append(
-            Row(
-                name=name,
-                unit='px' if name in INTRINSIC_NAMES else '',
-                value=_minus(to_sigma(camera.parameters[k], sigma[k])),
-                sigma=held + (significant(sigma[k], 2) if known else ''),
-                prior=_minus(significant(prior.camera.parameters[k], 8)) if prior else '',
-                change=_minus(to_sigma(changes[k], sigma[k], '+')) if changed else '',
-                change_sigmas=_minus(f'{changes[k] / sigma[k]:+.1f}') if changed and known else '',
-                moves_px=f'{moves[k]:.3f}' if changed else '',
-                sigma_px=f'{sigma_moves[k]:.3f}' if known else '',
-            )
-        )
-    return rows
-
-
-def alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
-    """Change and sigma of the alignment about each axis, arcsec."""
-    sigma = calibration.sigma[-3:] / ARCSECOND_RAD
-    changes = (
-        alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
-        if prior
-        else np.zeros(3)
-    )
-    return [
-        Row(
-            name=axis,
-            unit='arcsec',
-            sigma=f'{sigma[k]:.2f}',
-            change=_minus(f'{changes[k]:+.2f}') if prior else '',
-            change_sigmas=_minus(f'{changes[k] / sigma[k]:+.1f}')
-            if prior and sigma[k] > 0
-            else '',
-        )
-        for k, axis in enumerate('xyz')
-    ]
 
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes

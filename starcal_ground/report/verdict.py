@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Verdict of a report in words: checks, assumptions, the precision by cause and the next step."""
+"""Results in words: parameters, checks, assumptions, precision by cause and the next step."""
 
 from __future__ import annotations
 
@@ -10,9 +10,22 @@ import math
 import numpy as np
 
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
-from starcal_ros.text import p_value_text, significant
+from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    GateCheck,
+    HeldTerm,
+    parts_that_matter,
+    SigmaPart,
+    StarTrackerAlignment,
+    TemperatureTerms,
+)
+from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
 """Distance from an assumed value below which the value that the stars ask for is noise."""
@@ -188,3 +201,108 @@ def _px(value: float) -> str:
 def _p(value: float) -> str:
     """A p-value as text; empty where nothing was tested."""
     return '' if math.isnan(value) else p_value_text(value)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Row of the parameter table; numbers as text, empty if absent."""
+
+    name: str
+    unit: str
+    sigma: str
+    change: str
+    change_sigmas: str
+    value: str = ''
+    prior: str = ''
+    moves_px: str = ''
+    sigma_px: str = ''
+
+
+def parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
+    """Value, sigma and change of each camera parameter."""
+    camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
+    if prior and prior.camera.model != camera.model:
+        prior = None  # parameters of another lens model are no start of these
+    changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
+    moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
+    rows = []
+    for k, name in enumerate(camera.parameter_names):
+        known, changed = sigma[k] > 0, prior and changes[k]
+        held = '' if name in calibration.estimated else 'held, ' if known else 'held'
+        rows.append(
+            Row(
+                name=name,
+                unit='px' if name in INTRINSIC_NAMES else '',
+                value=to_sigma(camera.parameters[k], sigma[k]),
+                sigma=held + (significant(sigma[k], 2) if known else ''),
+                prior=significant(prior.camera.parameters[k], 8) if prior else '',
+                change=to_sigma(changes[k], sigma[k], '+') if changed else '',
+                change_sigmas=f'{changes[k] / sigma[k]:+.1f}' if changed and known else '',
+                moves_px=f'{moves[k]:.3f}' if changed else '',
+                sigma_px=f'{sigma_moves[k]:.3f}' if known else '',
+            )
+        )
+    return rows
+
+
+def alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
+    """Change and sigma of the alignment about each axis, arcsec; none of the camera alone."""
+    if not calibration.has_alignment:
+        return []
+    sigma = calibration.sigma[-3:] / ARCSECOND_RAD
+    changes = (
+        alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
+        if prior
+        else np.zeros(3)
+    )
+    return [
+        Row(
+            name=axis,
+            unit='arcsec',
+            sigma=f'{sigma[k]:.2f}',
+            change=f'{changes[k]:+.2f}' if prior else '',
+            change_sigmas=f'{changes[k] / sigma[k]:+.1f}' if prior and sigma[k] > 0 else '',
+        )
+        for k, axis in enumerate('xyz')
+    ]
+
+
+def thermal_summary(thermal: TemperatureTerms) -> str:
+    """One line of text with the terms, their sigmas and the reference."""
+    parts = [
+        f'a{k} {to_sigma(value, sigma, "+")} ({significant(sigma, 2)}) /degC'
+        + (f'^{k}' if k > 1 else '')
+        for k, (value, sigma) in enumerate(
+            zip(thermal.focal_per_degc, thermal.focal_per_degc_sigma, strict=True), start=1
+        )
+    ]
+    if thermal.alignment_rate_rad_per_degc:
+        rates = np.degrees(thermal.alignment_rate_rad_per_degc) * 3600.0
+        sigmas = np.degrees(thermal.alignment_rate_rad_per_degc_sigma) * 3600.0
+        axes = (
+            f'{rate:+.3f} ({significant(sigma, 2)})'
+            for rate, sigma in zip(rates, sigmas, strict=True)
+        )
+        parts.append('alignment ' + ', '.join(axes) + ' arcsec/degC')
+    text = f'{"; ".join(parts) or "no terms"}; reference {thermal.reference_degc:g} degC'
+    return text + (f'; {thermal.note}' if thermal.note else '')
+
+
+def alignment_summary(one: StarTrackerAlignment) -> str:
+    """One line of text: images, 1-sigma of alignment and mounting, drift."""
+    aligned, mounted = (
+        np.sqrt(np.diag(covariance)) / ARCSECOND_RAD
+        for covariance in (one.alignment_covariance_rad2, one.mounting_covariance_rad2)
+    )
+    text = f'{one.frame}: {one.images} images, alignment within {_three(aligned)} arcsec'
+    if mounted.any():
+        text += f', mounting within {_three(mounted)}'
+    if np.isfinite(one.drift_p_value):
+        text += (
+            f'; drift {one.drift_arcsec:.1f} arcsec (p-value {p_value_text(one.drift_p_value)})'
+        )
+    return text
+
+
+def _three(values: Floats) -> str:
+    return ', '.join(f'{value:.1f}' for value in values)
