@@ -9,22 +9,13 @@ import math
 
 import numpy as np
 
+from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.records import (
-    Calibration,
-    CameraGeometry,
-    GateCheck,
-    HeldTerm,
-    parts_that_matter,
-    SigmaPart,
-    StarTrackerAlignment,
-    TemperatureTerms,
-)
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
@@ -41,7 +32,9 @@ _SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
-def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str, str]]:
+def check_rows(
+    gate: Sequence[records.GateCheck],
+) -> list[tuple[records.GateCheck, str, str, str, str]]:
     """Checks, the failed ones first, each with its result, value, limit and note as text."""
     rows = []
     for check in sorted(gate, key=lambda check: check.passed is not False):
@@ -57,7 +50,7 @@ def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str
     return rows
 
 
-def checks_sentence(gate: Sequence[GateCheck]) -> str:
+def checks_sentence(gate: Sequence[records.GateCheck]) -> str:
     """How many checks passed, failed and were not made, and why not; empty without a gate."""
     if not gate:
         return ''
@@ -68,9 +61,9 @@ def checks_sentence(gate: Sequence[GateCheck]) -> str:
     return f'Checks: {text}{why}.'
 
 
-def precision_sentences(calibration: Calibration) -> list[str]:
+def precision_sentences(calibration: records.Calibration) -> list[str]:
     """1-sigma of the lines of sight over the detector, and its largest causes."""
-    maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
+    maps, budget = calibration.maps, records.parts_that_matter(calibration.sigma_budget)
     if maps is None:
         return []
     sentences = [_precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec')]
@@ -80,7 +73,7 @@ def precision_sentences(calibration: Calibration) -> list[str]:
     return sentences
 
 
-def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) -> str:
+def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], of: str) -> str:
     finite = sigma[np.isfinite(sigma)]
     if not len(finite):
         return f'{scope}: the lines of sight have no sigma.'
@@ -101,7 +94,7 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) 
     )
 
 
-def next_step(calibration: Calibration) -> str:
+def next_step(calibration: records.Calibration) -> str:
     """The measures against a refusal, or against the largest causes of the sigma."""
     if calibration.accepted:
         return ' '.join(_against_sigma(calibration))
@@ -115,9 +108,9 @@ def next_step(calibration: Calibration) -> str:
     return ' '.join([text, *steps])
 
 
-def _against_sigma(calibration: Calibration) -> list[str]:
+def _against_sigma(calibration: records.Calibration) -> list[str]:
     """A sentence with the measure against the largest cause of each sigma."""
-    causes = parts_that_matter(calibration.sigma_budget)[1:]
+    causes = records.parts_that_matter(calibration.sigma_budget)[1:]
     if not causes:
         return []
     steps = []
@@ -142,7 +135,7 @@ class ModelRow:
     remedy: str
 
 
-def model_rows(calibration: Calibration) -> list[ModelRow]:
+def model_rows(calibration: records.Calibration) -> list[ModelRow]:
     """Rows for the assumptions that a calibration tested; none of one that tested none."""
     found = calibration.model_checks
     if found is None:
@@ -175,7 +168,7 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     ]
 
 
-def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
+def _held(held: Sequence[records.HeldTerm]) -> Iterator[ModelRow]:
     """One row for each value that the stars contradict, and one for all others together."""
     agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
     for term in held:
@@ -218,7 +211,9 @@ class Row:
     sigma_px: str = ''
 
 
-def parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
+def parameter_rows(
+    calibration: records.Calibration, prior: records.CameraGeometry | None
+) -> list[Row]:
     """Value, sigma and change of each camera parameter."""
     camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
     if prior and prior.camera.model != camera.model:
@@ -245,7 +240,9 @@ def parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> li
     return rows
 
 
-def alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
+def alignment_rows(
+    calibration: records.Calibration, prior: records.CameraGeometry | None
+) -> list[Row]:
     """Change and sigma of the alignment about each axis, arcsec; none of the camera alone."""
     if not calibration.has_alignment:
         return []
@@ -267,7 +264,7 @@ def alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> li
     ]
 
 
-def thermal_summary(thermal: TemperatureTerms) -> str:
+def thermal_summary(thermal: records.TemperatureTerms) -> str:
     """One line of text with the terms, their sigmas and the reference."""
     parts = [
         f'a{k} {to_sigma(value, sigma, "+")} ({significant(sigma, 2)}) /degC'
@@ -288,7 +285,7 @@ def thermal_summary(thermal: TemperatureTerms) -> str:
     return text + (f'; {thermal.note}' if thermal.note else '')
 
 
-def alignment_summary(one: StarTrackerAlignment) -> str:
+def alignment_summary(one: records.StarTrackerAlignment) -> str:
     """One line of text: images, 1-sigma of alignment and mounting, drift."""
     aligned, mounted = (
         np.sqrt(np.diag(covariance)) / ARCSECOND_RAD

@@ -73,8 +73,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.image_series import ImageOptions
-    from starcal_ground.mission.ingest import recording, sources, tables
-    from starcal_ground.mission.ingest.guard import Guard
+    from starcal_ground.mission.ingest import mission_records, recording, sources
+    from starcal_ground.mission.ingest.mission_records import Guard
 
     options = ImageOptions(
         time_key=args.time_key,
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
     with Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
         if args.times:
-            times = guard.call(args.times, tables.read_times, args.times)
+            times = guard.call(args.times, mission_records.read_times, args.times)
             options = dataclasses.replace(options, times=times)
         files, problems = recording.look_at_all(paths, options, guard, advance)
         for problem in problems:

@@ -36,7 +36,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.mission.export.lookup_table import write_lookup_table
+    from starcal_ground.mission.export.export_formats import write_lookup_table
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
     from starcal_ros.formats.products.calibration_json import read_calibration
