@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 from bench.table import Table, verdict
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras, KEPT_FOLDER, Task
-from starcal_ground.mission.trend.rows import COMPUTED, kept_name, Row
 from starcal_ground.mission.trend.series import SECONDS_PER_YEAR
+from starcal_ground.mission.trend.trend_table import COMPUTED, kept_name, Row
 from starcal_ground.mission.trend.trend_table import Table as Rows
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel

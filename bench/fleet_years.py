@@ -29,7 +29,7 @@ from bench.table import Table
 from starcal_ground.mission.trend import fleet, places, trend_page
 from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
 from starcal_ground.mission.trend.places import Entry
-from starcal_ground.mission.trend.rows import Row
+from starcal_ground.mission.trend.trend_table import Row
 from starcal_ground.mission.trend.trend_table import Table as Rows
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from bench.frames import load_set_up
 from bench.table import Table
-from starcal_ground.planning.plan import plan_pointings, Pointing, Request
-from starcal_ground.planning.prospect import target
+from starcal_ground.planning.plan import plan_pointings, Pointing, Request, target
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
 from starcal_ros.estimation.calibrate import estimate_calibration

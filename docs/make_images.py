@@ -23,7 +23,7 @@ from PIL.PngImagePlugin import PngInfo
 import yaml
 
 from starcal_ground.cli import main as cli
-from starcal_ground.report.detector_figures import (
+from starcal_ground.report.figures import (
     cell_counts,
     distortion_contours,
     distortion_vectors,

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_ground.report.plots import plot
-from starcal_ground.report.svg import Curve, MUTED, SERIES, sheet
+from starcal_ground.report.svg import Curve, MUTED, plot, SERIES, sheet
 from starcal_ground.simulation.rendering import expose, star_electrons
 from starcal_ground.simulation.scenario import Detector
 from starcal_ros.arrays import Floats

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,6 +37,19 @@ class DifferenceMap:
     difference_px: Floats
     length_px: Floats
     sigmas: Floats
+
+    @property
+    def worst_and_rms_px(self) -> tuple[float, float]:
+        """Largest length and its root mean square."""
+        return float(self.length_px.max()), float(np.sqrt(np.mean(self.length_px**2)))
+
+    @property
+    def worst_and_rms_sigmas(self) -> tuple[float, float]:
+        """The same of the lengths in their sigmas; NaN where nothing was estimated."""
+        known = self.sigmas[np.isfinite(self.sigmas)]
+        if not known.size:
+            return math.nan, math.nan
+        return float(known.max()), float(np.sqrt(np.mean(known**2)))
 
 
 @dataclass(frozen=True)
@@ -176,16 +190,10 @@ def content(comparison: Comparison) -> dict[str, object]:
     """A comparison as a JSON object; a number that is not finite is null."""
 
     def of_map(found: DifferenceMap) -> dict[str, object]:
-        length_px = found.length_px
-        known = found.sigmas[np.isfinite(found.sigmas)]
-        return {
-            'worst_px': float(length_px.max()),
-            'rms_px': float(np.sqrt(np.mean(length_px**2))),
-            'worst_sigmas': float(known.max()) if known.size else None,
-            'rms_sigmas': float(np.sqrt(np.mean(known**2))) if known.size else None,
-            'difference_px': found.difference_px,
-            'sigmas': found.sigmas,
-        }
+        names = ('worst_px', 'rms_px', 'worst_sigmas', 'rms_sigmas')
+        numbers = (*found.worst_and_rms_px, *found.worst_and_rms_sigmas)
+        lengths = dict(zip(names, numbers, strict=True))
+        return {**lengths, 'difference_px': found.difference_px, 'sigmas': found.sigmas}
 
     total = comparison.total
     found = {

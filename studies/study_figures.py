@@ -9,12 +9,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from starcal_ground.report.figures import outline
-from starcal_ground.report.plots import plot
 from starcal_ground.report.svg import (
     Curve,
     Drawing,
     INK,
     Panel,
+    plot,
     Scale,
     SERIES,
     sheet,

@@ -9,7 +9,7 @@ from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.mission.trend.rows import RECORDED, Row, row_of
+from starcal_ground.mission.trend.trend_table import RECORDED, Row, row_of
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Calibration, CameraGeometry
 

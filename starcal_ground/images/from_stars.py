@@ -26,15 +26,8 @@ from starcal_ros.camera.lens import ideal_points
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.identification.blind import search
 from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
-from starcal_ros.identification.blind.search import (
-    confirm_sky,
-    find_in_any,
-    mirror,
-    NotFound,
-    ROUNDS,
-    SkyMatch,
-)
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.catalog import StarCatalog
@@ -250,7 +243,7 @@ def _without_distortion(size: tuple[int, int], focal_px: float, model: str) -> C
 
 def _first_match(
     seen: Sequence[_Seen], cameras: Sequence[CameraModel], catalog: StarCatalog
-) -> tuple[SkyMatch, bool] | None:
+) -> tuple[search.SkyMatch, bool] | None:
     """An image identified with one of the cameras, and whether by its compact sources."""
     deadline_s = time.thread_time() + _SEARCH_S
     ordered = sorted(seen, key=lambda one: -one.stars)
@@ -258,25 +251,29 @@ def _first_match(
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
         for camera in cameras:
             rankings = (one.compact, one.all)
-            sky, matched = find_in_any(rankings, camera, catalog, True, ROUNDS[:1], deadline_s)
-            if isinstance(sky, SkyMatch):
+            sky, matched = search.find_in_any(
+                rankings, camera, catalog, True, search.ROUNDS[:1], deadline_s
+            )
+            if isinstance(sky, search.SkyMatch):
                 return _of_better_lens(sky, rankings[matched], catalog), matched == 0
             if time.thread_time() > deadline_s:
                 return None
     return None
 
 
-def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMatch:
+def _of_better_lens(sky: search.SkyMatch, xy_px: Floats, catalog: StarCatalog) -> search.SkyMatch:
     """A match of sources (n, 2), or the same with an equidistant lens where that shows more."""
     if sky.camera.model == _EQUIDISTANT:
         return sky
-    turned_px = mirror(xy_px, sky.camera.width) if sky.mirrored else xy_px
+    turned_px = search.mirror(xy_px, sky.camera.width) if sky.mirrored else xy_px
     # Without distortion: coefficients fitted to a perspective lens bend corners without stars.
     size, focal_px = (sky.camera.width, sky.camera.height), _focal_px(sky.camera, _EQUIDISTANT)
     camera = _without_distortion(size, focal_px, _EQUIDISTANT)
     cx, cy = sky.camera.parameters[3:5].tolist()
-    other = confirm_sky(turned_px, camera.replace(cx=cx, cy=cy), catalog, sky.camera_from_icrf)
-    if isinstance(other, SkyMatch) and (
+    other = search.confirm_sky(
+        turned_px, camera.replace(cx=cx, cy=cy), catalog, sky.camera_from_icrf
+    )
+    if isinstance(other, search.SkyMatch) and (
         len(other.xy_px) > _MORE * len(sky.xy_px) or other.residual_px < _CLOSER * sky.residual_px
     ):
         return dataclasses.replace(other, mirrored=sky.mirrored)
@@ -284,18 +281,18 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
 
 
 def _all_matches(
-    seen: Sequence[_Seen], first: SkyMatch, compact_first: bool, catalog: StarCatalog
-) -> dict[int, SkyMatch]:
+    seen: Sequence[_Seen], first: search.SkyMatch, compact_first: bool, catalog: StarCatalog
+) -> dict[int, search.SkyMatch]:
     """The images that the camera of the first match identifies, by stamp, mirrored back."""
-    found: dict[int, SkyMatch] = {}
+    found: dict[int, search.SkyMatch] = {}
     camera = first.camera
-    before: SkyMatch | NotFound = NotFound('')
+    before: search.SkyMatch | search.NotFound = search.NotFound('')
     for one in seen:
         rankings = [one.compact, one.all] if compact_first else [one.all, one.compact]
         if first.mirrored:
-            rankings = [mirror(xy_px, camera.width) for xy_px in rankings]
+            rankings = [search.mirror(xy_px, camera.width) for xy_px in rankings]
         for sky in _attempts(rankings, camera, catalog, before):
-            if isinstance(sky, SkyMatch):
+            if isinstance(sky, search.SkyMatch):
                 found[one.time_ns] = before = sky
                 break
     return found
@@ -305,19 +302,19 @@ def _attempts(
     rankings: Sequence[Floats],
     camera: CameraModel,
     catalog: StarCatalog,
-    before: SkyMatch | NotFound,
-) -> Iterator[SkyMatch | NotFound]:
+    before: search.SkyMatch | search.NotFound,
+) -> Iterator[search.SkyMatch | search.NotFound]:
     """Matches of an image, the cheapest first: at the rotation before, then of few patterns."""
-    if isinstance(before, SkyMatch):
+    if isinstance(before, search.SkyMatch):
         for xy_px in rankings:
-            yield confirm_sky(xy_px, camera, catalog, before.camera_from_icrf)
-    for rounds in (ROUNDS[:1], ROUNDS[1:]):
-        yield find_in_any(rankings, camera, catalog, rounds=rounds)[0]
+            yield search.confirm_sky(xy_px, camera, catalog, before.camera_from_icrf)
+    for rounds in (search.ROUNDS[:1], search.ROUNDS[1:]):
+        yield search.find_in_any(rankings, camera, catalog, rounds=rounds)[0]
 
 
 def _of_one_lens(
-    found: Mapping[int, SkyMatch],
-) -> tuple[dict[int, SkyMatch], tuple[float, ...]]:
+    found: Mapping[int, search.SkyMatch],
+) -> tuple[dict[int, search.SkyMatch], tuple[float, ...]]:
     """
     The matches with the focal length of most, and the focal lengths of the others.
 
@@ -349,7 +346,7 @@ def _focal_px(camera: CameraModel, model: str) -> float:
 
 
 def _common_camera(
-    found: Mapping[int, SkyMatch], catalog: StarCatalog, camera: CameraModel
+    found: Mapping[int, search.SkyMatch], catalog: StarCatalog, camera: CameraModel
 ) -> tuple[CameraModel, dict[int, Rotation]]:
     """The camera that fits all matches, and the rotations ``icrf_from_camera`` with it."""
     stars = sum(len(sky.xy_px) for sky in found.values())
@@ -368,7 +365,7 @@ def _common_camera(
 
 
 def _observations(
-    time_ns: int, sky: SkyMatch, catalog: StarCatalog, camera: CameraModel
+    time_ns: int, sky: search.SkyMatch, catalog: StarCatalog, camera: CameraModel
 ) -> StarObservations:
     """Identified sources as observations of stars; their attitude is that of the camera."""
     rows, n = sky.catalog_index, len(sky.catalog_index)

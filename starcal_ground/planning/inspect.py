@@ -18,15 +18,6 @@ from starcal_ros.formats.bag.frames import read_ahead
 from starcal_ros.formats.bag.mcap_reader import Damage
 from starcal_ros.formats.messages import message_fields
 from starcal_ros.formats.messages.image_messages import decode_png
-from starcal_ros.formats.messages.message_fields import (
-    ATTITUDE_TYPE,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    Message,
-    OBSERVATIONS_TYPE,
-    TEMPERATURE_TYPE,
-    VELOCITY_TYPE,
-)
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis import bags
@@ -36,13 +27,13 @@ from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
-_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
+_IMAGES = (message_fields.IMAGE_TYPE, message_fields.COMPRESSED_TYPE)
 _STAMPED = (
     *_IMAGES,
-    ATTITUDE_TYPE,
-    VELOCITY_TYPE,
-    TEMPERATURE_TYPE,
-    OBSERVATIONS_TYPE,
+    message_fields.ATTITUDE_TYPE,
+    message_fields.VELOCITY_TYPE,
+    message_fields.TEMPERATURE_TYPE,
+    message_fields.OBSERVATIONS_TYPE,
 )
 
 
@@ -191,7 +182,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                 stamp_ns = message_fields.stamp_ns(message.header.stamp)
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
-                elif raw.type_name == ATTITUDE_TYPE:
+                elif raw.type_name == message_fields.ATTITUDE_TYPE:
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
@@ -216,7 +207,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
     return tuple(found)
 
 
-def _kind(message: Message) -> str:
+def _kind(message: message_fields.Message) -> str:
     """Encoding and size of an image message as text."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'

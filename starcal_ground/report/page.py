@@ -8,22 +8,27 @@ The page needs no network: styles, script and pictures are embedded.
 
 from __future__ import annotations
 
+import base64
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 import functools
 import json
 import logging
+import math
 from pathlib import Path
 
 import jinja2
+from markupsafe import Markup
+import numpy as np
 
-from starcal_ground.report import detector_figures, figures, page_sections, thumbnails, verdict
+from starcal_ground.report import figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
+from starcal_ground.report.thumbnails import star_of, Thumbnail
+from starcal_ground.report.verdict import Row
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.constants import utc_text
+from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import ProductError
-from starcal_ros.estimation.problem import alignment_summary
-from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json, product_folder
@@ -33,10 +38,197 @@ from starcal_ros.formats.products.product_files import (
     REPORT_FILE,
     write_atomically,
 )
+from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
 from starcal_ros.pipeline.provenance import inputs_of
-from starcal_ros.records import Calibration, IMAGE_REFUSALS, parts_that_matter, StarObservations
+from starcal_ros.records import (
+    Calibration,
+    IMAGE_REFUSALS,
+    parts_that_matter,
+    STAR_REFUSALS,
+    StarObservations,
+    TOTAL,
+)
 from starcal_ros.text import significant
 from starcal_ros.untrusted import json_value
+
+
+def typeset(rows: Sequence[Row]) -> list[Row]:
+    """Rows with minus signs in place of hyphens."""
+    return [Row(*(text.replace('-', '\N{MINUS SIGN}') for text in astuple(row))) for row in rows]
+
+
+def _none(count: int) -> str:
+    return f'{count:,}' if count else 'none'
+
+
+def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """(name, number, note) of the main results."""
+    rms_px = calibration.residual_rms_px
+    pixel_arcsec = 1.0 / calibration.geometry.camera.parameters[0] / ARCSECOND_RAD
+    in_arcsec = f'{rms_px * pixel_arcsec:.2f}″ at {pixel_arcsec:.1f}″ per pixel'
+    refused = _none(sum(calibration.images_refused.values()))
+    misfits = _none(len(calibration.misfit_images_ns))
+    outliers = _none(calibration.stars_rejected)
+    results = [
+        ('Residual', f'{rms_px:.3f} px', f'rms per axis; {in_arcsec}'),
+        (
+            'Images',
+            f'{calibration.images_used:,}',
+            f'used; {refused} refused; attitude misfits among those used: {misfits}',
+        ),
+        ('Stars', f'{calibration.stars_used:,}', f'used; outliers left out: {outliers}'),
+    ]
+    maps = calibration.maps
+    if maps is not None:
+        total = next((part for part in calibration.sigma_budget if part.cause == TOTAL), None)
+        scopes = (
+            ('Line of sight', maps.line_of_sight_sigma_arcsec,
+             total.pointing_arcsec if total else None, 'in the star tracker frame'),
+            ('Camera alone', maps.shape_sigma_arcsec, total.map_arcsec if total else None,
+             'common rotation removed'),
+        )  # fmt: skip
+        for name, sigma, rms, text in scopes if calibration.has_alignment else scopes[1:]:
+            worst = f'at most {significant(sigma.max(), 3)}″'
+            if rms is None:
+                results.append((name, worst, f'1-sigma, {text}'))
+            else:
+                note = f'1-sigma, rms over the detector, {text}; {worst}'
+                results.append((name, f'{significant(rms, 2)}″', note))
+    return results
+
+
+_SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
+_LISTED_REFUSED = 200
+
+
+def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
+    """Data of the single-image view: positions in px, residuals in 0.001 px."""
+    if residuals is None or len(residuals.image_time_ns) == 0:
+        return None
+    camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
+    count = len(residuals.image_time_ns)
+    mean_stars = max(1.0, len(residuals.image) / count)
+    most = max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars)))
+    chosen = np.rint(np.linspace(0, count - 1, min(count, most))).astype(int).tolist()
+    rms = residuals.image_rms_px()
+    images = []
+    for k in chosen:
+        here = residuals.image == k
+        place = np.rint(residuals.measured_px[here]).astype(int)
+        residual = np.rint(1000 * np.clip(residuals.residual_px[here], -99, 99)).astype(int)
+        stars = np.c_[place, residual, residuals.used[here].astype(int)]
+        error = residuals.attitude_error_arcsec[k]
+        images.append(
+            {
+                'number': k + 1,
+                'time': utc_text(int(residuals.image_time_ns[k])),
+                'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
+                'misfit': bool(residuals.image_misfit[k]),
+                'tracker': [None if math.isnan(e) else round(float(e), 2) for e in error],
+                'stars': stars.ravel().tolist(),
+            }
+        )
+    return {
+        'width': camera.width,
+        'height': camera.height,
+        'count': count,
+        'images': images,
+        # The length of a typical residual is a fiftieth of the width.
+        'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
+    }
+
+
+def picture(thumbnail: Thumbnail) -> Markup:
+    """Data URL of a picture."""
+    kind = 'image/jpeg' if thumbnail.name.endswith('.jpg') else 'image/png'
+    # Safe as markup: base64 has no special characters.
+    return Markup(f'data:{kind};base64,{base64.b64encode(thumbnail.encoded).decode("ascii")}')
+
+
+def refused_images(
+    counts: Mapping[str, int],
+    observations: Sequence[StarObservations],
+    thumbnails: Sequence[Thumbnail],
+) -> list[Mapping[str, object]]:
+    """For each reason its count, the refused images, and pictures of some of them."""
+    pictures = {t.time_ns: t for t in thumbnails if not t.reason}
+    groups: list[Mapping[str, object]] = []
+    for reason, count in Counter(counts).most_common():
+        images = [o for o in observations if o.refusal == reason]
+        groups.append(
+            {
+                'reason': reason,
+                'meaning': IMAGE_REFUSALS.get(reason, ''),
+                'count': count,
+                'images': [(utc_text(o.time_ns), o.detail) for o in images[:_LISTED_REFUSED]],
+                'pictures': [
+                    (picture(pictures[o.time_ns]), utc_text(o.time_ns), o.detail)
+                    for o in images
+                    if o.time_ns in pictures
+                ],
+            }
+        )
+    return groups
+
+
+def _counts(observations: Sequence[StarObservations]) -> Counter[str]:
+    """Refused stars of all images by reason."""
+    counts: Counter[str] = Counter()
+    for observed in observations:
+        counts.update(observed.refused_stars)
+    return counts
+
+
+def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str, str]]:
+    """Colour, letter and reason of the marks of refused stars in the pictures."""
+    return [
+        (
+            '#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)),
+            LETTERS[STAR_MARKS[reason].shape],
+            reason,
+        )
+        for reason, count in _counts(observations).items()
+        if count and reason in STAR_MARKS
+    ]
+
+
+def refused_stars(
+    observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
+) -> list[Mapping[str, object]]:
+    """
+    For each reason, most frequent first: meaning, count, and pictures of some refused stars.
+
+    Each picture has the stamp and the catalog number of its star.
+    """
+    by_time = {o.time_ns: o for o in observations}
+    pictures = defaultdict(list)
+    for one in (thumbnail for thumbnail in thumbnails if thumbnail.reason):
+        number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
+        label = '' if number is None else str(number)
+        pictures[one.reason].append((picture(one), utc_text(one.time_ns), label))
+    return [
+        {
+            'reason': reason,
+            'meaning': STAR_REFUSALS.get(reason, ''),
+            'count': count,
+            'pictures': pictures[reason],
+        }
+        for reason, count in _counts(observations).most_common()
+        if count
+    ]
+
+
+def used_images(
+    observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
+) -> list[tuple[Markup, str, int]]:
+    """Picture, stamp and number of stars of each used image."""
+    stars = {o.time_ns: len(o) for o in observations if not o.refusal}
+    return [
+        (picture(t), utc_text(t.time_ns), stars[t.time_ns])
+        for t in thumbnails
+        if not t.reason and t.time_ns in stars
+    ]
+
 
 _DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are written
 _PRODUCTS = (
@@ -135,28 +327,28 @@ def _context(found: Found) -> Mapping[str, object]:
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
         'active_since': utc_text(calibration.active_since_ns),
-        'parameters': page_sections.parameter_rows(calibration, prior),
-        'alignment': page_sections.alignment_rows(calibration, prior)
-        if calibration.has_alignment
-        else [],
-        'tiles': page_sections.tiles(calibration),
+        'parameters': typeset(verdict.parameter_rows(calibration, prior)),
+        'alignment': typeset(verdict.alignment_rows(calibration, prior)),
+        'tiles': tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
         'precision': verdict.precision_sentences(calibration),
         'next_step': verdict.next_step(calibration),
         'signed': _signed(calibration),
-        'star_trackers': [alignment_summary(one) for one in calibration.star_trackers],
-        'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
+        'star_trackers': [verdict.alignment_summary(one) for one in calibration.star_trackers],
+        'thermal': verdict.thermal_summary(calibration.temperature)
+        if calibration.temperature
+        else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
-        'slider': page_sections.slider(calibration, residuals),
-        'refused_images': page_sections.refused_images(refused, observations, pictures),
-        'refused_stars': page_sections.refused_stars(observations, pictures),
+        'slider': slider(calibration, residuals),
+        'refused_images': refused_images(refused, observations, pictures),
+        'refused_stars': refused_stars(observations, pictures),
         'model_rows': verdict.model_rows(calibration),
-        'star_marks': page_sections.star_marks(observations),
+        'star_marks': star_marks(observations),
         'files': [(name, _DIGEST.format(name)) for name in found.files],
         'has_images': any(not one.reason for one in pictures),
-        'used_images': page_sections.used_images(observations, pictures),
+        'used_images': used_images(observations, pictures),
         'options': _options(calibration),
     }
 
@@ -187,7 +379,7 @@ def write_failure_page(record: product_folder.NotCalibrated, folder: Path) -> Pa
     Raises ProductError when the page cannot be written.
     """
     pictures = [
-        (page_sections.picture(one), utc_text(one.time_ns))
+        (picture(one), utc_text(one.time_ns))
         for one in thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
         if one.reason == thumbnails.EXPECTED
     ]
@@ -208,22 +400,22 @@ def charts_of(
     geometry, prior = calibration.geometry, calibration_json.prior_of(calibration)
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, Chart | None] = {
-        'vectors': detector_figures.distortion_vectors(camera),
-        'contours': detector_figures.distortion_contours(camera),
-        'sky': detector_figures.pointings(observations, geometry),
+        'vectors': figures.distortion_vectors(camera),
+        'contours': figures.distortion_contours(camera),
+        'sky': figures.pointings(observations, geometry),
     }
     if prior is not None:
-        charts['change'] = detector_figures.change_contours(prior, geometry)
+        charts['change'] = figures.change_contours(prior, geometry)
     if (field := camera.moving_field) is not None:
-        charts['lens_field'] = detector_figures.field_vectors(field, camera)
+        charts['lens_field'] = figures.field_vectors(field, camera)
     if maps is not None:
-        charts['cells'] = detector_figures.cell_counts(maps.stars, camera)
-        charts['shape'] = detector_figures.line_of_sight_sigma(maps, camera, is_alone=True)
-        charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
+        charts['cells'] = figures.cell_counts(maps.stars, camera)
+        charts['shape'] = figures.line_of_sight_sigma(maps, camera, is_alone=True)
+        charts['line_of_sight'] = figures.line_of_sight_sigma(maps, camera, False)
     if calibration.sigma_budget:
         parts = parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
-        charts['causes'] = detector_figures.budget_over_detector(parts, camera)
+        charts['causes'] = figures.budget_over_detector(parts, camera)
     if residuals is not None and residuals.used.any():
         charts |= _residual_charts(calibration, residuals)
         if prior is not None:
@@ -235,9 +427,9 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
     camera = calibration.geometry.camera
     sigma_arcsec = calibration.star_tracker_sigma_arcsec
     return {
-        'coverage': detector_figures.star_coverage(residuals, camera),
+        'coverage': figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
-        'field': detector_figures.mean_residuals(residuals, camera),
+        'field': figures.mean_residuals(residuals, camera),
         'spectrum': figures.spectrum(residuals, camera),
         'histogram': figures.histogram(residuals),
         'magnitude': figures.residuals_against_magnitude(residuals),

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Verdict of a report in words: checks, assumptions, the precision by cause and the next step."""
+"""Results in words: parameters, checks, assumptions, precision by cause and the next step."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import math
 
 import numpy as np
 
+from starcal_ros import records
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
-from starcal_ros.text import p_value_text, significant
+from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
 """Distance from an assumed value below which the value that the stars ask for is noise."""
@@ -28,7 +32,9 @@ _SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
-def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str, str]]:
+def check_rows(
+    gate: Sequence[records.GateCheck],
+) -> list[tuple[records.GateCheck, str, str, str, str]]:
     """Checks, the failed ones first, each with its result, value, limit and note as text."""
     rows = []
     for check in sorted(gate, key=lambda check: check.passed is not False):
@@ -44,7 +50,7 @@ def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str
     return rows
 
 
-def checks_sentence(gate: Sequence[GateCheck]) -> str:
+def checks_sentence(gate: Sequence[records.GateCheck]) -> str:
     """How many checks passed, failed and were not made, and why not; empty without a gate."""
     if not gate:
         return ''
@@ -55,9 +61,9 @@ def checks_sentence(gate: Sequence[GateCheck]) -> str:
     return f'Checks: {text}{why}.'
 
 
-def precision_sentences(calibration: Calibration) -> list[str]:
+def precision_sentences(calibration: records.Calibration) -> list[str]:
     """1-sigma of the lines of sight over the detector, and its largest causes."""
-    maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
+    maps, budget = calibration.maps, records.parts_that_matter(calibration.sigma_budget)
     if maps is None:
         return []
     sentences = [_precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec')]
@@ -67,7 +73,7 @@ def precision_sentences(calibration: Calibration) -> list[str]:
     return sentences
 
 
-def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) -> str:
+def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], of: str) -> str:
     finite = sigma[np.isfinite(sigma)]
     if not len(finite):
         return f'{scope}: the lines of sight have no sigma.'
@@ -88,7 +94,7 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) 
     )
 
 
-def next_step(calibration: Calibration) -> str:
+def next_step(calibration: records.Calibration) -> str:
     """The measures against a refusal, or against the largest causes of the sigma."""
     if calibration.accepted:
         return ' '.join(_against_sigma(calibration))
@@ -102,9 +108,9 @@ def next_step(calibration: Calibration) -> str:
     return ' '.join([text, *steps])
 
 
-def _against_sigma(calibration: Calibration) -> list[str]:
+def _against_sigma(calibration: records.Calibration) -> list[str]:
     """A sentence with the measure against the largest cause of each sigma."""
-    causes = parts_that_matter(calibration.sigma_budget)[1:]
+    causes = records.parts_that_matter(calibration.sigma_budget)[1:]
     if not causes:
         return []
     steps = []
@@ -129,7 +135,7 @@ class ModelRow:
     remedy: str
 
 
-def model_rows(calibration: Calibration) -> list[ModelRow]:
+def model_rows(calibration: records.Calibration) -> list[ModelRow]:
     """Rows for the assumptions that a calibration tested; none of one that tested none."""
     found = calibration.model_checks
     if found is None:
@@ -162,7 +168,7 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     ]
 
 
-def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
+def _held(held: Sequence[records.HeldTerm]) -> Iterator[ModelRow]:
     """One row for each value that the stars contradict, and one for all others together."""
     agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
     for term in held:
@@ -188,3 +194,112 @@ def _px(value: float) -> str:
 def _p(value: float) -> str:
     """A p-value as text; empty where nothing was tested."""
     return '' if math.isnan(value) else p_value_text(value)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Row of the parameter table; numbers as text, empty if absent."""
+
+    name: str
+    unit: str
+    sigma: str
+    change: str
+    change_sigmas: str
+    value: str = ''
+    prior: str = ''
+    moves_px: str = ''
+    sigma_px: str = ''
+
+
+def parameter_rows(
+    calibration: records.Calibration, prior: records.CameraGeometry | None
+) -> list[Row]:
+    """Value, sigma and change of each camera parameter."""
+    camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
+    if prior and prior.camera.model != camera.model:
+        prior = None  # parameters of another lens model are no start of these
+    changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
+    moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
+    rows = []
+    for k, name in enumerate(camera.parameter_names):
+        known, changed = sigma[k] > 0, prior and changes[k]
+        held = '' if name in calibration.estimated else 'held, ' if known else 'held'
+        rows.append(
+            Row(
+                name=name,
+                unit='px' if name in INTRINSIC_NAMES else '',
+                value=to_sigma(camera.parameters[k], sigma[k]),
+                sigma=held + (significant(sigma[k], 2) if known else ''),
+                prior=significant(prior.camera.parameters[k], 8) if prior else '',
+                change=to_sigma(changes[k], sigma[k], '+') if changed else '',
+                change_sigmas=f'{changes[k] / sigma[k]:+.1f}' if changed and known else '',
+                moves_px=f'{moves[k]:.3f}' if changed else '',
+                sigma_px=f'{sigma_moves[k]:.3f}' if known else '',
+            )
+        )
+    return rows
+
+
+def alignment_rows(
+    calibration: records.Calibration, prior: records.CameraGeometry | None
+) -> list[Row]:
+    """Change and sigma of the alignment about each axis, arcsec; none of the camera alone."""
+    if not calibration.has_alignment:
+        return []
+    sigma = calibration.sigma[-3:] / ARCSECOND_RAD
+    changes = (
+        alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
+        if prior
+        else np.zeros(3)
+    )
+    return [
+        Row(
+            name=axis,
+            unit='arcsec',
+            sigma=f'{sigma[k]:.2f}',
+            change=f'{changes[k]:+.2f}' if prior else '',
+            change_sigmas=f'{changes[k] / sigma[k]:+.1f}' if prior and sigma[k] > 0 else '',
+        )
+        for k, axis in enumerate('xyz')
+    ]
+
+
+def thermal_summary(thermal: records.TemperatureTerms) -> str:
+    """One line of text with the terms, their sigmas and the reference."""
+    parts = [
+        f'a{k} {to_sigma(value, sigma, "+")} ({significant(sigma, 2)}) /degC'
+        + (f'^{k}' if k > 1 else '')
+        for k, (value, sigma) in enumerate(
+            zip(thermal.focal_per_degc, thermal.focal_per_degc_sigma, strict=True), start=1
+        )
+    ]
+    if thermal.alignment_rate_rad_per_degc:
+        rates = np.degrees(thermal.alignment_rate_rad_per_degc) * 3600.0
+        sigmas = np.degrees(thermal.alignment_rate_rad_per_degc_sigma) * 3600.0
+        axes = (
+            f'{rate:+.3f} ({significant(sigma, 2)})'
+            for rate, sigma in zip(rates, sigmas, strict=True)
+        )
+        parts.append('alignment ' + ', '.join(axes) + ' arcsec/degC')
+    text = f'{"; ".join(parts) or "no terms"}; reference {thermal.reference_degc:g} degC'
+    return text + (f'; {thermal.note}' if thermal.note else '')
+
+
+def alignment_summary(one: records.StarTrackerAlignment) -> str:
+    """One line of text: images, 1-sigma of alignment and mounting, drift."""
+    aligned, mounted = (
+        np.sqrt(np.diag(covariance)) / ARCSECOND_RAD
+        for covariance in (one.alignment_covariance_rad2, one.mounting_covariance_rad2)
+    )
+    text = f'{one.frame}: {one.images} images, alignment within {_three(aligned)} arcsec'
+    if mounted.any():
+        text += f', mounting within {_three(mounted)}'
+    if np.isfinite(one.drift_p_value):
+        text += (
+            f'; drift {one.drift_arcsec:.1f} arcsec (p-value {p_value_text(one.drift_p_value)})'
+        )
+    return text
+
+
+def _three(values: Floats) -> str:
+    return ', '.join(f'{value:.1f}' for value in values)

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.live import Live
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
-from starcal_ground.cli.commands.monitor import Seen, view
+from starcal_ground.cli.monitor_view import Seen, view
 from starcal_ros.formats.messages.calibration_messages import (
     calibration_from_message,
     status_from_message,

@@ -36,7 +36,6 @@ from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import Measurements, normal_blocks
 from starcal_ros.estimation.temperature import parameters_at, turns
 from starcal_ros.records import Ensemble, StarTrackerAlignment
-from starcal_ros.text import p_value_text
 
 METHODS = ('hierarchical', 'per_image', 'single')
 
@@ -313,23 +312,3 @@ def _drift(errors: AttitudeErrors, here: Mask) -> tuple[Floats, float, float]:
     p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # of three axes
     rate = slope / ARCSECOND_RAD
     return rate, float(np.linalg.norm(rate) * np.ptp(hours)), p_value
-
-
-def alignment_summary(one: StarTrackerAlignment) -> str:
-    """One line of text: images, 1-sigma of alignment and mounting, drift."""
-    aligned, mounted = (
-        np.sqrt(np.diag(covariance)) / ARCSECOND_RAD
-        for covariance in (one.alignment_covariance_rad2, one.mounting_covariance_rad2)
-    )
-    text = f'{one.frame}: {one.images} images, alignment within {_three(aligned)} arcsec'
-    if mounted.any():
-        text += f', mounting within {_three(mounted)}'
-    if np.isfinite(one.drift_p_value):
-        text += (
-            f'; drift {one.drift_arcsec:.1f} arcsec (p-value {p_value_text(one.drift_p_value)})'
-        )
-    return text
-
-
-def _three(values: Floats) -> str:
-    return ', '.join(f'{value:.1f}' for value in values)

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.records import Calibration, CameraGeometry, TemperatureTerms
-from starcal_ros.text import significant, to_sigma
 
 FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
 _SCALED = slice(0, 3)  # fx, skew, fy
@@ -99,27 +98,6 @@ def why_unsupported(temperatures_degc: Floats, order: int) -> str:
     if distinct <= order:
         return f'{distinct} temperatures do not determine a polynomial of degree {order}'
     return ''
-
-
-def summary(thermal: TemperatureTerms) -> str:
-    """One line of text with the terms, their sigmas and the reference."""
-    parts = [
-        f'a{k} {to_sigma(value, sigma, "+")} ({significant(sigma, 2)}) /degC'
-        + (f'^{k}' if k > 1 else '')
-        for k, (value, sigma) in enumerate(
-            zip(thermal.focal_per_degc, thermal.focal_per_degc_sigma, strict=True), start=1
-        )
-    ]
-    if thermal.alignment_rate_rad_per_degc:
-        rates = np.degrees(thermal.alignment_rate_rad_per_degc) * 3600.0
-        sigmas = np.degrees(thermal.alignment_rate_rad_per_degc_sigma) * 3600.0
-        axes = (
-            f'{rate:+.3f} ({significant(sigma, 2)})'
-            for rate, sigma in zip(rates, sigmas, strict=True)
-        )
-        parts.append('alignment ' + ', '.join(axes) + ' arcsec/degC')
-    text = f'{"; ".join(parts) or "no terms"}; reference {thermal.reference_degc:g} degC'
-    return text + (f'; {thermal.note}' if thermal.note else '')
 
 
 def _powers(above_reference_k: Floats, order: int) -> Floats:

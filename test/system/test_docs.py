@@ -21,8 +21,8 @@ from PIL import Image
 import pytest
 
 from starcal_ground.cli import main
-from starcal_ground.cli.arguments import parser
-from starcal_ground.cli.commands import demo
+from starcal_ground.cli.commands import compare, demo
+from starcal_ground.cli.main import parser
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.options import names_of, read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
@@ -218,7 +218,7 @@ def test_the_tool_takes_the_line(line: Line) -> None:
     """Every command and option in a document exists."""
     words = [re.sub(r'^[NMS]$', '1', word) for word in line.words]  # a number to be given
     args = parser().parse_args(words[1:])  # ends the test where it does not understand
-    assert args.command in main._COMMANDS
+    assert args.command in main.COMMANDS
 
 
 RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
@@ -248,7 +248,7 @@ def test_readme_and_tutorial_run() -> None:
 def test_subcommands_in_the_interface_document_are_those_of_the_tool() -> None:
     text = (ROOT / 'docs' / 'icd.md').read_text()
     documented = set(re.findall(r'^\| `starcal (\w+)', text, re.MULTILINE))
-    assert documented == set(main._COMMANDS)
+    assert documented == set(main.COMMANDS)
 
 
 PARAMETER_BLOCKS = [
@@ -315,7 +315,7 @@ def test_the_demo_lines_of_the_tutorial_are_those_of_the_demo(tiny_products: Pat
     """Estimates within a tenth of their sigma, sigmas within 2 %."""
     bag = demo.tiny_bag(tiny_products)
     calibration = read_calibration(tiny_products / 'calibration.json')
-    table = demo.compare(calibration, bag.truth, bag.prior)
+    table = compare.with_truth(calibration, bag.truth, bag.prior)
     made = {line.rpartition('  ')[0][:11].strip(): numbers(line) for line in table.lines[1:]}
     shown = re.findall(
         r'^    (fx|k1|p1|alignment x) (.*)$', (ROOT / 'docs/tutorial.md').read_text(), re.MULTILINE

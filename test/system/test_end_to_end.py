@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ground.cli import main
-from starcal_ground.cli.commands import demo
+from starcal_ground.cli.commands import compare
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
 from starcal_ros.assessment import agreement
@@ -81,7 +81,7 @@ def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[f
 def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> None:
     """Assert each parameter within 5 sigma, and the Mahalanobis error within 5 sigma."""
     prior_is_not_asked = calibration.geometry  # the comparison table wants one
-    comparison = demo.compare(calibration, truth, prior_is_not_asked)
+    comparison = compare.with_truth(calibration, truth, prior_is_not_asked)
     assert comparison.worst_sigmas < 5, '\n'.join(comparison.lines)
     chi2, count = normalised_error(calibration, truth)
     assert chi2 < count + 5 * np.sqrt(2 * count)  # five standard deviations of chi^2

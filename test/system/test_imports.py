@@ -28,7 +28,7 @@ BLOCKS = ('body', 'orelse', 'handlers', 'finalbody')  # of an if, a try, a class
 
 def test_a_calibration_does_not_wait_for_what_it_seldom_needs() -> None:
     """scipy.stats alone would make the start, one second, a third longer."""
-    show = 'import sys; from starcal_ground.cli.commands import calibrate; print(*sys.modules)'
+    show = 'import sys; from starcal_ground.cli import into_folder; print(*sys.modules)'
     done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert 'scipy.special' in loaded and 'starcal_ros.pipeline.solve' in loaded
@@ -72,7 +72,7 @@ def test_each_module_imports_alone() -> None:
     """No module needs another one imported first: none needs itself, through whatever others."""
     graph = {name: needed_by(name) for name in MODULES}
     assert 'starcal_ros.camera.projection' in graph['starcal_ros.camera']
-    assert 'starcal_ros.pipeline.campaign' in graph['starcal_ground.cli.commands.calibrate']
+    assert 'starcal_ros.pipeline.campaign' in graph['starcal_ground.cli.into_folder']
     graphlib.TopologicalSorter(graph).prepare()  # CycleError names the modules
 
 

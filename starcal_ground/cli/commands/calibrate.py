@@ -1,46 +1,174 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""`starcal calibrate`: bags to products, or to a record of why there are none."""
+"""
+Calibrate from bags, without a ROS graph.
+
+Measures the stars of all images, estimates camera and alignment, checks the result against the
+limits of the gate and writes report.html, calibration.json, camera_info.yaml and observations.mcap
+to DIR. Images without attitudes give the camera alone: their attitudes are found from the stars.
+
+  # the bag in the repository
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
+  # photographs of the night sky alone
+  starcal calibrate 'night/*.jpg' -o out
+  # the images of the first 30 s
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30
+  # one of several cameras, from two bags together
+  starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
+  # repeat from the recorded observations, with other options and without images
+  starcal calibrate out/observations.mcap --params bags/tiny/params.yaml -o again
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
-import dataclasses
 from dataclasses import dataclass
+from datetime import datetime, timezone
+import math
 from pathlib import Path
-import sys
 import tempfile
-import threading
+from typing import TYPE_CHECKING
 
-from starcal_ground.cli import output
-from starcal_ground.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt, Time
-from starcal_ground.cli.output import check_folder
-from starcal_ground.cli.terminal import print_text, progress_bar
-from starcal_ground.report import thumbnails
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_table, print_text, print_verdict
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import (
-    missing_package,
-    NotFromStars,
-    OptionError,
-    StarcalError,
-    TooFewObservations,
-)
-from starcal_ros.estimation.options import tracker_sigma_is_given
-from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.product_files import make_folder, REPORT_FILE, write_atomically
-from starcal_ros.formats.products.product_folder import (
-    NotCalibrated,
-    write_not_calibrated,
-    write_observations,
-    write_products,
-)
-from starcal_ros.pipeline import campaign
-from starcal_ros.pipeline.provenance import inputs_of, software_version
-from starcal_ros.pipeline.setup import files_of, read_setup, read_values
-from starcal_ros.pipeline.topics import Topics, without_attitudes
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.errors import NotFromStars, OptionError
+from starcal_ros.formats.products.product_files import make_folder
+from starcal_ros.text import significant
+
+if TYPE_CHECKING:
+    from starcal_ros.pipeline.campaign import Source
+    from starcal_ros.records import Calibration, CameraGeometry
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    arguments.add_bags(command, arguments.BAGS_OR_IMAGES)
+    what = 'ROS parameter file: prior camera, mounting and options; images need none'
+    arguments.add_params(command, what)
+    arguments.add_output(
+        command, 'DIR', 'folder for the products, created if absent', required=True
+    )
+    what = 'write no report; starcal report DIR writes it later'
+    command.add_argument('--no-report', action='store_true', help=what)
+    arguments.add_camera_alone(command)
+    arguments.add_lens(command)
+    arguments.add_topics(command)
+    when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
+    for name, what in (('from', f'use images from T on: {when}'), ('to', 'use images up to T')):
+        command.add_argument(
+            f'--{name}', dest=f'{name}_time', type=parse_time, metavar='T', help=what
+        )
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.cli import into_folder
+    from starcal_ros.estimation.options import tracker_sigma_is_given
+
+    with _source(args) as (source, files), into_folder.digests(files) as inputs:
+        if args.output.exists() and not args.output.is_dir():
+            raise OptionError(f'{args.output}: not a folder')
+        arguments.print_notes(source.notes)
+        selection = None
+        if args.from_time or args.to_time:
+            selection = Selection(args.from_time, args.to_time)
+        made, report = into_folder.calibrate_into(
+            args.output, source, inputs, selection, not args.no_report
+        )
+    calibration, setup = made.calibration, made.setup
+    print_calibration(calibration, setup.prior)
+    if calibration.has_alignment and not tracker_sigma_is_given(setup.calibration):
+        sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
+        print_text(
+            f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
+            ' is not given'
+        )
+    print_text(f'products written to {args.output}' + (f'; {report}' if report else ''))
+    return arguments.EXIT_ACCEPTED if calibration.accepted else arguments.EXIT_REFUSED
+
+
+@contextlib.contextmanager
+def _source(args: argparse.Namespace) -> Iterator[tuple[Source, Sequence[Path]]]:
+    """The source that the arguments name, and its files; that of images lasts for the block."""
+    from starcal_ground.cli.into_folder import check_folder, failure_recorded
+    from starcal_ground.images.photographs import image_paths
+    from starcal_ros.formats.bag import reader
+    from starcal_ros.pipeline.campaign import source_of
+    from starcal_ros.pipeline.setup import files_of, read_setup, read_values
+    from starcal_ros.pipeline.topics import without_attitudes
+
+    photographs, topics = image_paths(args.bags), arguments.topics(args)
+    values = read_values(args.params) if args.params else {}
+    if photographs or without_attitudes(args.bags, topics, values, args.camera_alone):
+        with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+            yield _source_by_stars(args, values, photographs, Path(folder))
+        return
+    if args.params is None:
+        raise OptionError('--params: needed for a bag with attitudes, unless --camera-alone')
+    setup = read_setup(args.params)
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
+    with failure_recorded(args.output, args.bags, OptionError):
+        source = source_of(args.bags, setup, topics)
+    yield source, (*reader.mcap_files(args.bags), args.params)
+
+
+def _source_by_stars(
+    args: argparse.Namespace, values: Mapping[str, object], photographs: list[Path], folder: Path
+) -> tuple[Source, Sequence[Path]]:
+    """Photographs, or bags without attitudes: those of their stars are written to a folder."""
+    from starcal_ground.cli.into_folder import check_folder, failure_recorded
+    from starcal_ground.images import night_sky
+    from starcal_ros.formats.bag import reader
+    from starcal_ros.pipeline.campaign import source_of
+
+    bags = [] if photographs else args.bags
+    files = [] if photographs else reader.mcap_files(bags)
+    params = list(filter(None, [args.params]))
+    check_folder(args.output, bags, (*photographs, *params))
+    make_folder(args.output)
+    with failure_recorded(args.output, args.bags, NotFromStars):
+        if photographs:
+            chosen, notes = night_sky.photographs_of(
+                photographs, args.focal_length_mm, args.pixel_size_um
+            )
+            arguments.print_notes(notes)
+            files = [photograph.path for photograph in chosen]
+            sky = night_sky.from_photographs(chosen, values, folder)
+        else:
+            sky = night_sky.from_bags(bags, arguments.topics(args), values, folder)
+    arguments.print_notes(sky.notes)
+    return source_of(sky.bags, sky.setup, sky.topics, sky.through_air), (*files, *params)
+
+
+@dataclass(frozen=True)
+class Time:
+    """Value of a time option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
+
+    seconds: float
+    since_first_image: bool
+
+
+def parse_time(text: str) -> Time:
+    """
+    A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
+
+    Raises argparse.ArgumentTypeError for another text.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(
+                f'{text!r} is not a time: give 2026-05-15T07:20:00, seconds since 1970, or'
+                ' +seconds after the first image'
+            ) from error
+        with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
+        return Time(with_zone.timestamp(), False)
+    if not math.isfinite(seconds):
+        raise argparse.ArgumentTypeError(f'{text!r} is not a finite number of seconds')
+    return Time(seconds, text.strip().startswith('+'))
 
 
 @dataclass
@@ -79,257 +207,62 @@ class Selection:
         return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
 
 
-def calibrate(args: argparse.Namespace, asked: Topics) -> int:
-    """Calibrate from bags in one process, as the two nodes do on the graph, or from images."""
-    with _source(args, asked) as (source, files), _digests(files) as inputs:
-        if args.output.exists() and not args.output.is_dir():
-            raise OptionError(f'{args.output}: not a folder')
-        _tell(source.notes)
-        wanted = None
-        if args.from_time or args.to_time:
-            wanted = Selection(args.from_time, args.to_time)
-        made, report = calibrate_into(args.output, source, inputs, wanted, not args.no_report)
-    calibration, setup = made.calibration, made.setup
-    output.print_calibration(calibration, setup.prior)
-    if calibration.has_alignment and not tracker_sigma_is_given(setup.calibration):
-        sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
-        print_text(
-            f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
-            ' is not given'
+def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
+    """Print parameters, statistics and verdict; changes are relative to the prior."""
+    import numpy as np
+
+    from starcal_ground.report import verdict
+
+    rows = verdict.parameter_rows(calibration, prior)
+    angles = verdict.alignment_rows(calibration, prior)
+    print_table(
+        ('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas'),
+        [
+            (f'{kind}{row.name}', row.value, row.unit, row.sigma, row.change, row.change_sigmas)
+            for kind, of_kind in (('', rows), ('alignment ', angles))
+            for row in of_kind
+        ],
+    )
+    _print_budget(calibration)
+    quaternion = calibration.geometry.star_tracker_from_camera_xyzw
+    aligned = np.array2string(quaternion, precision=9, separator=', ')
+    if not calibration.has_alignment:
+        aligned = 'none: attitudes from the stars, the camera alone'
+    refused = ', '.join(f'{n} {reason}' for reason, n in calibration.images_refused.items())
+    print_text(f'alignment xyzw  {aligned}')
+    print_text(f'images          {calibration.images_used} used, refused: {refused or "none"}')
+    print_text(
+        f'stars           {calibration.stars_used} used, {calibration.stars_rejected} rejected'
+    )
+    print_text(f'residual        {calibration.residual_rms_px:.4f} px rms per axis')
+    print_text(f'method          {calibration.method}')
+    print_text(f'solver          {calibration.iterations} iterations, {calibration.termination}')
+    if calibration.temperature is not None:
+        print_text(f'temperature     {verdict.thermal_summary(calibration.temperature)}')
+    for tracker in calibration.star_trackers:
+        print_text(f'star tracker    {verdict.alignment_summary(tracker)}')
+    if calibration.accepted:
+        print_verdict(True, 'verdict         accepted')
+    else:
+        print_verdict(False, f'verdict         refused: {"; ".join(calibration.reasons)}')
+
+
+def _print_budget(calibration: Calibration) -> None:
+    from starcal_ros.records import parts_that_matter
+
+    parts = parts_that_matter(calibration.sigma_budget)
+    columns = 4 if calibration.has_alignment else 3
+    rows = [
+        (
+            part.cause,
+            part.assumption,
+            *(
+                f'{significant(one, 3, least=0.001)}"'
+                for one in (part.map_arcsec, part.pointing_arcsec)
+            ),
         )
-    print_text(f'products written to {args.output}' + (f'; {report}' if report else ''))
-    return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
-
-
-@contextlib.contextmanager
-def _source(
-    args: argparse.Namespace, asked: Topics
-) -> Iterator[tuple[campaign.Source, Sequence[Path]]]:
-    """The source that the arguments name, and its files; that of images lasts for the block."""
-    from starcal_ground.images.photographs import image_paths
-
-    photographs = image_paths(args.bags)
-    values = read_values(args.params) if args.params else {}
-    if photographs or without_attitudes(args.bags, asked, values, args.camera_alone):
-        with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-            yield _source_by_stars(args, asked, photographs, Path(folder))
-        return
-    if args.params is None:
-        raise OptionError('--params: needed for a bag with attitudes, unless --camera-alone')
-    setup = read_setup(args.params)
-    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
-    with _failure_recorded(args, OptionError):
-        source = campaign.source_of(args.bags, setup, asked)
-    yield source, (*reader.mcap_files(args.bags), args.params)
-
-
-def _source_by_stars(
-    args: argparse.Namespace, asked: Topics, photographs: list[Path], folder: Path
-) -> tuple[campaign.Source, Sequence[Path]]:
-    """Photographs, or bags without attitudes: those of their stars are written to a folder."""
-    from starcal_ground.images import night_sky  # seldom needed, slow to load
-
-    bags = [] if photographs else args.bags
-    files = [] if photographs else reader.mcap_files(bags)
-    params = list(filter(None, [args.params]))
-    check_folder(args.output, bags, (*photographs, *params))
-    values = read_values(args.params) if args.params else {}
-    make_folder(args.output)
-    with _failure_recorded(args, NotFromStars):
-        if photographs:
-            chosen, notes = night_sky.photographs_of(
-                photographs, args.focal_length_mm, args.pixel_size_um
-            )
-            _tell(notes)
-            files = [photograph.path for photograph in chosen]
-            sky = night_sky.from_photographs(chosen, values, folder)
-        else:
-            sky = night_sky.from_bags(bags, asked, values, folder)
-    _tell(sky.notes)
-    source = campaign.source_of(sky.bags, sky.setup, sky.topics, sky.through_air)
-    return source, (*files, *params)
-
-
-@contextlib.contextmanager
-def _failure_recorded(args: argparse.Namespace, kind: type[StarcalError]) -> Iterator[None]:
-    """Write an error of a kind that ends the block to the folder as well."""
-    try:
-        yield
-    except kind as error:
-        make_folder(args.output)
-        _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
-        raise
-
-
-@contextlib.contextmanager
-def _digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
-    """Digests of input files, which are read during the block; its end stops that at once."""
-    with ThreadPoolExecutor(1, 'digests') as thread:
-        stopped = threading.Event()
-        try:
-            yield thread.submit(inputs_of, files, stopped.is_set).result
-        finally:
-            stopped.set()
-
-
-def _tell(notes: Sequence[str]) -> None:
-    for note in notes:
-        print_text(note, file=sys.stderr)
-
-
-def calibrate_into(
-    folder: Path,
-    source: campaign.Source,
-    inputs: Callable[[], Mapping[str, str]],
-    wanted: Selection | None = None,
-    with_report: bool = False,
-) -> tuple[campaign.Campaign, str]:
-    """
-    Calibrate and write the products, with or without a report.
-
-    Also returns where the report is, or why there is none.
-    """
-    album, drawings = thumbnails.Album(source.image_count, source.setup), Drawings()
-
-    def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
-        with drawings.kind('pictures of images'):
-            album.show(image, observed, geometry)
-
-    with progress_bar(source.image_count, 'images') as advance:
-        observed = campaign.observe(source, wanted, show, advance)
-    if wanted is not None and not observed.observations:
-        raise OptionError(wanted.without_images())
-    make_folder(folder)
-    # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    write_observations(observed.observations, folder, source.setup.frames.camera_frame)
-    with ThreadPoolExecutor(1, 'pictures') as thread:
-        drawn = thread.submit(album.thumbnails)
-        if with_report:
-            thread.submit(_load_report)
-        made = _calibrated(folder, observed, inputs(), album)
-        pictures: Sequence[thumbnails.Thumbnail] = ()
-        with drawings.kind('pictures of images'):
-            pictures = drawn.result()
-        written = thread.submit(_write_all, made, pictures, folder)
-        page, report = '', ''
-        try:
-            if with_report:
-                with drawings.kind('report'):
-                    page, report = _drawn(made, pictures, folder)
-        finally:
-            written.result()
-            if not page:  # one that is there is of the products that were replaced
-                (folder / REPORT_FILE).unlink(missing_ok=True)
-    if page:
-        from starcal_ground.report.page import with_digests
-
-        # After the products that it is of.
-        write_atomically(folder / REPORT_FILE, with_digests(page, folder))
-    return made, report
-
-
-def _calibrated(
-    folder: Path,
-    observed: campaign.Observed,
-    inputs: Mapping[str, str],
-    album: thumbnails.Album,
-) -> campaign.Campaign:
-    """The calibration of observed images; a failure is recorded in the folder."""
-    try:
-        made = campaign.calibrate(observed, inputs)
-    except TooFewObservations as error:
-        failure = _failure(str(error), observed)
-        _write_failure(folder, failure, album.unmatched)
-        raise TooFewObservations(failure.reason) from error
-    _tell(made.notes[len(observed.source.notes) :])
-    if made.observations is not observed.observations:
-        write_observations(made.observations, folder, made.setup.frames.camera_frame)
-    return made
-
-
-def _load_report() -> None:
-    """Import the modules of the report and compile its template."""
-    with contextlib.suppress(ModuleNotFoundError):
-        from starcal_ground.report import page
-
-        page.page_template('report.html')
-
-
-def _write_all(
-    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
-) -> None:
-    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    write_products(made.calibration, folder, made.residuals)
-
-
-def _drawn(
-    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
-) -> tuple[str, str]:
-    """The report of what is being written, and where it will be; or why there is none."""
-    try:
-        from starcal_ground.report import page
-    except ModuleNotFoundError as error:
-        return '', f'no report: {missing_package(error, "report")}'
-    ordered = thumbnails.ordered(pictures)
-    content = page.Found(made.calibration, made.residuals, made.observations, ordered)
-    return page.render(content, folder), f'look at {folder / REPORT_FILE}'
-
-
-def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
-    """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals, refusals
-
-    source, count = observed.source, len(observed.observations)
-    groups = refusals(observed.observations)
-    refused = {group.reason: group.count for group in groups}
-    is_none_used = sum(refused.values()) == count
-    if count and is_none_used:
-        words = f'no image of {count} can be used'
-    if refused:
-        words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
-    named = tuple(map(str, source.bags))
-    cause = of_refusals(groups, count)
-    if source.topics.image and is_none_used:
-        cause = of_a_failure(source.bags, source.topics, source.setup, groups)
-    if cause is None:
-        return NotCalibrated(words, named, refused)
-    command = 'starcal diagnose' if source.through_air is None else ''
-    words = f'{cause.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
-    return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
-
-
-def _write_failure(
-    folder: Path, failure: NotCalibrated, pictures: Sequence[thumbnails.Thumbnail] = ()
-) -> None:
-    """Replace what a folder holds of an earlier calibration by the record of a failure."""
-    software = f'starcal {software_version()}'
-    write_not_calibrated(dataclasses.replace(failure, software=software), folder)
-    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    with Drawings().kind('report'):
-        try:
-            from starcal_ground.report import page
-        except ModuleNotFoundError as error:
-            missing_package(error, 'report')  # raises where another module is missing
-        else:
-            page.write_report(folder)
-
-
-class Drawings:
-    """Drawings of one result; one that fails costs a line on stderr, once for each kind."""
-
-    def __init__(self) -> None:
-        self._failed: set[str] = set()
-
-    @contextlib.contextmanager
-    def kind(self, name: str) -> Iterator[None]:
-        """End the block quietly where drawing fails; writing belongs outside of it."""
-        try:
-            yield
-        # Other versions of contourpy, Jinja2 and OpenCV fail in their own ways.
-        except Exception as error:
-            if is_interrupt(error):
-                raise
-            if name not in self._failed:
-                self._failed.add(name)
-                kind = '' if isinstance(error, StarcalError) else f'{type(error).__name__}: '
-                complain(f'warning: no {name}, the other results are complete: {kind}{error}')
+        for part in parts
+    ]
+    if rows:
+        header = ('1-sigma of lines of sight', '', 'camera alone', 'with alignment')
+        print_table(header[:columns], [row[:columns] for row in rows], left=2)

@@ -1,70 +1,89 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Demonstration: calibrates a small bag with the real nodes and compares with the truth."""
+"""
+Calibrate a small bag with the real ROS nodes.
+
+Starts the nodes, plays ten simulated images to them, requests a calibration through the service
+and prints the result and the truth.
+
+  # write to the folder starcal_demo
+  starcal demo
+  # write to another folder
+  starcal demo -o first_look
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-import contextlib
+import argparse
 from dataclasses import dataclass
-import importlib.util
 import json
 import os
 from pathlib import Path
-import signal
-import socket
-import subprocess
-import sys
-import tempfile
-import time
-from typing import NoReturn
+from typing import TYPE_CHECKING
 
-import numpy as np
-import yaml
+from starcal_ground.cli import arguments, terminal
+from starcal_ros.formats.products.product_files import check_outputs, make_folder
+from starcal_ros.text import significant
 
-from starcal_ground.cli.terminal import table_lines
-from starcal_ground.simulation import scenario, simulated_bag
-from starcal_ground.simulation.simulated_bag import true_geometry
-from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import ProductError, StarcalError
-from starcal_ros.files import mark
-from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
-from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.formats.products.product_files import read_text, write_atomically
-from starcal_ros.processes import module_command
-from starcal_ros.records import Calibration, CameraGeometry
-from starcal_ros.text import significant, to_sigma
-from starcal_ros.untrusted import json_value, PRODUCT_BYTES
+if TYPE_CHECKING:
+    from starcal_ros.records import CameraGeometry
 
-Process = subprocess.Popen[bytes]
-
-RATE = 5.0  # ten images in eight seconds
-_START_S = 30.0  # longest start of the nodes
-_QUIET_S = 10.0  # after the bag was played: no more images come
-_NODES = ('star_observer', 'calibrator')
+_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
+_MOST_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
 
-class NodeError(StarcalError):
-    """A node did not start, or ended early."""
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    what = 'folder for products and log files, created if absent (default: starcal_demo)'
+    arguments.add_output(command, 'DIR', what, default=Path('starcal_demo'))
 
 
-def check_ros() -> None:
-    """
-    Check that nodes can run.
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground import comparison
+    from starcal_ground.cli import node_processes
+    from starcal_ground.cli.commands.compare import with_truth
+    from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
+    from starcal_ground.report import page
+    from starcal_ros.formats.products.product_folder import write_products
+    from starcal_ros.pipeline.campaign import source_of
+    from starcal_ros.pipeline.setup import load_setup
+    from starcal_ros.pipeline.topics import Topics
 
-    Raises NodeError where ROS, or the generated messages, cannot be imported.
-    """
-    for name in ('rclpy', 'starcal.msg'):
-        try:
-            is_there = importlib.util.find_spec(name) is not None
-        except ModuleNotFoundError:
-            is_there = False
-        if not is_there:
-            raise NodeError(
-                f'no ROS nodes here: {name} is not installed; source a ROS 2 workspace with'
-                ' starcal (docs/tutorial.md, "Run in the vehicle"), or calibrate without ROS:'
-                ' starcal calibrate'
-            )
+    node_processes.check_ros()
+    make_folder(args.output)
+    bag = tiny_bag(args.output)
+    check_folder(args.output, [bag.bag], ())
+    check_outputs(node_processes.outputs(args.output))
+    terminal.print_text(f'bag {bag.bag}; log files and products in {args.output}')
+    with terminal.progress_bar(bag.image_count, 'images') as advance:
+        calibration, verdict = node_processes.calibrate_with_nodes(
+            bag.bag, bag.parameters, bag.image_count, args.output, advance
+        )
+    terminal.print_text(verdict)
+    if calibration is None:
+        return arguments.EXIT_REFUSED
+    beside_truth = with_truth(calibration, bag.truth, bag.prior)
+    terminal.print_text('\n'.join(beside_truth.lines))
+    good = beside_truth.worst_sigmas <= _MOST_SIGMAS
+    terminal.print_verdict(
+        good,
+        f'largest error {beside_truth.worst_sigmas:.1f} sigma, '
+        f'{"within" if good else "over"} the limit of {_MOST_SIGMAS:g} sigma',
+    )
+    # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
+    setup = load_setup(bag.parameters)
+    again, _ = calibrate_into(args.output, source_of([bag.bag], setup, Topics()), dict)
+    write_products(calibration, args.output)
+    apart_px = float(comparison.compare(calibration, again.calibration).before.length_px.max())
+    same = apart_px <= _SAME_PX
+    terminal.print_verdict(
+        same,
+        'starcal calibrate gives the same calibration from the bag'
+        if same
+        else 'starcal calibrate gives another calibration from the bag: they differ by '
+        f'{significant(apart_px, 2)} px',
+    )
+    with Drawings().kind('report'):
+        terminal.print_text(f'open {page.write_report(args.output)}')
+    return arguments.EXIT_ACCEPTED if good and same else arguments.EXIT_REFUSED
 
 
 @dataclass(frozen=True)
@@ -78,16 +97,15 @@ class DemoBag:
     image_count: int
 
 
-@dataclass(frozen=True)
-class TruthTable:
-    """Estimate and truth: lines of a table, and the largest error in sigmas."""
-
-    lines: tuple[str, ...]
-    worst_sigmas: float
-
-
 def tiny_bag(spare: Path) -> DemoBag:
     """The small bag of the source tree or the installed package, or one rendered under `spare`."""
+    import numpy as np
+    import yaml
+
+    from starcal_ground.simulation import scenario, simulated_bag
+    from starcal_ros.formats.products.camera_yaml import read_camera_info
+    from starcal_ros.records import CameraGeometry
+
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     places = [Path(__file__).parents[3], *(Path(p, 'share/starcal') for p in prefixes if p)]
     folders = (place / 'bags' / 'tiny' for place in places)
@@ -102,236 +120,3 @@ def tiny_bag(spare: Path) -> DemoBag:
         read_camera_info(folder / 'camera.yaml'), np.array(parameters['prior_alignment'])
     )
     return DemoBag(folder, parameters, prior, simulated_bag.true_geometry(truth), truth['images'])
-
-
-def outputs(folder: Path) -> list[Path]:
-    """The parameter file and the log files of a run."""
-    logs = [folder / f'{name}.log' for name in (*_NODES, 'bag_player')]
-    return [folder / 'demo_params.yaml', *logs]  # not params.yaml: a user's may be there
-
-
-def run(
-    bag: DemoBag, folder: Path, on_image: Callable[[], None] = lambda: None
-) -> tuple[Calibration | None, str]:
-    """
-    Calibration of the nodes, None if refused, and the answer of their service.
-
-    Starts the nodes, plays the bag and calls the service; images and calibration are read from the
-    state folder of the calibrator, a temporary one.  Log files go to the folder.  All processes
-    have ended when this returns.  Raises NodeError when a node does not start, or ends before the
-    calibration.
-    """
-    params, *_ = outputs(folder)
-    content = {'/**': {'ros__parameters': bag.parameters}}
-    write_atomically(params, yaml.safe_dump(content, sort_keys=False))
-    environment = {**os.environ, **_own_domain()}
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(_ended_like_interrupted())
-        state = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        nodes: dict[str, Process] = {}
-        commands = {name: _node_command(name, params, state) for name in _NODES}
-        commands['bag_player'] = [
-            *node_command('bag_player', player_arguments(bag.bag, RATE)),
-            *('-p', 'wait_for_topic:=observations', '-p', f'wait_for_subscribers_s:={_START_S}'),
-        ]
-        for name, command in commands.items():
-            log = stack.enter_context((folder / f'{name}.log').open('w+b'))
-            stack.callback(mark, log)
-            # Interrupted in here, the process would run on with nobody to end it.
-            with _interrupts_wait():
-                nodes[name] = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
-                )
-                stack.callback(_stop, nodes[name])
-        _wait_for_images(bag.image_count, state / 'ensemble', nodes, folder, on_image)
-        asked = subprocess.run(
-            node_command('starcal_ground.ros.calibrate_client', []),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            env=environment,
-            text=True,
-            check=False,
-        )
-        if asked.returncode:
-            raise NodeError(f'{asked.stderr.strip()} (see the log files in {folder})')
-        activated = next((state / 'calibrations').glob('*.json'), None)
-        return (read_calibration(activated) if activated else None), asked.stdout.strip()
-
-
-def _wait_for_images(
-    count: int,
-    ensemble: Path,
-    nodes: dict[str, Process],
-    folder: Path,
-    on_image: Callable[[], None],
-) -> None:
-    """Wait until the calibrator has kept all images, or no more come after the bag was played."""
-    kept, since_s = 0, time.monotonic()
-    while kept < count:
-        for name, node in nodes.items():
-            if node.poll():  # the player ends by itself, with status 0
-                said = (folder / f'{name}.log').read_text(errors='replace').strip()
-                last = said.rpartition('\n')[2]
-                raise NodeError(f'{name} ended before the calibration: {last}')
-        found = len(list(ensemble.glob('*.mcap')))
-        if found > kept or nodes['bag_player'].poll() is None:
-            since_s = time.monotonic()
-        elif time.monotonic() > since_s + _QUIET_S:
-            return
-        for _ in range(found - kept):
-            on_image()
-        kept = found
-        time.sleep(0.05)
-
-
-def become(command: list[str]) -> NoReturn:
-    """
-    Replace this process by a node; a Ctrl-C waits until that answers it without a traceback.
-
-    Raises NodeError where nodes cannot run.
-    """
-    check_ros()
-    sys.stdout.flush()
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        os.execv(sys.executable, command)
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-
-
-def _node_command(name: str, params: Path, state: Path) -> list[str]:
-    topics = {
-        'image': simulated_bag.IMAGE_TOPIC,
-        'attitude': simulated_bag.ATTITUDE_TOPIC,
-        'velocity': simulated_bag.VELOCITY_TOPIC,
-    }
-    remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
-    kept = ['-p', f'state_dir:={state}']
-    return node_command(name, ['--ros-args', '--params-file', str(params), *kept, *remaps])
-
-
-def node_command(name: str, arguments: Sequence[str], remaps: Sequence[str] = ()) -> list[str]:
-    """Command line that runs a node or another module, with names replaced by others, ``A:=B``."""
-    renamed = [part for remap in remaps for part in ('-r', remap)]
-    ros_arguments = ['--ros-args', *renamed] if renamed else []
-    return [*module_command('starcal_ros.entry_points'), name, *arguments, *ros_arguments]
-
-
-def player_arguments(path: Path, rate: float) -> list[str]:
-    """Parameters of the bag player."""
-    return ['--ros-args', '-p', f'bag:={path.resolve()}', '-p', f'rate:={rate!r}']
-
-
-@contextlib.contextmanager
-def _ended_like_interrupted() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C, so that it stops the nodes too."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Raise the KeyboardInterrupt of a signal that comes in the block at its end."""
-    came: list[int] = []
-    numbers = [
-        number
-        for number in (signal.SIGINT, signal.SIGTERM)
-        if callable(signal.getsignal(number))  # not ignored
-    ]
-    before = [signal.signal(number, lambda got, _: came.append(got)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-    if came:
-        raise KeyboardInterrupt
-
-
-def _stop(process: Process) -> None:
-    """End a process, by SIGKILL if it ignores the milder signals."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-        if process.poll() is None:
-            process.send_signal(number)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(5.0)
-
-
-def _own_domain() -> dict[str, str]:
-    """Environment of a ROS domain unused on this machine; empty if ROS_DOMAIN_ID is set."""
-    if 'ROS_DOMAIN_ID' in os.environ:
-        return {}
-    first = os.getpid() % 100
-    for domain in (1 + (first + k) % 100 for k in range(100)):
-        # The first participant of a domain holds UDP port 7400 + 250 domain + 10 (RTPS 9.6.1.1).
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(('', 7410 + 250 * domain))
-            except OSError:
-                continue
-        return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-    raise NodeError('no free ROS domain on this machine: set ROS_DOMAIN_ID')
-
-
-def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> TruthTable:
-    """Table of the estimated parameters and the alignment with prior and truth."""
-    all_names = calibration.geometry.camera.parameter_names
-    names = [name for name in all_names if name in calibration.estimated]
-    columns = [all_names.index(name) for name in names]
-    before, estimate, true = (
-        geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
-    )
-    sigma = calibration.sigma
-    off = (estimate - true) / sigma[columns]
-    rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
-    table = [
-        (
-            name,
-            significant(b, 6),
-            to_sigma(e, s),
-            significant(s, 2),
-            significant(t, 6),
-            f'{o:+.1f} sigma',
-        )
-        for name, b, e, s, t, o in rows
-    ]
-    # Alignment angles are relative to the truth.
-    prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
-    error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
-    sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
-    angles_off = error_arcsec / sigma_arcsec
-    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True)
-    table += [
-        (f'alignment {axis}', f'{b:+.2f}"', f'{e:+.2f}"', f'{s:.2f}"', '0"', f'{o:+.1f} sigma')
-        for axis, b, e, s, o in angles
-    ]
-    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
-    return TruthTable(tuple(table_lines(header, table)), float(np.abs([*off, *angles_off]).max()))
-
-
-def is_truth(path: Path) -> bool:
-    """True if a file is the truth of a simulated bag, as ``starcal simulate`` writes it."""
-    try:
-        content = json_value(read_text(path, PRODUCT_BYTES))
-    except (ProductError, ValueError):
-        return False
-    return isinstance(content, dict) and 'k_true' in content
-
-
-def compare_with(calibration: Calibration, path: Path) -> TruthTable:
-    """
-    The table of a calibration beside the truth.
-
-    Raises ProductError when the truth is of another lens model or damaged.
-    """
-    try:
-        truth = true_geometry(json_value(read_text(path, PRODUCT_BYTES)))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
-    model = calibration.geometry.camera.model
-    if truth.camera.model != model:
-        raise ProductError(f'{path}: of lens model {truth.camera.model}, calibrated was {model}')
-    return compare(calibration, truth, prior_of(calibration) or calibration.geometry)

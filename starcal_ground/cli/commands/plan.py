@@ -1,97 +1,134 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""`starcal plan`: the pointings to take next."""
+r"""
+Propose the next pointings of the camera.
+
+Calibrates from the images so far. Then it chooses the allowed pointings one by one, each time the
+one that lowers a sigma most, and prints the sigma expected after it.
+
+  # the next ten images, anywhere on the sky
+  starcal plan bags/tiny --params bags/tiny/params.yaml
+  # five images, within 60 degrees of the zenith of Houston, away from the Sun
+  starcal plan bags/tiny --params bags/tiny/params.yaml --images 5 \
+      --within 250 30 60 --avoid 83 23 40 -o pointings.csv
+"""
 
 from __future__ import annotations
 
 import argparse
 import csv
 import io
-import json
 from pathlib import Path
-import sys
+from typing import TYPE_CHECKING
 
-from starcal_ground.cli.arguments import EXIT_ACCEPTED
-from starcal_ground.cli.output import check_file
+from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text
-from starcal_ground.planning.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.errors import errors_as, OptionError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.setup import files_of, read_setup
-from starcal_ros.pipeline.topics import Topics
-from starcal_ros.record_fields import json_object
 from starcal_ros.text import significant
 from starcal_ros.untrusted import PRODUCT_BYTES, read_text
+
+if TYPE_CHECKING:
+    from starcal_ground.planning.plan import Plan, Pointing
 
 _COLUMNS = ('ra_deg', 'dec_deg', 'roll_deg')
 
 
-def plan(args: argparse.Namespace, asked: Topics) -> int:
-    """Print the pointings that lower a sigma most, and write them if asked."""
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    arguments.add_bags(command, f'images or observations so far: {arguments.BAGS}')
+    arguments.add_params(command)
+    images = arguments.number(int, 1, 1000)
+    what = 'images that may be taken (default: 10)'
+    add('--images', type=images, default=10, metavar='N', help=what)
+    what = 'sigma to lower: line_of_sight (default), map, or a parameter such as fx or k1'
+    add('--minimise', default='line_of_sight', metavar='NAME', help=what)
+    allowed = command.add_mutually_exclusive_group()
+    what = 'CSV of the allowed pointings, with the columns ra_deg, dec_deg and, if fixed, roll_deg'
+    allowed.add_argument('--pointings', type=arguments.path, metavar='FILE', help=what)
+    cone = ('RA', 'DEC', 'DEG')
+    what = 'allow boresights within DEG degrees of a direction, ICRF (default: the whole sky)'
+    whole = (0.0, 0.0, 180.0)
+    allowed.add_argument('--within', type=float, nargs=3, default=whole, metavar=cone, help=what)
+    what = 'no boresight within DEG degrees of a direction: Sun, Moon, Earth; may be repeated'
+    add('--avoid', type=float, nargs=3, action='append', default=[], metavar=cone, help=what)
+    slew = arguments.number(float, 0.001, 180)
+    what = 'largest angle between the boresights of an image and the next (default: 180)'
+    add('--slew', type=slew, default=180.0, metavar='DEG', help=what)
+    arguments.add_output(command, 'FILE', 'write the pointings as CSV too')
+    arguments.add_topics(command)
+    arguments.add_json(command)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.planning.plan import Cone, plan_pointings, Request
+    from starcal_ros.formats.bag import reader
+    from starcal_ros.pipeline.campaign import calibrate_bags
+    from starcal_ros.pipeline.setup import files_of, read_setup
+
     setup = read_setup(args.params)
     if args.output:
         given = [args.params, *files_of(setup.frames).values(), *filter(None, [args.pointings])]
-        check_file(args.output, [*reader.files_of_bags(args.bags), *given])
+        arguments.check_file(args.output, [*reader.files_of_bags(args.bags), *given])
     request = Request(
         args.images,
         args.minimise,
         _pointings(args.pointings) if args.pointings else (),
         Cone(*args.within),
-        tuple(Cone(*one) for one in args.avoid),
+        tuple(Cone(*cone) for cone in args.avoid),
         args.slew,
     )
-    campaign = calibrate_bags(args.bags, setup, asked)
-    for note in campaign.notes:
-        print_text(note, file=sys.stderr)
-    found = plan_pointings(campaign.ensemble, campaign.setup, request)
+    campaign = calibrate_bags(args.bags, setup, arguments.topics(args))
+    arguments.print_notes(campaign.notes)
+    plan = plan_pointings(campaign.ensemble, campaign.setup, request)
     if args.output:
-        write_atomically(args.output, _csv(found))
+        write_atomically(args.output, _csv(plan))
     if args.json:
-        print_text(json.dumps(json_object(found), indent=1, allow_nan=False))
-        return EXIT_ACCEPTED
-    print_table(*_table(found), left=0)
-    if found.enough is not None:
-        print_text(f'after image {found.enough} another lowers the sigma by less than 1 %')
-    print_text(found.in_a_sentence())
-    if len(found.steps) < args.images:
-        print_text(f'no other pointing can be reached after image {len(found.steps)}')
+        arguments.print_json(plan)
+        return arguments.EXIT_ACCEPTED
+    print_table(*_table(plan), left=0)
+    if plan.enough is not None:
+        print_text(f'after image {plan.enough} another lowers the sigma by less than 1 %')
+    print_text(plan.in_a_sentence())
+    if len(plan.steps) < args.images:
+        print_text(f'no other pointing can be reached after image {len(plan.steps)}')
     if args.output:
         print_text(f'pointings written to {args.output}')
-    return EXIT_ACCEPTED
+    return arguments.EXIT_ACCEPTED
 
 
 def _pointings(path: Path) -> tuple[Pointing, ...]:
     """Return the rows of a file of pointings."""
+    from starcal_ground.planning.plan import Pointing
+
     with errors_as(OptionError, path):
         rows = csv.DictReader(io.StringIO(read_text(path, PRODUCT_BYTES)))
     try:
         lacking = [name for name in _COLUMNS[:2] if name not in (rows.fieldnames or ())]
         if lacking:
             raise OptionError(f'{path}: no column {" and ".join(lacking)}')
-        found = [Pointing(*(float(row.get(name) or 0.0) for name in _COLUMNS)) for row in rows]
+        pointings = [Pointing(*(float(row.get(name) or 0.0) for name in _COLUMNS)) for row in rows]
     except (TypeError, ValueError, csv.Error) as error:
         raise OptionError(f'{path}: line {rows.line_num}: {error}') from error
-    if not found:
+    if not pointings:
         raise OptionError(f'{path}: no pointings')
-    return tuple(found)
+    return tuple(pointings)
 
 
-def _csv(found: Plan) -> str:
+def _csv(plan: Plan) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
-    writer.writerow([*_COLUMNS, 'stars', found.name])
-    for step in found.steps:
+    writer.writerow([*_COLUMNS, 'stars', plan.name])
+    for step in plan.steps:
         place = step.pointing
         angles = [f'{a:.4f}' for a in (place.ra_deg, place.dec_deg, place.roll_deg)]
         writer.writerow([*angles, step.stars, f'{step.sigma:.6g}'])
     return text.getvalue()
 
 
-def _table(found: Plan) -> tuple[list[str], list[list[str]]]:
-    header = ['image', 'ra', 'dec', 'roll', 'stars', found.name]
-    rows = [['now', '', '', '', '', significant(found.sigma, 4)]]
-    for k, step in enumerate(found.steps, 1):
+def _table(plan: Plan) -> tuple[list[str], list[list[str]]]:
+    header = ['image', 'ra', 'dec', 'roll', 'stars', plan.name]
+    rows = [['now', '', '', '', '', significant(plan.sigma, 4)]]
+    for k, step in enumerate(plan.steps, 1):
         place = step.pointing
         angles = [f'{deg:.3f}' for deg in (place.ra_deg, place.dec_deg, place.roll_deg)]
         rows.append([str(k), *angles, str(step.stars), significant(step.sigma, 4)])

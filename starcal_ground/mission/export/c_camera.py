@@ -19,7 +19,7 @@ import zlib
 
 import numpy as np
 
-from starcal_ground.mission.export.losses import ascii_line, origin
+from starcal_ground.mission.export.exported import ascii_line, origin
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import pixel_grid

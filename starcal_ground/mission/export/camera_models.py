@@ -23,16 +23,7 @@ import numpy as np
 from scipy.optimize import least_squares
 import yaml
 
-from starcal_ground.mission.export.losses import (
-    about,
-    ascii_line,
-    Content,
-    Files,
-    fitted,
-    GRID,
-    Loss,
-    origin,
-)
+from starcal_ground.mission.export import exported
 from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
@@ -51,18 +42,18 @@ _MRCAL = {
 }
 
 
-def opencv_yaml(calibration: Calibration) -> Content:
+def opencv_yaml(calibration: Calibration) -> exported.Content:
     """
     YAML for ``cv2.FileStorage``: camera matrix, distortion, rotation.
 
     ``distortion_coefficients`` are for ``cv2.projectPoints``, or for ``cv2.fisheye`` if
     ``lens_model`` is ``fisheye``.
     """
-    camera, made = fitted(calibration, calibration.geometry.camera.model, ('skew',))
+    camera, made = exported.fitted(calibration, calibration.geometry.camera.model, ('skew',))
     _, D = ros_distortion(camera.model, camera.distortion)
     lines = [
         '%YAML:1.0',
-        *_commented(about(calibration, made)),
+        *_commented(exported.about(calibration, made)),
         '# rotation: camera_from_star_tracker',
         '---',
         f'image_width: {camera.width}',
@@ -78,14 +69,16 @@ def opencv_yaml(calibration: Calibration) -> Content:
     return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
 
 
-def kalibr_yaml(calibration: Calibration, topic: str) -> Content:
+def kalibr_yaml(calibration: Calibration, topic: str) -> exported.Content:
     """
     A camchain of kalibr with one camera.
 
     The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment without
     translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller error.
     """
-    candidates = [(*fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()]
+    candidates = [
+        (*exported.fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()
+    ]
     camera, made, word = min(candidates, key=lambda candidate: candidate[1].worst_px)
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
@@ -104,18 +97,18 @@ def kalibr_yaml(calibration: Calibration, topic: str) -> Content:
         }
     }
     note = '# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker'
-    text = '\n'.join([*_commented(about(calibration, made)), note, _yaml(content)])
+    text = '\n'.join([*_commented(exported.about(calibration, made)), note, _yaml(content)])
     return dataclasses.replace(made, files={'camchain.yaml': text})
 
 
-def ros_yaml(calibration: Calibration) -> Content:
+def ros_yaml(calibration: Calibration) -> exported.Content:
     """
     The camera YAML of ROS, and ``alignment.yaml`` for a static transform publisher.
 
     The alignment is a geometry_msgs/TransformStamped.
     """
     camera = calibration.geometry.camera
-    _, made = fitted(calibration, camera.model, ('skew',))
+    _, made = exported.fitted(calibration, camera.model, ('skew',))
     x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw.tolist()
     content = {
         'header': {'frame_id': calibration.parent_frame},
@@ -125,21 +118,21 @@ def ros_yaml(calibration: Calibration) -> Content:
             'rotation': {'x': x, 'y': y, 'z': z, 'w': w},
         },
     }
-    files: Files = {
+    files: exported.Files = {
         CAMERA_INFO_FILE: lambda path: write_camera_info(camera, path, calibration.child_frame),
-        'alignment.yaml': '\n'.join([*_commented(origin(calibration)), _yaml(content)]),
+        'alignment.yaml': '\n'.join([*_commented(exported.origin(calibration)), _yaml(content)]),
     }
     return dataclasses.replace(made, files=files)
 
 
-def giant_json(calibration: Calibration) -> Content:
+def giant_json(calibration: Calibration) -> exported.Content:
     """
     JSON whose ``OpenCVModel`` holds the keyword arguments of the model.
 
     ``star_tracker_from_camera_xyzw`` is a separate key: a camera model of GIANT has no alignment.
     """
     own = calibration.geometry.camera.model
-    camera, made = fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
+    camera, made = exported.fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
     # GIANT has the change of the focal length with temperature: it is no loss.
     losses = tuple(loss for loss in made.losses if 'focal' not in loss.part)
     made = dataclasses.replace(made, losses=losses)
@@ -152,7 +145,7 @@ def giant_json(calibration: Calibration) -> Content:
         arguments |= {f'a{k}': value for k, value in enumerate(terms.focal_per_degc, start=1)}
     content = {
         'about': [
-            *about(calibration, made),
+            *exported.about(calibration, made),
             'from giant.camera_models import OpenCVModel; OpenCVModel(**content["OpenCVModel"])',
         ],
         'OpenCVModel': arguments,
@@ -166,15 +159,15 @@ def giant_json(calibration: Calibration) -> Content:
     )
 
 
-def mrcal_cameramodel(calibration: Calibration) -> Content:
+def mrcal_cameramodel(calibration: Calibration) -> exported.Content:
     """Text for ``mrcal.cameramodel``; ``extrinsics`` are rt_cam_ref."""
     own = calibration.geometry.camera.model
-    camera, made = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
+    camera, made = exported.fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
     rt = [*calibration.geometry.star_tracker_from_camera.inv().as_rotvec().tolist(), 0.0, 0.0, 0.0]
     lines = [
-        *_commented(about(calibration, made)),
+        *_commented(exported.about(calibration, made)),
         '{',
         f"    'lensmodel':  '{_MRCAL[camera.model]}',",
         f"    'extrinsics': {rt!r},",
@@ -186,7 +179,7 @@ def mrcal_cameramodel(calibration: Calibration) -> Content:
 
 
 def _commented(lines: list[str]) -> list[str]:
-    return [f'# {ascii_line(line)}' for line in lines]
+    return [f'# {exported.ascii_line(line)}' for line in lines]
 
 
 def _yaml(content: object) -> str:
@@ -210,19 +203,19 @@ _HALF_PX = 0.5
 _ISIS_FIRST_PX = 1.0
 
 
-def isd_files(calibration: Calibration, names: SpiceNames) -> Content:
+def isd_files(calibration: Calibration, names: SpiceNames) -> exported.Content:
     """
     JSON with the keys of a frame camera in an ISD that a calibration determines; and an ISIS IK.
 
     Without a pixel size a pixel counts as 1 mm; lines of sight do not depend on it.
     """
     isis, loss = _isis_kernel(calibration, names)
-    camera, made = fitted(calibration, 'plumb_bob', ())
+    camera, made = exported.fitted(calibration, 'plumb_bob', ())
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
     focal_px, pitch_mm = np.sqrt(fx * fy), names.pixel_size_um / UM_PER_MM or 1.0
     content = {
-        'about': about(calibration, made),
+        'about': exported.about(calibration, made),
         'name_model': 'USGS_ASTRO_FRAME_SENSOR_MODEL',
         'image_lines': camera.height,
         'image_samples': camera.width,
@@ -237,10 +230,10 @@ def isd_files(calibration: Calibration, names: SpiceNames) -> Content:
         'optical_distortion': {'radtan': {'coefficients': D.tolist()}},
     }
     files = {'camera_isd.json': json.dumps(content, indent=1) + '\n', 'camera_isis.ti': isis}
-    return Content(files, made.worst_px, (*made.losses, loss))
+    return exported.Content(files, made.worst_px, (*made.losses, loss))
 
 
-def _isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss]:
+def _isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, exported.Loss]:
     """
     IK with ISIS's keywords of a camera with radial distortion, and its largest error.
 
@@ -265,9 +258,9 @@ def _isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss
         'ITRANSL': [0.0, *to_pixel[1].tolist()],
         'OD_K': [0.0, *(k / focal_mm ** np.array([2.0, 4.0])).tolist()],
     }
-    loss = Loss('ISIS: all but radial distortion', worst_px)
+    loss = exported.Loss('ISIS: all but radial distortion', worst_px)
     comments = ['Keywords of ISIS; its first pixel has its centre at (1, 1).', '']
-    comments += about(calibration, Content({}, worst_px, (loss,)))
+    comments += exported.about(calibration, exported.Content({}, worst_px, (loss,)))
     return kernel_text('Camera for ISIS', comments, prefix, values), loss
 
 
@@ -283,7 +276,7 @@ def radial_directions(intrinsics: Floats, k: Floats, pixels: Floats) -> Floats:
 
 def _radial(camera: CameraModel) -> tuple[Floats, Floats, float]:
     """Best intrinsics (5,) and k (2,) over the detector, and the largest error of a pixel."""
-    pixels = pixel_grid(camera, GRID, GRID)
+    pixels = pixel_grid(camera, exported.GRID, exported.GRID)
 
     def error_px(p: Floats) -> Floats:
         return np.asarray(project(camera, radial_directions(p[:5], p[5:], pixels)) - pixels)

@@ -1,36 +1,38 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-SPICE kernels of a calibration: a frame kernel (FK) and an instrument kernel (IK).
+SPICE kernels of a calibration: frame (FK), instrument (IK), attitude of each image (CK).
 
 The FK has the camera as a fixed frame (TKFRAME) in the star tracker frame.  The IK has the field
-of view, and the whole camera: lens model, skew and field; nothing is approximated.  Sources:
-NAIF's Frames Required Reading (TK frames), Kernel Required Reading (text kernels) and the
-specification of GETFOV.
+of view, and the whole camera: lens model, skew and field; nothing is approximated.  The CK, of
+type 3, has the attitude of the calibrated camera by the stars of each image, an interval of its
+own, so that nothing is interpolated from one to the next.  Sources: NAIF's Frames Required Reading
+(TK frames), Kernel Required Reading (text kernels), CK Required Reading (a C-matrix takes inertial
+to frame coordinates) and the specification of GETFOV.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 import re
+import tempfile
 import textwrap
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from starcal_ground.mission.export.losses import (
-    ascii_line,
-    Content,
-    Loss,
-    origin,
-    PIXEL_CONVENTION,
-    temperature_losses,
-)
+from starcal_ground.mission.export import exported
+from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.detector_field import COSINE_DOMAIN
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError
-from starcal_ros.records import Calibration
+from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 
 _LONGEST_NAME = 32  # of a pool variable or a frame: SPICE Required Reading, kernel.req, frames.req
 _COMMENT_COLUMNS = 78  # longer lines are read, but NAIF asks for no more than 80
@@ -85,7 +87,7 @@ class SpiceNames:
         return self.instrument_id or _INSTRUMENTS_PER_SPACECRAFT * self.spacecraft_id - 1
 
 
-def spice_kernels(calibration: Calibration, names: SpiceNames) -> Content:
+def spice_kernels(calibration: Calibration, names: SpiceNames) -> exported.Content:
     """
     The FK and the IK of a calibration.
 
@@ -97,15 +99,15 @@ def spice_kernels(calibration: Calibration, names: SpiceNames) -> Content:
     )
     if camera_frame == tracker_frame:
         raise OptionError(f'--camera-frame: {camera_frame} is the star tracker frame too')
-    losses = temperature_losses(calibration)
+    losses = exported.temperature_losses(calibration)
     boresight, corners = field_of_view(calibration.geometry.camera)
     if corners is None:
-        losses = (*losses, Loss('field of view: as wide as a half space or folded', 0.0))
+        losses = (*losses, exported.Loss('field of view: as wide as a half space or folded', 0.0))
     missing = [f'Not in this kernel: {loss.part}, {loss.cost_px:.3g} px.' for loss in losses]
-    about = [*origin(calibration), '', *missing]
+    about = [*exported.origin(calibration), '', *missing]
     fk = _frame_kernel(calibration, names, camera_frame, tracker_frame, about)
     ik = _instrument_kernel(calibration, names, camera_frame, boresight, corners, about)
-    return Content({'camera.tf': fk, 'camera.ti': ik}, losses=losses)
+    return exported.Content({'camera.tf': fk, 'camera.ti': ik}, losses=losses)
 
 
 def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
@@ -152,7 +154,7 @@ def _frame_kernel(
         f'{camera_frame} is fixed in {tracker_frame}. TKFRAME_{number}_Q takes vectors of the',
         'camera frame to the star tracker frame (SPICE quaternion, scalar first).',
         '',
-        *PIXEL_CONVENTION,
+        *exported.PIXEL_CONVENTION,
         '',
         f'1-sigma of the alignment about the camera axes, arcsec: {sigmas}.',
         f'Names of the calibration: {calibration.child_frame} in {calibration.parent_frame}.',
@@ -256,7 +258,7 @@ def _lens_values(camera: CameraModel) -> dict[str, Value]:
 
 def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
     lines = [
-        *PIXEL_CONVENTION,
+        *exported.PIXEL_CONVENTION,
         '',
         'A direction (X, Y, Z) of the camera frame is seen at pixel (u, v), with',
         'x = X/Z, y = Y/Z, r2 = x^2 + y^2, and LENS_COEFFICIENTS named by LENS_TERMS:',
@@ -336,14 +338,101 @@ def _frame_name(text: str, option: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    return "'" + ascii_line(text)[:_STRING_COLUMNS].replace("'", "''") + "'"
+    return "'" + exported.ascii_line(text)[:_STRING_COLUMNS].replace("'", "''") + "'"
 
 
 def _wrapped(text: str) -> list[str]:
     # Only the first blanks of a line are its indent; a backslash would open a data block.
-    text = ascii_line(text.replace('\\', '/'))
+    text = exported.ascii_line(text.replace('\\', '/'))
     indent = ' ' * (len(text) - len(text.lstrip()))
     below = indent + '  '
     return textwrap.wrap(
         text, _COMMENT_COLUMNS, subsequent_indent=below, break_on_hyphens=False
     ) or ['']
+
+
+CK_FILE = 'camera.bc'
+_LEAST_STARS = 3
+_OUTLIER = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
+_INTERNAL_NAME = 'starcal: attitude of the calibrated camera'
+
+
+def attitude_by_stars(
+    calibration: Calibration, image: StarObservations
+) -> tuple[Rotation, float] | None:
+    """
+    Attitude icrf_from_camera of an image, and its 1-sigma across the boresight in px.
+
+    None for an image that was refused or has fewer than three stars.
+    """
+    if image.refusal or len(image) < _LEAST_STARS:
+        return None
+    degc = image.temperature_degc
+    geometry = camera_at(calibration, degc) if np.isfinite(degc) else calibration.geometry
+    seen = line_of_sight(geometry.camera, image.measured_px)
+    information = 1.0 / image.covariance_px2[:, [0, 2]].mean(axis=1)
+    used = np.isfinite(seen).all(axis=1)
+    for _ in range(2):  # the second without the stars that the first does not fit
+        if used.sum() < _LEAST_STARS:
+            return None
+        rotation, _ = Rotation.align_vectors(
+            image.direction_icrf[used], seen[used], information[used]
+        )
+        off = np.linalg.norm(rotation.apply(seen) - image.direction_icrf, axis=1)
+        off = off * np.sqrt(information)
+        used = used & (off <= _OUTLIER * RAYLEIGH_TO_SIGMA * np.median(off[used]))
+    return rotation, float(1.0 / np.sqrt(information[used].sum()))
+
+
+def ck_of_images(
+    calibration: Calibration,
+    observations: Iterable[StarObservations],
+    names: SpiceNames,
+    kernels: Sequence[Path],
+) -> exported.Content:
+    """
+    A CK of the attitudes of images; ``kernels`` are the LSK and the SCLK of the spacecraft.
+
+    With a star tracker ID they are of its frame, in which the frame kernel of `spice_kernels` has
+    the camera; else of the camera itself, by its instrument ID.  Raises ProductError if no image
+    has stars, or SPICE refuses the file.  Raises IngestError for a kernel that cannot be read.
+    """
+    found = {
+        image.time_ns: one
+        for image in observations
+        if (one := attitude_by_stars(calibration, image)) is not None
+    }
+    if not found:
+        raise ProductError('--to ck: no image with stars among the observations')
+    times_ns = sorted(found)
+    icrf_from_frame = Rotation.concatenate([found[time_ns][0] for time_ns in times_ns])
+    if names.star_tracker_id:
+        icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
+    structure = names.star_tracker_id or names.camera_id
+    q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
+    with loaded(kernels) as spice:
+        try:
+            ticks = np.array(
+                [spice.sce2c(names.spacecraft_id, ephemeris_time(spice, t)) for t in times_ns]
+            )
+            data = _ck(spice, structure, ticks, q)
+        except spice.SpiceyError as error:
+            words = ' '.join(str(error).split())[:240]
+            raise ProductError(f'{CK_FILE}: {words}') from error
+    sigma_px = float(np.median([sigma_px for _, sigma_px in found.values()]))
+    loss = exported.Loss('1-sigma of the attitude of an image (median)', sigma_px)
+    return exported.Content({CK_FILE: data}, losses=(loss,))
+
+
+def _ck(spice: Any, structure: int, ticks: Floats, q: Floats) -> bytes:
+    """Content of a CK with an interval for each attitude."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'attitude.bc')
+        handle = spice.ckopn(str(path), _INTERNAL_NAME, 0)
+        no_rate = np.zeros((len(ticks), 3))
+        spice.ckw03(
+            *(handle, ticks[0], ticks[-1], structure, 'J2000', False, 'starcal', len(ticks)),
+            *(ticks, q, no_rate, len(ticks), ticks),
+        )
+        spice.ckcls(handle)
+        return path.read_bytes()

@@ -22,26 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ground.mission.ingest.guard import Guard
+from starcal_ground.mission.ingest.mission_records import Guard
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, IngestError, needing
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.sky.catalog import (
-    ANGLE_UNIT_RAD,
-    CATALOG_EPOCH_JYEAR,
-    CATALOG_FORMAT,
-    CLOSE_PAIR_RAD,
-    column_digest,
-    COLUMN_TYPES,
-    load_catalog,
-    MAGNITUDE_UNIT,
-    MOTION_UNIT_RAD,
-    MotionSource,
-    NO_COLOUR,
-    PARALLAX_UNIT_RAD,
-    StarCatalog,
-)
+from starcal_ros.sky import catalog as sky_catalog
 from starcal_ros.untrusted import regular_file, shown
 
 
@@ -115,8 +101,8 @@ def catalog_file(columns: Mapping[str, NDArray[np.generic]]) -> bytes:
     content = io.BytesIO()
     np.savez_compressed(
         content,
-        format=np.array(CATALOG_FORMAT),
-        digest=np.array(column_digest(columns)),
+        format=np.array(sky_catalog.CATALOG_FORMAT),
+        digest=np.array(sky_catalog.column_digest(columns)),
         **columns,  # type: ignore[arg-type]  # no column is named allow_pickle
     )
     return content.getvalue()
@@ -131,7 +117,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
     """
     with Guard(_PROCESSOR_S, _WALL_S) as guard:
         stars, refused = guard.call(path, _read, path)
-    bundled = load_catalog()
+    bundled = sky_catalog.load_catalog()
     _check(path, stars, bundled)
     kept = ~np.isin(bundled.id, stars['id'])
     # Of stars without a number of Gaia, or with another one in the bundled catalog.
@@ -159,29 +145,31 @@ def integer_columns(values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
     Raises CatalogError for a value that the type of its column cannot hold.
     """
     units = {
-        'ra': ('ra_rad', ANGLE_UNIT_RAD),
-        'dec': ('dec_rad', ANGLE_UNIT_RAD),
-        'pm_ra_cosdec': ('pm_ra_cosdec_rad_per_year', MOTION_UNIT_RAD),
-        'pm_dec': ('pm_dec_rad_per_year', MOTION_UNIT_RAD),
-        'parallax': ('parallax_rad', PARALLAX_UNIT_RAD),
-        'magnitude': ('magnitude', MAGNITUDE_UNIT),
-        'colour_bp_rp': ('colour_bp_rp', MAGNITUDE_UNIT),
+        'ra': ('ra_rad', sky_catalog.ANGLE_UNIT_RAD),
+        'dec': ('dec_rad', sky_catalog.ANGLE_UNIT_RAD),
+        'pm_ra_cosdec': ('pm_ra_cosdec_rad_per_year', sky_catalog.MOTION_UNIT_RAD),
+        'pm_dec': ('pm_dec_rad_per_year', sky_catalog.MOTION_UNIT_RAD),
+        'parallax': ('parallax_rad', sky_catalog.PARALLAX_UNIT_RAD),
+        'magnitude': ('magnitude', sky_catalog.MAGNITUDE_UNIT),
+        'colour_bp_rp': ('colour_bp_rp', sky_catalog.MAGNITUDE_UNIT),
     }
     whole = {name: np.rint(values[of] / unit) for name, (of, unit) in units.items()}
-    whole['colour_bp_rp'][np.isnan(whole['colour_bp_rp'])] = NO_COLOUR
+    whole['colour_bp_rp'][np.isnan(whole['colour_bp_rp'])] = sky_catalog.NO_COLOUR
     whole['ra'] %= 2**32
     for name, stored in whole.items():
-        room = np.iinfo(COLUMN_TYPES[name])
+        room = np.iinfo(sky_catalog.COLUMN_TYPES[name])
         if len(stored) and not (room.min <= stored.min() and stored.max() <= room.max):
             raise CatalogError(f'{name}: {stored.min():g} to {stored.max():g} steps do not fit')
     order = np.lexsort([values['id'], whole['magnitude']])
     return {
         name: (whole if name in whole else values)[name][order].astype(kind)
-        for name, kind in COLUMN_TYPES.items()
+        for name, kind in sky_catalog.COLUMN_TYPES.items()
     }
 
 
-def _check(path: Path, stars: Mapping[str, NDArray[Any]], bundled: StarCatalog) -> None:
+def _check(
+    path: Path, stars: Mapping[str, NDArray[Any]], bundled: sky_catalog.StarCatalog
+) -> None:
     """Raise CatalogError where bright stars are missing, or are at different places."""
     direction = _direction(stars)
     _, mine, theirs = np.intersect1d(stars['id'], bundled.id, return_indices=True)
@@ -208,7 +196,7 @@ def _direction(stars: Mapping[str, NDArray[Any]]) -> Floats:
 
 def close_pairs(direction: Floats) -> NDArray[np.intp]:
     """Rows (k, 2) of the stars within 20 arcsec of each other."""
-    reach = 2 * np.sin(CLOSE_PAIR_RAD / 2)
+    reach = 2 * np.sin(sky_catalog.CLOSE_PAIR_RAD / 2)
     return np.asarray(cKDTree(direction).query_pairs(reach, output_type='ndarray'))
 
 
@@ -234,7 +222,9 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, int]]:
     motion = np.stack([table['pm_ra'], table['pm_dec']], axis=-1) * _MAS_RAD
     has_motion = np.isfinite(motion).all(axis=1)
     motion[~has_motion] = 0.0
-    years = CATALOG_EPOCH_JYEAR - np.nan_to_num(table['epoch'], nan=CATALOG_EPOCH_JYEAR)
+    years = sky_catalog.CATALOG_EPOCH_JYEAR - np.nan_to_num(
+        table['epoch'], nan=sky_catalog.CATALOG_EPOCH_JYEAR
+    )
     ra, dec = np.radians(table['ra']), np.radians(table['dec'])
     return {
         'id': number,
@@ -245,7 +235,9 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, int]]:
         'parallax_rad': np.nan_to_num(table['parallax']).clip(0) * _MAS_RAD,
         'magnitude': johnson_v(table['g'], table['colour']),
         'colour_bp_rp': table['colour'],
-        'motion_source': np.where(has_motion, MotionSource.GAIA, MotionSource.UNKNOWN),
+        'motion_source': np.where(
+            has_motion, sky_catalog.MotionSource.GAIA, sky_catalog.MotionSource.UNKNOWN
+        ),
     }, refused
 
 

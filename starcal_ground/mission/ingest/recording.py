@@ -20,8 +20,7 @@ import yaml
 
 from starcal_ground.images import image_series
 from starcal_ground.images.from_stars import options_of
-from starcal_ground.mission.ingest.guard import Guard
-from starcal_ground.mission.ingest.mission_records import Attitudes, Velocities
+from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of

@@ -31,8 +31,16 @@ import numpy as np
 
 from starcal_ground.mission.trend import places
 from starcal_ground.mission.trend.places import Entry
-from starcal_ground.mission.trend.rows import COMPUTED, failure, kept_name, RECORDED, Row, row_of
-from starcal_ground.mission.trend.trend_table import Table
+from starcal_ground.mission.trend.trend_table import (
+    COMPUTED,
+    failure,
+    kept_name,
+    RECORDED,
+    Row,
+    row_of,
+    Table,
+)
+from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
@@ -46,14 +54,6 @@ from starcal_ros.pipeline.topics import Topics
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.text import printable
-from starcal_ros.untrusted import (
-    json_value,
-    METADATA_BYTES,
-    read_text,
-    regular_file,
-    shown,
-    yaml_value,
-)
 
 KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
@@ -167,7 +167,7 @@ def digest(files: Sequence[str | Path], version: str = '') -> str:
     for file in files:
         if not os.path.lexists(file):
             continue  # metadata.yaml of a bag, which need not be there
-        with regular_file(Path(file)) as stream:
+        with untrusted.regular_file(Path(file)) as stream:
             while block := stream.read(1 << 20):
                 found.update(block)
     return found.hexdigest()
@@ -277,7 +277,8 @@ def _compiled(pattern: str) -> re.Pattern[str]:
     for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
         if other or (name and name not in _KEYS) or name in names:
             raise OptionError(
-                f'--cameras: {shown(pattern)}: not a pattern with {{spacecraft}} and {{camera}}'
+                f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and'
+                ' {camera}'
             )
         names += [name] if name else []
         found += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
@@ -401,7 +402,7 @@ def _of_task(row: Row, task: Task, bag: Path = Path()) -> Row:
 def _custom_data(metadata: Path) -> dict[str, str]:
     """Texts that the recorder of a bag was given; empty where there are none."""
     try:
-        content = yaml_value(read_text(metadata, METADATA_BYTES))
+        content = untrusted.yaml_value(untrusted.read_text(metadata, untrusted.METADATA_BYTES))
         found = content['rosbag2_bagfile_information']['custom_data']
         return {name: value for name, value in found.items() if isinstance(value, str)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -420,7 +421,7 @@ def _setup_beside(bag: Path) -> Setup:
     calibration = calibration_json.read_calibration(path)
     prior = calibration_json.prior_of(calibration)
     try:
-        options = json_value(calibration.provenance['options'])
+        options = untrusted.json_value(calibration.provenance['options'])
     except (KeyError, ValueError) as error:
         raise ProductError(f'{path}: has no options to calibrate with: give --params') from error
     if prior is None:

@@ -11,35 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_ground.mission.trend.overview import Overview, overview_of, swapped_with
-from starcal_ground.mission.trend.rows import Row
-from starcal_ground.mission.trend.series import (
-    activations,
-    Active,
-    Change,
-    changes,
-    findings,
-    groups,
-    MAX_P_VALUE,
-    newest_of_each,
-    SECONDS_PER_YEAR,
-    Series,
-    series_of,
-    Term,
-    versions,
-)
+from starcal_ground.mission.trend import series as trends
+from starcal_ground.mission.trend.trend_table import Row
+from starcal_ground.report import svg
 from starcal_ground.report.page import page_template
-from starcal_ground.report.plots import plot
-from starcal_ground.report.svg import (
-    Chart,
-    Curve,
-    Drawing,
-    in_digits,
-    MUTED,
-    Panel,
-    round_step,
-    SERIES,
-)
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.formats.products.product_files import write_atomically
@@ -74,9 +49,9 @@ class Page:
 class _Judged:
     """A camera with its overview, and its calibrations and series for the figures."""
 
-    overview: Overview
+    overview: trends.Overview
     group: Sequence[Row]
-    shown: Sequence[Series]
+    shown: Sequence[trends.Series]
     line: tuple[object, ...]
 
 
@@ -89,24 +64,24 @@ def write_page(
     p-values are corrected for the number of cameras.  Raises ProductError when the page cannot be
     written.
     """
-    max_p_value = MAX_P_VALUE / max(camera_count, 1)
+    max_p_value = trends.MAX_P_VALUE / max(camera_count, 1)
     failures: list[Row] = []
     drawn: list[_Judged] = []
-    lines: list[tuple[Overview, tuple[object, ...]]] = []
+    lines: list[tuple[trends.Overview, tuple[object, ...]]] = []
     failed = count = 0
     times: list[int] = []
     for rows in cameras:
         bad = [row for row in rows if row.error]
         failures += bad[: _LISTED - len(failures)]
         failed, count = failed + len(bad), count + len(rows) - len(bad)
-        for name, group in groups(rows).items():
+        for name, group in trends.groups(rows).items():
             one = _judged(name, group, max_p_value)
             lines.append((one.overview, one.line))
             times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, one], key=_order)[:_DRAWN]
     lines.sort(key=lambda line: not line[0].needs_attention)
     overviews = [overview for overview, _ in lines]
-    swaps = {one.name: swapped_with(one, overviews) for one in overviews}
+    swaps = {one.name: trends.swapped_with(one, overviews) for one in overviews}
     text = page_template('trend.html').render(
         root=printable(root),
         lines=[(o, swaps[o.name], *line) for o, line in lines] if len(lines) > 1 else (),
@@ -120,7 +95,7 @@ def write_page(
     path = folder / TREND_FILE
     write_atomically(path, text)
     span_ns = max(times) - min(times) if times else 0
-    years = span_ns / NANOSECONDS_PER_SECOND / SECONDS_PER_YEAR
+    years = span_ns / NANOSECONDS_PER_SECOND / trends.SECONDS_PER_YEAR
     return Page(path, count, years, failed, tuple(failures))
 
 
@@ -131,23 +106,23 @@ def _order(one: _Judged) -> tuple[bool, int, str]:
 
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
 def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
-    rows = newest_of_each(group)
-    active = activations(group)
-    shown = series_of(rows, max_p_value)
-    new = changes(group, active[-1:])
+    rows = trends.newest_of_each(group)
+    active = trends.activations(group)
+    shown = trends.series_of(rows, max_p_value)
+    new = trends.changes(group, active[-1:])
     is_stable, verdict = verdict_of(group, active, new, shown)
     px = new[-1].line_of_sight_px if new else math.nan
     line = (len(rows), utc_text(rows[-1].time_ns)[:10], px, verdict[1])
-    return _Judged(overview_of(name, rows, shown, is_stable), group, shown, line)
+    return _Judged(trends.overview_of(name, rows, shown, is_stable), group, shown, line)
 
 
 @np.errstate(all='ignore')
 def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
     """The part of the page on one camera."""
     group, shown = judged.group, judged.shown
-    rows = newest_of_each(group)
-    active = activations(group)
-    new = changes(group, active)
+    rows = trends.newest_of_each(group)
+    active = trends.activations(group)
+    new = trends.changes(group, active)
     charts = [_change_chart(group, new)] if new else []
     charts += [_chart(one, rows) for one in shown]
     is_stable, verdict = verdict_of(group, active, new, shown)
@@ -159,7 +134,7 @@ def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
             f'Since its step it has the parameters of {swapped}.' * bool(swapped),
         ),
         'rows': rows,
-        'findings': [_finding(one, term, rows) for one, term in findings(shown)],
+        'findings': [_finding(one, term, rows) for one, term in trends.findings(shown)],
         'charts': charts,
         'active': [_active(one, group, new) for one in active],
         'versions': [
@@ -169,20 +144,25 @@ def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
                 group[v.row].software,
                 f'{v.line_of_sight_px:.3f}',
             )
-            for v in versions(group)
+            for v in trends.versions(group)
         ],
         'assumed': any(one.assumed for one in active),
     }
 
 
 def verdict_of(
-    rows: Sequence[Row], active: Sequence[Active], new: Sequence[Change], shown: Sequence[Series]
+    rows: Sequence[Row],
+    active: Sequence[trends.Active],
+    new: Sequence[trends.Change],
+    shown: Sequence[trends.Series],
 ) -> tuple[bool, tuple[str, str]]:
     """True while the active calibration holds, with sentences on that and on the changes."""
     words = {'step': 'steps of', 'drift': 'drifts of', 'temperature': 'effects of temperature on'}
     found = []
     for kind, word in words.items():
-        names = list(dict.fromkeys(one.name for one, t in findings(shown) if t.kind == kind))
+        names = list(
+            dict.fromkeys(one.name for one, t in trends.findings(shown) if t.kind == kind)
+        )
         found += [f'{word} {", ".join(names)}'] if names else []
     text = f'Found: {"; ".join(found)}.' if found else 'No step or drift was found.'
     later = [change for change in new if active and change.against == active[-1].row]
@@ -197,7 +177,7 @@ def verdict_of(
     return px <= _RECALIBRATE_PX, (newest, text)
 
 
-def _finding(series: Series, term: Term, rows: Sequence[Row]) -> dict[str, str]:
+def _finding(series: trends.Series, term: trends.Term, rows: Sequence[Row]) -> dict[str, str]:
     """A row of the table of findings."""
     unit = series.unit and f' {series.unit}'
     when = 'throughout'
@@ -216,7 +196,9 @@ def _finding(series: Series, term: Term, rows: Sequence[Row]) -> dict[str, str]:
     }
 
 
-def _active(one: Active, rows: Sequence[Row], new: Sequence[Change]) -> tuple[str, str, str, str]:
+def _active(
+    one: trends.Active, rows: Sequence[Row], new: Sequence[trends.Change]
+) -> tuple[str, str, str, str]:
     """Times of a calibration, its name, and the largest change that was missed meanwhile."""
     row = rows[one.row]
     missed = [c.line_of_sight_px for c in new if c.against == one.row]
@@ -226,14 +208,14 @@ def _active(one: Active, rows: Sequence[Row], new: Sequence[Change]) -> tuple[st
     return utc_text(one.since_ns)[:16], until, name, worst
 
 
-def _chart(series: Series, rows: Sequence[Row]) -> Chart:
+def _chart(series: trends.Series, rows: Sequence[Row]) -> svg.Chart:
     words = ', '.join(_words(term, series) for term in series.trend.terms) or 'no change found'
     scatter = series.trend.scatter
     about = '' if math.isnan(scatter) else f' Scatter about the fit: {scatter:.2f} of the sigmas.'
     every = _every(series.row)
     about += f' One in {every} calibrations is drawn.' if every > 1 else ''
     text = f'{words[0].upper()}{words[1:]}.{about}'
-    return Chart(series.name, series_figure(series, rows), text)
+    return svg.Chart(series.name, series_figure(series, rows), text)
 
 
 def _every(numbers: Sequence[object]) -> int:
@@ -241,23 +223,23 @@ def _every(numbers: Sequence[object]) -> int:
     return -(-len(numbers) // _POINTS)
 
 
-def _words(term: Term, series: Series) -> str:
+def _words(term: trends.Term, series: trends.Series) -> str:
     unit = series.unit and f' {series.unit}'
     size = f'{term.size:.3g}'.replace('-', '\N{MINUS SIGN}')
     return f'{term.kind} of {size}{unit}{_PER[term.kind]}'
 
 
-def _change_chart(rows: Sequence[Row], new: Sequence[Change]) -> Chart:
+def _change_chart(rows: Sequence[Row], new: Sequence[trends.Change]) -> svg.Chart:
     worst = max(change.line_of_sight_px for change in new)
     over = sum(change.line_of_sight_px > _RECALIBRATE_PX for change in new)
     text = (
         f'Largest change of a line of sight that each calibration would have made: up to '
         f'{worst:.3g} px, {over} of {len(new)} over {_RECALIBRATE_PX:g} px (dashed).'
     )
-    return Chart('Change by a recalibration', change_figure(new, rows), text)
+    return svg.Chart('Change by a recalibration', change_figure(new, rows), text)
 
 
-def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:
+def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
     """A number of calibrations over time with 1-sigma, its fit, and a line at each step."""
     at = _times([rows[index] for index in series.row])
     low, high = (series.value - series.sigma).min(), (series.value + series.sigma).max()
@@ -265,7 +247,7 @@ def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:
     room = max(high - low, 1e-12 * max(abs(low), abs(high)))
     offset = _offset(float(low - room), float(high + room))
     sign = '\N{MINUS SIGN}' if offset > 0 else '+'
-    name = f'{series.name} {sign} {in_digits(abs(offset))}' if offset else series.name
+    name = f'{series.name} {sign} {svg.in_digits(abs(offset))}' if offset else series.name
     drawn = slice(None, None, _every(series.row))
     value, sigma = series.value[drawn], series.sigma[drawn]
     titles = [
@@ -273,52 +255,56 @@ def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:
         for index, v, s in zip(series.row[drawn], value, sigma, strict=True)
     ]
     curves = [
-        Curve(at[drawn], value - offset, SERIES[0], 'calibration, 1-sigma', 'circle', width=0,
-              sigma=sigma, titles=titles)
+        svg.Curve(at[drawn], value - offset, svg.SERIES[0], 'calibration, 1-sigma', 'circle',
+                  width=0, sigma=sigma, titles=titles)
     ]  # fmt: skip
     steps = sorted(term.after for term in series.trend.terms if term.kind == 'step')
     if series.trend.terms:
         fit, gaps = series.trend.fit - offset, [step + 1 for step in steps]
         curves.append(
-            Curve(np.insert(at, gaps, np.nan), np.insert(fit, gaps, np.nan), SERIES[1], 'fit')
+            svg.Curve(
+                np.insert(at, gaps, np.nan), np.insert(fit, gaps, np.nan), svg.SERIES[1], 'fit'
+            )
         )
 
-    def lines_at_steps(panel: Panel) -> None:
+    def lines_at_steps(panel: svg.Panel) -> None:
         for step in steps:
-            panel.upright(at[step : step + 2].mean(), MUTED, 1.0, '5 3')
+            panel.upright(at[step : step + 2].mean(), svg.MUTED, 1.0, '5 3')
 
     return _over_dates(
         at, curves, f'{name} ({series.unit})' if series.unit else name, '', lines_at_steps
     )
 
 
-def change_figure(new: Sequence[Change], rows: Sequence[Row]) -> Drawing:
+def change_figure(new: Sequence[trends.Change], rows: Sequence[Row]) -> svg.Drawing:
     """Largest change that each calibration would have made, px, over time; logarithmic."""
     at = _times([rows[change.row] for change in new])
     curves = [
-        Curve(at, np.maximum(sizes, _LEAST_PX), colour, name, mark, width=0.9)
+        svg.Curve(at, np.maximum(sizes, _LEAST_PX), colour, name, mark, width=0.9)
         for name, mark, colour, sizes in zip(
             ('line of sight', 'common rotation removed'),
             ('circle', 'square'),
-            SERIES[:2],
+            svg.SERIES[:2],
             ([change.line_of_sight_px for change in new], [change.shape_px for change in new]),
             strict=True,
         )
     ]
-    curves.append(Curve(_date_ends(at), [_RECALIBRATE_PX, _RECALIBRATE_PX], MUTED, dash='5 3'))
+    curves.append(
+        svg.Curve(_date_ends(at), [_RECALIBRATE_PX, _RECALIBRATE_PX], svg.MUTED, dash='5 3')
+    )
     return _over_dates(at, curves, 'change against the active one (px)', 'y')
 
 
 def _over_dates(
     at: Floats,
-    curves: Sequence[Curve],
+    curves: Sequence[svg.Curve],
     y_label: str,
     log: str = '',
-    under: Callable[[Panel], None] | None = None,
-) -> Drawing:
+    under: Callable[[svg.Panel], None] | None = None,
+) -> svg.Drawing:
     ends = _date_ends(at)
-    return plot(curves, 'date', y_label, x=ends, x_ticks=_date_ticks(*ends), log=log, under=under,
-                height=_HEIGHT)  # fmt: skip
+    return svg.plot(curves, 'date', y_label, x=ends, x_ticks=_date_ticks(*ends), log=log,
+                    under=under, height=_HEIGHT)  # fmt: skip
 
 
 def _times(rows: Sequence[Row]) -> Floats:
@@ -333,10 +319,10 @@ def _date_ends(at: Floats) -> tuple[float, float]:
 
 def _offset(low: float, high: float) -> float:
     """Round number to draw values from ``low`` to ``high`` as differences to; 0: not needed."""
-    step = round_step((high - low) / _TICKS)
+    step = svg.round_step((high - low) / _TICKS)
     if max(abs(low), abs(high)) < _DIGITS * step:
         return 0.0
-    coarse = round_step(50 * step)
+    coarse = svg.round_step(50 * step)
     return round(0.5 * (low + high) / coarse) * coarse
 
 

@@ -22,9 +22,10 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ground.cli import main
-from starcal_ground.cli.arguments import EXIT_INTERRUPTED, parser
-from starcal_ground.cli.commands import demo
+from starcal_ground.cli import main, node_processes
+from starcal_ground.cli.arguments import EXIT_INTERRUPTED
+from starcal_ground.cli.commands import compare, demo
+from starcal_ground.cli.main import COMMANDS, parser
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.provenance import software_version
@@ -448,7 +449,7 @@ def examples() -> list[tuple[str, list[str]]]:
     return [
         (name, shlex.split(line))
         for name, epilog in epilogs.items()
-        for line in str(epilog).splitlines()
+        for line in str(epilog).replace('\\\n', ' ').splitlines()
         if line.startswith('  starcal ')
     ]
 
@@ -458,7 +459,11 @@ def test_each_command_has_examples_that_it_takes() -> None:
     assert all(
         shown[name] >= 2 for name in ('inspect', 'calibrate', 'compare', 'simulate', 'play')
     )
-    assert set(shown) == {'', *main._COMMANDS}
+    assert set(shown) == {'', *COMMANDS}
+    files = {
+        path.stem.strip('_') for path in (Path(main.__file__).parent / 'commands').glob('*.py')
+    }
+    assert files == {'init', *COMMANDS}  # a command is one file
     for _, words in examples():
         parser().parse_args(words[1:])  # exits where it does not understand
 
@@ -629,7 +634,9 @@ def test_demo_says_which_node_failed(
     failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
     waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
     monkeypatch.setattr(
-        demo, 'node_command', lambda name, *_: failing if name == 'calibrator' else waiting
+        node_processes,
+        'node_command',
+        lambda name, *_: failing if name == 'calibrator' else waiting,
     )
     assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
@@ -638,7 +645,7 @@ def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> No
     def broken(_args: object) -> int:
         raise ImportError('libfreetype is not there')
 
-    monkeypatch.setitem(main._COMMANDS, 'compare', broken)
+    monkeypatch.setattr(compare, 'run', broken)
     with pytest.raises(ImportError, match='libfreetype'):
         main.main(['compare', 'a', 'b'])
 
@@ -647,7 +654,8 @@ def test_a_ctrl_c_whose_error_has_lost_its_cause_is_one() -> None:
     """As NumPy raises it, whose import of its own modules catches ImportError."""
     code = """
 import os, signal, sys, time
-from starcal_ground.cli import entry_point, main
+from starcal_ground.cli import entry_point
+from starcal_ground.cli.commands import inspect
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 
@@ -659,7 +667,7 @@ def interrupted(_args):
         pass
     raise ModuleNotFoundError('Error importing numpy')
 
-main._COMMANDS['inspect'] = interrupted
+inspect.run = interrupted
 sys.argv = ['starcal', 'inspect', 'x']
 sys.exit(entry_point.main())
 """
@@ -671,12 +679,12 @@ def test_a_ctrl_c_while_the_player_starts_is_silent() -> None:
     code = """
 import os, signal
 from pathlib import Path
-from starcal_ground.cli.commands import demo
+from starcal_ground.cli import node_processes
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 become = os.execv
 os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
-demo.become(demo.node_command('bag_player', demo.player_arguments(Path('none'), 1.0)))
+node_processes.become('bag_player', node_processes.player_arguments(Path('none'), 1.0), [])
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
@@ -687,7 +695,7 @@ def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
     before = signal.getsignal(signal.SIGTERM)
 
     def start() -> None:
-        with demo._ended_like_interrupted(), demo._interrupts_wait():
+        with node_processes._ended_like_interrupted(), node_processes._interrupts_wait():
             os.kill(os.getpid(), signal.SIGTERM)
             seen.append('the rest of the block')
 

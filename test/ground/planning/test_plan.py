@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from bench.frames import load_set_up
-from starcal_ground.planning.plan import Cone, Plan, plan_pointings, Pointing, Request
-from starcal_ground.planning.prospect import target
+from starcal_ground.planning.plan import Cone, Plan, plan_pointings, Pointing, Request, target
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import camera_from_icrf, Inertial, scenario
 from starcal_ros.errors import OptionError, TooFewObservations

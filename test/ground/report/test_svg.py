@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from starcal_ground.report import svg
-from starcal_ground.report.plots import plot
-from starcal_ground.report.svg import Curve, in_digits, Panel, round_step, Scale
+from starcal_ground.report.svg import Curve, in_digits, Panel, plot, round_step, Scale
 
 
 def panel() -> Panel:

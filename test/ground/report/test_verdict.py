@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_ground.report import verdict
 from starcal_ros.formats.products.calibration_json import read_calibration
-from starcal_ros.records import GateCheck, SigmaPart
+from starcal_ros.records import GateCheck, SigmaPart, TemperatureTerms
 
 GATE = (
     GateCheck('residual', 'max_residual_rms_px', 0.2, 1.0, 'px', True),
@@ -79,3 +79,16 @@ def test_a_refusal_states_the_measures_against_its_failed_checks(tiny_products: 
     assert 'failed checks: take more images. Then' in step('min_images')
     assert 'To reduce the sigma' in step('max_map_sigma_px')
     assert step('max_change_px').endswith('failed checks and calibrate again.')
+
+
+def test_the_summary_is_a_line() -> None:
+    terms = TemperatureTerms(
+        20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
+    )
+    assert verdict.thermal_summary(terms) == (
+        'a1 +0.0000400 (0.000001) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
+        'arcsec/degC; reference 20 degC; left out: this'
+    )
+    assert verdict.thermal_summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'
+    both = TemperatureTerms(20.0, (4e-5, 2e-6), (1e-6, 1e-7))
+    assert '; a2 +0.00000200 (0.0000001) /degC^2;' in verdict.thermal_summary(both)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.mission.export.lookup_table import write_lookup_table
+from starcal_ground.mission.export.export_formats import write_lookup_table
 from starcal_ros.assessment.lookup import (
     COLUMNS,
     Derivatives,

@@ -353,16 +353,3 @@ def test_the_camera_at_a_temperature() -> None:
         TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0
     ) == CameraGeometry(TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw)
     assert temperature.geometry_at(TRUTH, None, 50.0) is TRUTH
-
-
-def test_the_summary_is_a_line() -> None:
-    terms = TemperatureTerms(
-        20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
-    )
-    assert temperature.summary(terms) == (
-        'a1 +0.0000400 (0.000001) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
-        'arcsec/degC; reference 20 degC; left out: this'
-    )
-    assert temperature.summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'
-    both = TemperatureTerms(20.0, (4e-5, 2e-6), (1e-6, 1e-7))
-    assert '; a2 +0.00000200 (0.0000001) /degC^2;' in temperature.summary(both)

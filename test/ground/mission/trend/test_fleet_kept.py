@@ -13,8 +13,15 @@ import pytest
 
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Answer, Cameras, KEPT_FOLDER, Task
-from starcal_ground.mission.trend.rows import COMPUTED, FAILED, failure, kept_name, Row, row_of
-from starcal_ground.mission.trend.trend_table import Table
+from starcal_ground.mission.trend.trend_table import (
+    COMPUTED,
+    FAILED,
+    failure,
+    kept_name,
+    Row,
+    row_of,
+    Table,
+)
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.calibration_json import read_calibration
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from trend_rows import DAY_NS, made  # type: ignore[import-not-found]
 
-from starcal_ground.mission.trend.rows import COMPUTED, FAILED, Row
 from starcal_ground.mission.trend.series import (
     activations,
     changes,
@@ -18,6 +17,7 @@ from starcal_ground.mission.trend.series import (
     series_of,
     versions,
 )
+from starcal_ground.mission.trend.trend_table import COMPUTED, FAILED, Row
 from starcal_ros.constants import ARCSECOND_RAD
 
 

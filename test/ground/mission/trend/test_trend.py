@@ -19,8 +19,7 @@ from trend_missions import make_mission, trend, write  # type: ignore[import-not
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
-from starcal_ground.mission.trend.rows import COMPUTED
-from starcal_ground.mission.trend.trend_table import Table
+from starcal_ground.mission.trend.trend_table import COMPUTED, Table
 from starcal_ros.formats.products.calibration_json import write_calibration
 
 

@@ -20,8 +20,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from starcal_ground.mission.trend.rows import failure, RECORDED, Row, row_of
-from starcal_ground.mission.trend.trend_table import Table, TABLE_FILE
+from starcal_ground.mission.trend.trend_table import (
+    failure,
+    RECORDED,
+    Row,
+    row_of,
+    Table,
+    TABLE_FILE,
+)
 from starcal_ros.errors import ProductError
 
 

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from sample_records import calibration, observations, status  # type: ignore[import-not-found]
 
-from starcal_ground.cli.commands.monitor import coverage_text, Seen, share_of_limit, view
+from starcal_ground.cli.monitor_view import coverage_text, Seen, share_of_limit, view
 from starcal_ros.records import GateCheck, refused_image
 
 

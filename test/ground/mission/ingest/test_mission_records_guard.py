@@ -14,7 +14,7 @@ import pytest
 
 from starcal_ground.images.image_series import ImageOptions, look
 from starcal_ground.mission.ingest import sources
-from starcal_ground.mission.ingest.guard import Guard
+from starcal_ground.mission.ingest.mission_records import Guard
 from starcal_ros.errors import IngestError
 
 pytestmark = pytest.mark.slow

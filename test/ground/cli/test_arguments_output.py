@@ -23,7 +23,7 @@ from mission_files import write_frame, write_lsk, write_sclk  # type: ignore[imp
 import numpy as np
 import pytest
 
-from starcal_ground.cli import arguments, main
+from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.sky.catalog import load_catalog
@@ -228,7 +228,7 @@ def inputs(campaign: Path) -> Path:
 
 def test_each_command_that_writes_is_in_the_table() -> None:
     """One without an option -o that writes is `report`."""
-    actions = arguments.parser()._actions
+    actions = main.parser()._actions
     commands = next(one for one in actions if isinstance(one, argparse._SubParsersAction))
     writing = {
         name

@@ -8,13 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from starcal_ground.planning.prospect import (
-    expected_noise_px2,
-    LINE_OF_SIGHT,
-    MAP,
-    prospect,
-    target,
-)
+from starcal_ground.planning.plan import expected_noise_px2, LINE_OF_SIGHT, MAP, prospect, target
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import OptionError

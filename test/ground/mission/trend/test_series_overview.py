@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 
 from bench.fleet import simulated_rows, simulated_truth, Truth
-from starcal_ground.mission.trend.overview import Overview, overview_of, swapped_with
-from starcal_ground.mission.trend.rows import Row
-from starcal_ground.mission.trend.series import findings, series_of
+from starcal_ground.mission.trend.series import (
+    findings,
+    Overview,
+    overview_of,
+    series_of,
+    swapped_with,
+)
 from starcal_ground.mission.trend.trend_page import write_page
+from starcal_ground.mission.trend.trend_table import Row
 from starcal_ros.arrays import Floats
 
 MONTHS = 24

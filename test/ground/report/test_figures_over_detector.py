@@ -8,8 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from starcal_ground.report import detector_figures as figures
-from starcal_ground.report import svg
+from starcal_ground.report import figures, svg
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.records import CameraGeometry, refused_image, StarObservations

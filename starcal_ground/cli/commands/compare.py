@@ -1,0 +1,205 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Compare two calibrations in pixels and sigmas.
+
+A and B are calibration.json files or folders with one. Lines of sight are compared in the star
+tracker frame, before and after removing their common rotation. Differences are B minus A; their
+sigmas assume that A and B are independent.
+
+  # two runs
+  starcal compare out again
+  # with the truth of a simulated bag
+  starcal compare out sim/truth.json
+  # with a map of the difference over the detector
+  starcal compare out again -o difference.svg
+  # machine-readable output
+  starcal compare out/calibration.json again/calibration.json --json
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_table, print_text, table_lines
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.text import p_value_text, significant, to_sigma
+
+if TYPE_CHECKING:
+    from starcal_ground.comparison import Comparison, DifferenceMap
+    from starcal_ros.records import Calibration, CameraGeometry
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    for name, which in (('a', 'reference calibration'), ('b', 'calibration to compare')):
+        what = f'{which}: calibration.json or its folder'
+        command.add_argument(name, type=arguments.path, metavar=name.upper(), help=what)
+    arguments.add_output(command, 'FILE', 'plot of the difference over the detector (.svg)')
+    arguments.add_json(command)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground import comparison
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_folder import calibration_file
+
+    files = [calibration_file(path) for path in (args.a, args.b)]
+    truth = _truth_of(files[1])
+    if truth is not None:
+        if args.output:
+            raise OptionError('--output: a plot needs two calibrations')
+        table = _compared_with(read_calibration(files[0]), truth, files[1])
+        if args.json:
+            arguments.print_json(table)
+        else:
+            print_text('\n'.join(table.lines))
+        return arguments.EXIT_ACCEPTED
+    result = comparison.compare(*map(read_calibration, files))
+    if args.output:
+        from starcal_ground.report.figures import write_comparison
+
+        arguments.check_file(args.output, files)
+        write_comparison(result, args.output)
+    if args.json:
+        arguments.print_json(comparison.content(result))
+    else:
+        _print(result)
+        if args.output:
+            print_text(f'figure written to {args.output}')
+    return arguments.EXIT_ACCEPTED
+
+
+def _print(comparison: Comparison) -> None:
+    """Print the differences of parameters, alignment and lines of sight."""
+    a, b = (c.geometry.camera for c in (comparison.a, comparison.b))
+    of_a = dict(zip(a.parameter_names, a.parameters, strict=True))
+    difference, sigma = comparison.difference, comparison.sigma
+    rows = [
+        (
+            name,
+            to_sigma(of_a[name], sigma[k]) if name in of_a else '',
+            to_sigma(b.parameters[k], sigma[k]),
+            to_sigma(difference[k], sigma[k], '+'),
+            significant(sigma[k], 2) if sigma[k] else 'held',
+            _sigmas(difference[k], sigma[k]),
+        )
+        for k, name in enumerate(b.parameter_names)
+    ]
+    arcsec, sigma_arcsec = difference[-3:] / ARCSECOND_RAD, sigma[-3:] / ARCSECOND_RAD
+    rows += [
+        (f'alignment {axis}', '', '', f'{d:+.2f}"', f'{s:.2f}"', _sigmas(d, s))
+        for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
+    ]
+    print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
+    print_table(
+        ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
+        [
+            ('as calibrated', *_map_cells(comparison.before)),
+            ('common rotation removed', *_map_cells(comparison.after)),
+        ],
+    )
+    print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}"')
+    total = comparison.total
+    if total.degrees_of_freedom:
+        print_text(
+            f'all parameters  chi2 {total.value:.1f}, {total.degrees_of_freedom} degrees of '
+            f'freedom, p-value {p_value_text(total.p_value)}'
+        )
+    for note in comparison.notes:
+        print_text(f'note: {note}')
+
+
+def _map_cells(difference: DifferenceMap) -> Sequence[str]:
+    cells = [f'{px:.4f} px' for px in difference.worst_and_rms_px]
+    sigmas = difference.worst_and_rms_sigmas
+    return cells + [f'{one:.2f} sigma' if one == one else '' for one in sigmas]
+
+
+def _sigmas(difference: float, sigma: float) -> str:
+    return f'{difference / sigma:+.1f}' if sigma > 0 else ''
+
+
+@dataclass(frozen=True)
+class TruthTable:
+    """Estimate and truth: lines of a table, and the largest error in sigmas."""
+
+    lines: tuple[str, ...]
+    worst_sigmas: float
+
+
+def _truth_of(path: Path) -> object:
+    """Content of the truth of a simulated bag, as ``starcal simulate`` writes it; else None."""
+    from starcal_ros.formats.products.product_files import read_text
+    from starcal_ros.untrusted import json_value, PRODUCT_BYTES
+
+    try:
+        content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
+    except (ProductError, ValueError):
+        return None
+    return content if isinstance(content, dict) and 'k_true' in content else None
+
+
+def _compared_with(calibration: Calibration, content: object, path: Path) -> TruthTable:
+    """
+    The table of a calibration beside the truth.
+
+    Raises ProductError when the truth is of another lens model or damaged.
+    """
+    from starcal_ground.simulation.simulated_bag import true_geometry
+    from starcal_ros.formats.products.calibration_json import prior_of
+
+    try:
+        truth = true_geometry(content)  # type: ignore[arg-type]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
+    model = calibration.geometry.camera.model
+    if truth.camera.model != model:
+        raise ProductError(f'{path}: of lens model {truth.camera.model}, calibrated was {model}')
+    return with_truth(calibration, truth, prior_of(calibration) or calibration.geometry)
+
+
+def with_truth(
+    calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry
+) -> TruthTable:
+    """Table of the estimated parameters and the alignment with prior and truth."""
+    import numpy as np
+
+    from starcal_ros.assessment.agreement import alignment_difference_rad
+
+    all_names = calibration.geometry.camera.parameter_names
+    names = [name for name in all_names if name in calibration.estimated]
+    columns = [all_names.index(name) for name in names]
+    before, estimate, true = (
+        geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
+    )
+    sigma = calibration.sigma
+    off = (estimate - true) / sigma[columns]
+    rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
+    table = [
+        (
+            name,
+            significant(b, 6),
+            to_sigma(e, s),
+            significant(s, 2),
+            significant(t, 6),
+            f'{o:+.1f} sigma',
+        )
+        for name, b, e, s, t, o in rows
+    ]
+    # Alignment angles are relative to the truth.
+    prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
+    error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
+    sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
+    angles_off = error_arcsec / sigma_arcsec
+    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True)
+    table += [
+        (f'alignment {axis}', f'{b:+.2f}"', f'{e:+.2f}"', f'{s:.2f}"', '0"', f'{o:+.1f} sigma')
+        for axis, b, e, s, o in angles
+    ]
+    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
+    return TruthTable(tuple(table_lines(header, table)), float(np.abs([*off, *angles_off]).max()))

@@ -1,0 +1,119 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Write a calibration in the format of another tool.
+
+Writes SPICE kernels (FK and IK, or CK with the attitude of each image), an ALE fragment and ISIS
+keywords, YAML of OpenCV, kalibr or ROS, arguments of GIANT, a model of mrcal, a table of lines of
+sight, or C99 source; prints the parts that the format cannot represent and the error in pixels
+that this causes. SPICE kernels, tables and C represent the whole camera.
+
+  # frame and instrument kernel, including the star tracker frame
+  starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-id -999100
+  # with the frame names of the mission, whose frame kernel defines the star tracker
+  starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-frame MSN_ST1
+  # attitude of the camera at each image, by its stars
+  starcal export out --to ck -o kernels --spacecraft-id -999 --kernels naif.tls clock.tsc
+  # for cv2.projectPoints
+  starcal export out --to opencv -o opencv
+  # C99 for flight software, and a later calibration as a table for it
+  starcal export out --to c -o src
+  starcal export newer --to c --table -o uplink
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_text
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import make_folder, OBSERVATIONS_FILE
+from starcal_ros.text import significant
+
+if TYPE_CHECKING:
+    from starcal_ros.records import StarObservations
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    what = 'calibration.json or its folder'
+    add('calibration', type=Path, metavar='DIR', help=what)
+    what = 'format: spice, ck, isd, opencv, kalibr, ros, giant, mrcal, csv or c'
+    add('--to', required=True, metavar='FORMAT', help=what)
+    what = 'folder for the files, created if absent'
+    add('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
+    spice = command.add_argument_group('SPICE')
+    what = 'NAIF ID of the spacecraft, negative'
+    spice.add_argument('--spacecraft-id', type=int, metavar='ID', help=what)
+    what = 'NAIF ID of the camera (default: 1000 times the spacecraft ID, minus 1)'
+    spice.add_argument('--instrument-id', type=int, default=0, metavar='ID', help=what)
+    what = (
+        'frame ID of the star tracker; the kernel then defines its frame as a CK frame (default: '
+        'the frame kernel of the mission does)'
+    )
+    spice.add_argument('--star-tracker-id', type=int, default=0, metavar='ID', help=what)
+    for name in ('camera', 'star-tracker'):
+        what = f'name of the {name.replace("-", " ")} frame (default: from the calibration)'
+        spice.add_argument(f'--{name}-frame', default='', metavar='NAME', help=what)
+    what = 'pixel size, micrometres, for a focal length in mm (default: pixels only)'
+    spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
+    what = 'LSK and SCLK of the spacecraft, for ck'
+    spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
+    add('--image-topic', default='', metavar='T', help='image topic, for kalibr')
+    what = 'only the binary table, for compiled C code'
+    add('--table', action='store_true', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.mission.export.export_formats import export
+    from starcal_ground.mission.export.spice import SpiceNames
+    from starcal_ros.formats.bag.reader import read_observations
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_folder import calibration_file, OBSERVATIONS_TOPIC
+
+    calibration = read_calibration(calibration_file(args.calibration))
+    names = None
+    if args.spacecraft_id is not None:
+        names = SpiceNames(
+            args.spacecraft_id,
+            args.instrument_id,
+            args.star_tracker_id,
+            args.camera_frame,
+            args.star_tracker_frame,
+            args.pixel_size_um,
+        )
+    make_folder(args.output)
+    observations: Iterable[StarObservations] = ()
+    if args.to == 'ck':
+        observations = read_observations([_observations_of(args.calibration)], OBSERVATIONS_TOPIC)
+    done = export(
+        *(calibration, args.to, args.output, names, args.image_topic, args.table),
+        *(observations, args.kernels),
+    )
+    print_text(f'written: {", ".join(map(str, done.files))}')
+    if not calibration.accepted:
+        arguments.complain(
+            f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}'
+        )
+    if not math.isfinite(done.worst_px):
+        print_text('the format cannot see the whole detector: use spice, opencv or csv')
+    else:
+        print_text(
+            f'largest error of a pixel against the calibration: {significant(done.worst_px, 3)} px'
+        )
+    for loss in done.losses:
+        print_text(f'left out: {loss.part}, {significant(loss.cost_px, 3)} px alone')
+    return arguments.EXIT_ACCEPTED
+
+
+def _observations_of(calibration: Path) -> Path:
+    from starcal_ros.formats.products.product_folder import calibration_file
+
+    path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)
+    if not path.exists():
+        raise OptionError(f'--to ck: needs {path} with the stars of the images')
+    return path

@@ -1,0 +1,141 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Make a bag from images and attitudes in the formats of a mission.
+
+Images are FITS (also tiled, scaled or floating point), TIFF or PNG. Attitudes of one or more star
+trackers are CCSDS AEM, CSV, SPICE CK with SCLK and LSK, or the WCS of a program such as
+astrometry.net. Velocities are CCSDS OEM, CSV or SPK. Times in UTC, TAI, TT, TDB and GPS are
+converted to UTC. With --camera it also writes a parameter file to calibrate the bag.
+
+  # FITS and an attitude ephemeris
+  starcal import --images 'night/*.fits' --attitude attitude.aem -o bag --camera prior.yaml
+  # SPICE kernels for attitude and velocity
+  starcal import --images 'night/*.fits' --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
+  # FITS solved by astrometry.net, which writes NAME.wcs for NAME.fits
+  starcal import --images 'night/*.fits' --attitude 'night/*.wcs' -o bag --camera prior.yaml
+  # PNG with a table of times and one of attitudes
+  starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag
+"""
+
+import argparse
+from collections.abc import Sequence
+import dataclasses
+import glob
+from pathlib import Path
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ros.errors import OptionError
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    what = 'image files; a pattern in quotes is expanded here'
+    add('--images', nargs='+', required=True, metavar='FILE', help=what)
+    what = (
+        'AEM, CSV, SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK), or FITS with the'
+        ' WCS of each image: the images, or files with the same names'
+    )
+    add('--attitude', nargs='+', required=True, metavar='FILE', help=what)
+    what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
+    add('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
+    what = 'bag folder or .mcap file to write'
+    add('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
+    what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
+    add('--star-tracker', default='', metavar='FRAME', help=what)
+    what = 'frames of further star trackers in the same files'
+    add('--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
+    what = 'name or NAIF ID of the spacecraft in the SPK'
+    add('--spacecraft', default='', metavar='BODY', help=what)
+    what = 'FITS keyword of the middle of the exposure (default: DATE-AVG, else from DATE-BEG)'
+    add('--time-key', default='', metavar='KEY', help=what)
+    what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
+    add('--times', type=Path, metavar='FILE', help=what)
+    what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
+    add('--temperature-key', default='', metavar='KEY', help=what)
+    what = 'FITS extension by number or name (default: the first image)'
+    add('--hdu', default='', metavar='N', help=what)
+    what = 'colour to take from an RGB image or a mosaic'
+    add('--channel', default='', choices=('red', 'green', 'blue'), help=what)
+    what = 'Bayer pattern of a mosaic; the image then has half the width and height'
+    add('--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what)
+    what = 'range of pixel values that is mapped to 16 bit (default: the range of all images)'
+    add('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
+    what = 'prior camera, ROS YAML or .cameramodel of mrcal; params.yaml is written then'
+    add('--camera', type=Path, metavar='FILE', help=what)
+    what = (
+        'prior orientation x y z w of the camera in the star tracker frame, then in the frame of'
+        ' each further star tracker; of a single star tracker it may be left out: it is then found'
+        ' from the first images'
+    )
+    add('--alignment', nargs='+', type=float, default=(), metavar='Q', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.images.image_series import ImageOptions
+    from starcal_ground.mission.ingest import mission_records, recording, sources
+    from starcal_ground.mission.ingest.mission_records import Guard
+
+    options = ImageOptions(
+        time_key=args.time_key,
+        hdu=args.hdu,
+        channel=args.channel,
+        bayer=args.bayer,
+        value_range=None if args.value_range is None else tuple(args.value_range),
+        temperature_key=args.temperature_key,
+    )
+    needed = 4 * (1 + len(args.more_star_trackers))
+    given = len(args.alignment)
+    if args.camera and given != needed and (given or args.more_star_trackers):
+        raise OptionError(
+            f'--alignment: {given} numbers, {needed} are needed: x y z w for each star tracker;'
+            ' only that of a single one is found from the images'
+        )
+    paths, solved = _expanded(args.images), _expanded(args.attitude, '--attitude')
+    inputs = [args.times, args.camera, *solved, *(args.velocity or ())]
+    recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
+    with Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
+        if args.times:
+            times = guard.call(args.times, mission_records.read_times, args.times)
+            options = dataclasses.replace(options, times=times)
+        files, problems = recording.look_at_all(paths, options, guard, advance)
+        for problem in problems:
+            arguments.complain(problem)
+        if problems:
+            return arguments.EXIT_BAD_INPUT
+        stamps = [file.time_ns for file in files]
+        attitudes, *others = (
+            guard.call(_names(solved), sources.attitudes, solved, frame, stamps, files)
+            for frame in (args.star_tracker, *args.more_star_trackers)
+        )
+        further = dict(
+            zip(map(recording.frame_name, args.more_star_trackers), others, strict=True)
+        )
+        velocities = args.velocity and guard.call(
+            _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
+        )
+        prior = args.camera and recording.Prior(args.camera, tuple(args.alignment) or (0.0,) * 4)
+        made = recording.write_bag(
+            args.output, files, options, guard, attitudes, velocities, prior, advance, further
+        )
+    print_text(f'bag {made.bag}: {len(files)} images')
+    for note in made.notes:
+        print_text(f'note: {note}')
+    if made.params:
+        print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    return arguments.EXIT_ACCEPTED
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ', '.join(map(str, paths))
+
+
+def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
+    """Files of patterns, each once, in order of their names."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
+        if not names:
+            raise OptionError(f'{option}: no file matches {pattern}')
+        found |= dict.fromkeys(map(Path, names))
+    return list(found)

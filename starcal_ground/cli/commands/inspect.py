@@ -1,0 +1,168 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+List the contents of a bag and the images a calibration would refuse.
+
+Lists topics, rates, stamps, encodings and gaps, and checks each image against the attitudes as a
+calibration does. With --params it also measures the stars.
+
+  # check stamps and attitudes
+  starcal inspect bags/tiny
+  # also measure the stars, as "starcal calibrate" does
+  starcal inspect bags/tiny --params bags/tiny/params.yaml
+  # machine-readable output
+  starcal inspect bags/tiny --json
+
+exit status: 0 the bag can be calibrated; 3 it cannot, with the reasons; 2 bad input.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+import math
+from typing import TYPE_CHECKING
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_table, print_text, print_verdict, progress_bar
+from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.text import significant
+
+if TYPE_CHECKING:
+    from starcal_ground.planning.inspect import Inspection, TopicContent
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    arguments.add_bags(command)
+    arguments.add_params(command, 'ROS parameter file; with it the stars are measured too')
+    arguments.add_camera_alone(command)
+    arguments.add_topics(command)
+    arguments.add_json(command)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.planning import inspect
+    from starcal_ros.formats.bag import reader
+    from starcal_ros.formats.messages import message_fields
+
+    setup = None
+    if args.params:
+        from starcal_ros.pipeline.setup import read_setup
+
+        setup = read_setup(args.params)
+    kinds = (
+        message_fields.IMAGE_TYPE,
+        message_fields.COMPRESSED_TYPE,
+        message_fields.OBSERVATIONS_TYPE,
+    )
+    total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
+    with progress_bar(total, 'images') as advance:
+        inspection = inspect.inspect(
+            args.bags, arguments.topics(args), setup, advance, args.camera_alone
+        )
+    arguments.print_notes(inspection.notes)
+    if args.json:
+        arguments.print_json(inspection)
+    else:
+        _print(inspection)
+    return arguments.EXIT_REFUSED if inspection.problems else arguments.EXIT_ACCEPTED
+
+
+def _print(inspection: Inspection) -> None:
+    """Print topics, images, attitudes and refused images."""
+    print_table(
+        ('topic', 'type', 'messages', 'rate', 'longest gap'),
+        [
+            (
+                topic.name,
+                topic.type_name.replace('/msg/', '/'),
+                str(topic.count),
+                f'{significant(topic.rate_hz, 3)} Hz' if topic.rate_hz else '',
+                f'{significant(topic.longest_gap_s, 3)} s' if topic.count > 1 else '',
+            )
+            for topic in inspection.topics
+        ],
+        left=2,
+    )
+    for topic in inspection.topics:
+        print_text(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
+    for text in inspection.damage:
+        print_text(f'damage: {text}')
+    if inspection.images:
+        _print_images(inspection)
+    if inspection.status is not None:
+        print_table(
+            ('predicted', '1-sigma'),
+            [
+                (name, _predicted(name, value))
+                for name, value in zip(
+                    inspection.status.parameter_names,
+                    inspection.status.predicted_sigma,
+                    strict=True,
+                )
+            ],
+        )
+    if inspection.problems:
+        print_verdict(False, 'cannot be calibrated: ' + '; '.join(inspection.problems))
+    elif inspection.by_stars:
+        print_verdict(True, 'no problems found so far; the camera alone, without attitudes')
+    elif inspection.measured:
+        print_verdict(True, 'can be calibrated')
+    else:
+        print_verdict(True, 'no problems found so far; use --params to measure the stars too')
+
+
+def _print_images(inspection: Inspection) -> None:
+    bad = sum(refused.count for refused in inspection.refused)
+    chosen = inspection.chosen
+    assert chosen is not None  # images come from a chosen topic
+    attitudes = ', '.join(filter(None, (chosen.attitude, *chosen.more_attitudes)))
+    print_text(
+        f'{inspection.images - bad} of {inspection.images} images of '
+        f'{chosen.image or chosen.observations} can be used'
+        + (f', with the attitudes of {attitudes}' if attitudes else '')
+    )
+    if math.isfinite(inspection.longest_attitude_gap_s):
+        gap_s = significant(inspection.longest_attitude_gap_s, 3)
+        print_text(f'longest attitude gap around an image: {gap_s} s')
+    if inspection.refused:
+        print_table(
+            ('refused', 'images', 'meaning', 'first'),
+            [
+                (r.reason, str(r.count), r.meaning, f'{_clock(r.first_ns)}: {r.detail}')
+                for r in inspection.refused
+            ],
+            left=4,
+        )
+    if inspection.stars_per_image:
+        stars = inspection.stars_per_image
+        print_text(
+            f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
+            f'refused: {_counted(inspection.refused_stars)}'
+        )
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ', '.join(f'{count} {reason}' for reason, count in counts.items()) or 'none'
+
+
+def _predicted(name: str, sigma: float) -> str:
+    if not math.isfinite(sigma):
+        return 'not observable yet'
+    return (
+        f'{sigma / ARCSECOND_RAD:.2f}"' if name.startswith('alignment') else significant(sigma, 2)
+    )
+
+
+def _topic_notes(topic: TopicContent) -> list[str]:
+    notes = [f'{utc_text(topic.first_ns)} to {_clock(topic.last_ns)}']
+    if topic.kinds:
+        notes.append(', '.join(f'{count} x {kind}' for kind, count in topic.kinds.items()))
+    if topic.bad:
+        notes.append(f'{topic.bad} of {topic.count} messages are invalid')
+    if topic.backward:
+        notes.append(f'stamps go back {topic.backward} times')
+    return notes
+
+
+def _clock(time_ns: int) -> str:
+    return utc_text(time_ns).partition(' ')[2]

@@ -1,0 +1,61 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Write a table of lines of sight and their sigma by pixel.
+
+Writes u_px, v_px, the unit vector x, y, z in the camera frame, shape_sigma_arcsec (1-sigma of the
+direction, common rotation removed) and sigma_arcsec (in the star tracker frame). The lines of
+sight include the residual field if there is one.
+
+  # 25 x 25 pixels over the detector
+  starcal lookup out -o lines_of_sight.csv
+  # every 16 pixels, for interpolation
+  starcal lookup out -o lines_of_sight.npz --step 16
+"""
+
+import argparse
+import math
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_text
+from starcal_ros.errors import OptionError
+from starcal_ros.text import significant
+
+_MOST_POINTS = 2000  # pixels a side of a table of lines of sight: 1.8 GB of memory
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    what = 'calibration.json or its folder'
+    command.add_argument('calibration', type=arguments.path, metavar='DIR', help=what)
+    arguments.add_output(command, 'FILE', 'table to write: .csv, .npz or .fits', required=True)
+    grid = command.add_mutually_exclusive_group()
+    points = arguments.number(int, 2, _MOST_POINTS)
+    what = 'N x N pixels from corner to corner of the detector, u fastest (default: 25)'
+    grid.add_argument('--points', type=points, default=25, metavar='N', help=what)
+    what = 'a pixel every PX pixels along both axes, in place of --points'
+    grid.add_argument('--step', type=float, metavar='PX', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.mission.export.export_formats import write_lookup_table
+    from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
+    from starcal_ros.camera import pixel_grid
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_folder import calibration_file
+
+    file = calibration_file(args.calibration)
+    arguments.check_file(args.output, [file])
+    calibration = read_calibration(file)
+    camera = calibration.geometry.camera
+    pixels = pixel_grid(camera, args.points, args.points)
+    if args.step is not None:
+        least = math.sqrt(camera.width * camera.height) / _MOST_POINTS
+        if not least <= args.step <= max(camera.width, camera.height):
+            raise OptionError(
+                f'--step: {args.step:g} px: give {significant(least, 3)} px (a table of'
+                f' {_MOST_POINTS}^2 pixels) or more, up to the size of the detector'
+            )
+        pixels = pixels_every(camera, args.step)
+    table = line_of_sight_table(camera, calibration.map_covariance, pixels)
+    write_lookup_table(table, args.output)
+    print_text(f'{len(pixels)} lines of sight written to {args.output}')
+    return arguments.EXIT_ACCEPTED

@@ -1,0 +1,38 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Rewrite report.html of a calibration.
+
+Makes one page from the files of a folder: gate verdict, parameters, residuals, uncertainties,
+refused images and stars. The page needs no network. --pdf writes it as numbered pages with a block
+for signatures (extra pdf).
+
+  # from the files of an earlier calibration, with pages to sign
+  starcal report out --pdf
+  # of the last calibration of a calibrator, from its state_dir
+  starcal report state
+"""
+
+import argparse
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_text
+from starcal_ros.formats.products.product_files import check_outputs, REPORT_FILE
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    what = 'folder with the products of starcal calibrate, or the state_dir of a calibrator'
+    command.add_argument('folder', type=arguments.path, metavar='DIR', help=what)
+    what = 'write report.pdf too, to print and sign'
+    command.add_argument('--pdf', action='store_true', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.report import page
+
+    names = (REPORT_FILE, page.PDF_FILE) if args.pdf else (REPORT_FILE,)
+    check_outputs(args.folder / name for name in names)
+    written = page.write_report(args.folder)
+    print_text(f'report written to {written}')
+    if args.pdf:
+        print_text(f'report written to {page.write_pdf(written)}')
+    return arguments.EXIT_ACCEPTED

@@ -1,0 +1,120 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Render a bag with known truth.
+
+Renders images of real stars with a simulated camera and writes the truth, a prior camera and a
+parameter file beside the bag.
+
+  # 24 images of 1296 x 1024, in a few seconds
+  starcal simulate -o sim --scenario small
+  # calibrate them
+  starcal calibrate sim --params sim/params.yaml -o out
+  # another draw of the camera and the noise
+  starcal simulate -o sim2 --scenario small --seed 2
+  # the camera of sim with other noise, twelve stars in each image
+  starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
+  # a deliberate mistake, to practise the diagnosis
+  starcal simulate -o mirrored --scenario tiny --flip
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from typing import TYPE_CHECKING
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ros.errors import OptionError
+
+if TYPE_CHECKING:
+    from starcal_ground.simulation.simulated_bag import Mistakes
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    add, number = command.add_argument, arguments.number
+    arguments.add_output(command, 'BAG', 'bag folder or .mcap file to write', required=True)
+    what, names = 'scenario: tiny, small or paper', ('tiny', 'small', 'paper')
+    add('--scenario', required=True, choices=names, metavar='NAME', help=what)
+    what, seed = 'seed of the truth and the noise (default: 1)', number(int, 0, 2**63 - 1)
+    add('--seed', type=seed, default=1, metavar='N', help=what)
+    what = (
+        'seed of the camera and its mounting: the same camera with other noise (default: --seed)'
+    )
+    add('--camera-seed', type=number(int, 0), metavar='N', help=what)
+    what = 'number of images (default: from the scenario)'
+    add('--images', type=number(int, 1), metavar='N', help=what)
+    what = 'draw only the N brightest stars of each image'
+    add('--stars-per-image', type=number(int, 1), metavar='N', help=what)
+    add = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"').add_argument
+    what, sides = (
+        'mirror the images (default where no side is given: left-right)',
+        (
+            'left-right',
+            'top-bottom',
+        ),
+    )
+    add('--flip', nargs='?', const=sides[0], choices=sides, help=what)
+    what = 'angle of a counterclockwise rotation of the images, degrees'
+    add('--rotate', type=int, choices=(0, 90, 180, 270), default=0, help=what)
+    what = 'direction of the attitudes in the bag; the parameter file has st_to_inertial'
+    directions = ('st_to_inertial', 'inertial_to_st')
+    add('--attitude-direction', choices=directions, default=directions[0], help=what)
+    what = 'order of the numbers of the quaternions in the bag'
+    add('--quaternion-order', choices=('xyzw', 'wxyz'), default='xyzw', help=what)
+    for name, low, high, metavar, what in (
+        ('alignment-error', -180, 180, 'DEG', 'error of the prior alignment, degrees'),
+        ('focal-error', -90, 400, 'PERCENT', 'error of the prior focal length, percent'),
+        ('clock-error', -1e9, 1e9, 'S', 'delay of the image stamps, s, over 0.75'),
+    ):
+        add(f'--{name}', type=number(float, low, high), default=0.0, metavar=metavar, help=what)
+    what = 'length of the streak of a star, px'
+    add('--smear', type=number(int, 1, 200), default=1, metavar='PX', help=what)
+    what = 'tone curve: pixel values grow with light to the power 1/G'
+    add('--gamma', type=number(float, 0.2, 5), default=1.0, metavar='G', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.simulation import scenario as synthetic
+    from starcal_ground.simulation import simulated_bag
+
+    camera_seed = args.seed if args.camera_seed is None else args.camera_seed
+    scenario = synthetic.scenario(args.scenario, camera_seed)
+    scenario = dataclasses.replace(
+        scenario,
+        seed=args.seed,
+        image_count=args.images or scenario.image_count,
+        stars_per_image=args.stars_per_image,
+    )
+    mistakes = _mistakes(args)
+    with progress_bar(scenario.image_count, 'images') as advance:
+        made = simulated_bag.write_bag(
+            scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
+        )
+    print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
+    print_text(f'truth {made.truth}')
+    print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    return arguments.EXIT_ACCEPTED
+
+
+def _mistakes(args: argparse.Namespace) -> Mistakes:
+    from starcal_ground.simulation.scenario import ATTITUDE_OFFSETS_S
+    from starcal_ground.simulation.simulated_bag import Mistakes
+
+    still_s = max(ATTITUDE_OFFSETS_S)
+    if 0 < abs(args.clock_error) <= still_s:
+        raise OptionError(
+            f'--clock-error: {args.clock_error:g} s changes no result: in the scenarios the camera'
+            f' is at rest, or turns evenly, within {still_s:g} s of an image; give more'
+        )
+    return Mistakes(
+        flip=args.flip or '',
+        rotate_deg=args.rotate,
+        attitude_direction=args.attitude_direction,
+        quaternion_order=args.quaternion_order,
+        alignment_error_deg=args.alignment_error,
+        focal_error_percent=args.focal_error,
+        clock_error_s=args.clock_error,
+        smear_px=args.smear,
+        gamma=args.gamma,
+    )

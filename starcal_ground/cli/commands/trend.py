@@ -1,0 +1,111 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Follow calibrations over years.
+
+Adds every calibration.json and state folder under ROOT to a table in DIR, one SQLite file. With
+--params it calibrates bags too. Observations of older versions are calibrated again. Writes
+trend.html: each parameter, boresight and alignment over time, steps and drifts with p-values, and
+the change that a recalibration would have made.
+
+  # all calibrations of a mission; another run adds only new ones
+  starcal trend mission -o trend
+  # a thousand bags on two processes
+  starcal trend fleet -o trend --params camera.yaml --workers 2
+  # on a Dask cluster with access to the same files
+  starcal trend /data/fleet -o trend --params camera.yaml --scheduler tcp://host:8786
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import check_outputs, make_folder
+
+if TYPE_CHECKING:
+    from starcal_ground.mission.trend.fleet import Task
+
+_FAILURES_SHOWN = 5
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
+    add('root', metavar='ROOT', help=what)
+    what = 'folder for trend.html, the table trend.sqlite and the calibrations of bags'
+    add('-o', '--output', required=True, metavar='DIR', help=what)
+    what = (
+        'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '
+        'in its path are replaced'
+    )
+    add('--params', default='', metavar='FILE', help=what)
+    what = (
+        "names of spacecraft and cameras: a pattern, e.g. '{spacecraft}/{camera}/*.mcap', or a "
+        'CSV file with columns path, spacecraft, camera, params'
+    )
+    add('--cameras', default='', metavar='PATTERN', help=what)
+    what = 'write the table as trend.parquet too, for other tools'
+    add('--parquet', action='store_true', help=what)
+    where = command.add_mutually_exclusive_group()
+    what = 'worker processes (default: 0, in-process)'
+    where.add_argument(
+        '--workers', type=arguments.number(int, 0, 1024), default=0, metavar='N', help=what
+    )
+    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
+    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    from starcal_ground.mission.trend import fleet, places, trend_page
+    from starcal_ground.mission.trend.fleet import find, read_cameras
+    from starcal_ground.mission.trend.trend_table import Table
+
+    root, cameras = places.absolute(args.root), read_cameras(args.cameras, args.params)
+    if places.is_remote(args.output):
+        raise OptionError(f'-o: {args.output}: results are written to a local folder, no URL')
+    with _reading(args.root):
+        if not places.exists(root):
+            raise OptionError(f'{args.root}: no such folder')
+
+    def tasks() -> Iterator[Task]:
+        with _reading(args.root):
+            yield from find(root, cameras)
+
+    folder = Path(places.absolute(args.output))
+    make_folder(folder)
+    check_outputs([folder / trend_page.TREND_FILE])
+    table = Table(folder)
+    with progress_bar(None, 'calibrations') as advance:
+        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance)
+    if done == fleet.Done():
+        raise OptionError(
+            f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
+        )
+    page = trend_page.write_page(table.cameras(), len(table.names()), folder, args.root)
+    print_text(f'{done.computed} new, {done.known} known, {done.failed} failed')
+    for row in page.failures[:_FAILURES_SHOWN]:
+        print_text(f'failed: {row.path}: {row.error}')
+    if args.parquet:
+        print_text(f'written to {table.write_parquet()}')
+    print_text(f'{page.years:.2f} years; look at {page.path}')
+    if done.silent == fleet.MOST_SILENT:
+        arguments.complain(
+            f'{args.root}: no answer for {done.silent} files; run again when the store answers:'
+            ' the others are left for that run'
+        )
+        return arguments.EXIT_REFUSED
+    return arguments.EXIT_ACCEPTED if page.calibrations else arguments.EXIT_REFUSED
+
+
+@contextlib.contextmanager
+def _reading(root: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OptionError(f'{root}: cannot be read: {error.strerror or error}') from error

@@ -1,0 +1,234 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A calibration into a folder: products, pictures and report, or why there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import dataclasses
+from pathlib import Path
+import threading
+from typing import TYPE_CHECKING
+
+from starcal_ground.cli import arguments
+from starcal_ground.cli.terminal import progress_bar
+from starcal_ground.report import thumbnails
+from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
+from starcal_ros.files import same_as_one_of
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.products import product_files, product_folder
+from starcal_ros.formats.products.product_folder import NotCalibrated
+from starcal_ros.pipeline import campaign
+from starcal_ros.pipeline.provenance import inputs_of, software_version
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+
+if TYPE_CHECKING:
+    from starcal_ground.cli.commands.calibrate import Selection
+
+
+def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
+    """
+    `check_outputs` of the products of a calibration, which do not become part of a bag either.
+
+    Raises OptionError or ProductError naming the folder or the file.
+    """
+    bag_files = reader.files_of_bags(bags)
+    if same_as_one_of(folder, [file.parent for file in bag_files]):
+        raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
+    products = [
+        folder / name
+        for name in (*product_folder.PRODUCT_FILES, product_folder.NOT_CALIBRATED_FILE)
+    ]
+    pictures = thumbnails.thumbnails_in(folder / thumbnails.THUMBNAILS_FOLDER)
+    product_files.check_outputs((*products, *pictures), (*bag_files, *files))
+
+
+@contextlib.contextmanager
+def failure_recorded(
+    folder: Path, bags: Sequence[Path], kind: type[StarcalError]
+) -> Iterator[None]:
+    """Write an error of a kind that ends the block to the folder as well."""
+    try:
+        yield
+    except kind as error:
+        product_files.make_folder(folder)
+        _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
+        raise
+
+
+@contextlib.contextmanager
+def digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
+    """Digests of input files, which are read during the block; its end stops that at once."""
+    with ThreadPoolExecutor(1, 'digests') as thread:
+        stopped = threading.Event()
+        try:
+            yield thread.submit(inputs_of, files, stopped.is_set).result
+        finally:
+            stopped.set()
+
+
+def calibrate_into(
+    folder: Path,
+    source: campaign.Source,
+    inputs: Callable[[], Mapping[str, str]],
+    selection: Selection | None = None,
+    with_report: bool = False,
+) -> tuple[campaign.Campaign, str]:
+    """
+    Calibrate and write the products, with or without a report.
+
+    Also returns where the report is, or why there is none.
+    """
+    album, drawings = thumbnails.Album(source.image_count, source.setup), Drawings()
+
+    def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
+        with drawings.kind('pictures of images'):
+            album.show(image, observed, geometry)
+
+    with progress_bar(source.image_count, 'images') as advance:
+        observed = campaign.observe(source, selection, show, advance)
+    if selection is not None and not observed.observations:
+        raise OptionError(selection.without_images())
+    product_files.make_folder(folder)
+    # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
+    product_folder.write_observations(
+        observed.observations, folder, source.setup.frames.camera_frame
+    )
+    with ThreadPoolExecutor(1, 'pictures') as thread:
+        drawn = thread.submit(album.thumbnails)
+        if with_report:
+            thread.submit(_load_report)
+        made = _calibrated(folder, observed, inputs(), album)
+        pictures: Sequence[thumbnails.Thumbnail] = ()
+        with drawings.kind('pictures of images'):
+            pictures = drawn.result()
+        written = thread.submit(_write_all, made, pictures, folder)
+        page, report = '', ''
+        try:
+            if with_report:
+                with drawings.kind('report'):
+                    page, report = _drawn(made, pictures, folder)
+        finally:
+            written.result()
+            if not page:  # one that is there is of the products that were replaced
+                (folder / product_files.REPORT_FILE).unlink(missing_ok=True)
+    if page:
+        from starcal_ground.report.page import with_digests
+
+        # After the products that it is of.
+        product_files.write_atomically(
+            folder / product_files.REPORT_FILE, with_digests(page, folder)
+        )
+    return made, report
+
+
+def _calibrated(
+    folder: Path,
+    observed: campaign.Observed,
+    inputs: Mapping[str, str],
+    album: thumbnails.Album,
+) -> campaign.Campaign:
+    """The calibration of observed images; a failure is recorded in the folder."""
+    try:
+        made = campaign.calibrate(observed, inputs)
+    except TooFewObservations as error:
+        failure = _failure(str(error), observed)
+        _write_failure(folder, failure, album.unmatched)
+        raise TooFewObservations(failure.reason) from error
+    arguments.print_notes(made.notes[len(observed.source.notes) :])
+    if made.observations is not observed.observations:
+        product_folder.write_observations(
+            made.observations, folder, made.setup.frames.camera_frame
+        )
+    return made
+
+
+def _load_report() -> None:
+    """Import the modules of the report and compile its template."""
+    with contextlib.suppress(ModuleNotFoundError):
+        from starcal_ground.report import page
+
+        page.page_template('report.html')
+
+
+def _write_all(
+    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
+) -> None:
+    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
+    product_folder.write_products(made.calibration, folder, made.residuals)
+
+
+def _drawn(
+    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
+) -> tuple[str, str]:
+    """The report of what is being written, and where it will be; or why there is none."""
+    try:
+        from starcal_ground.report import page
+    except ModuleNotFoundError as error:
+        return '', f'no report: {missing_package(error, "report")}'
+    ordered = thumbnails.ordered(pictures)
+    content = page.Found(made.calibration, made.residuals, made.observations, ordered)
+    return page.render(content, folder), f'look at {folder / product_files.REPORT_FILE}'
+
+
+def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
+    """The record of a failure, with the cause for which most images are refused."""
+    from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals, refusals
+
+    source, count = observed.source, len(observed.observations)
+    groups = refusals(observed.observations)
+    refused = {group.reason: group.count for group in groups}
+    is_none_used = sum(refused.values()) == count
+    if count and is_none_used:
+        words = f'no image of {count} can be used'
+    if refused:
+        words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
+    named = tuple(map(str, source.bags))
+    cause = of_refusals(groups, count)
+    if source.topics.image and is_none_used:
+        cause = of_a_failure(source.bags, source.topics, source.setup, groups)
+    if cause is None:
+        return NotCalibrated(words, named, refused)
+    command = 'starcal diagnose' if source.through_air is None else ''
+    words = f'{cause.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
+    return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
+
+
+def _write_failure(
+    folder: Path, failure: NotCalibrated, pictures: Sequence[thumbnails.Thumbnail] = ()
+) -> None:
+    """Replace what a folder holds of an earlier calibration by the record of a failure."""
+    software = f'starcal {software_version()}'
+    product_folder.write_not_calibrated(dataclasses.replace(failure, software=software), folder)
+    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
+    with Drawings().kind('report'):
+        try:
+            from starcal_ground.report import page
+        except ModuleNotFoundError as error:
+            missing_package(error, 'report')  # raises where another module is missing
+        else:
+            page.write_report(folder)
+
+
+class Drawings:
+    """Drawings of one result; one that fails costs a line on stderr, once for each kind."""
+
+    def __init__(self) -> None:
+        self._failed: set[str] = set()
+
+    @contextlib.contextmanager
+    def kind(self, name: str) -> Iterator[None]:
+        """End the block quietly where drawing fails; writing belongs outside of it."""
+        try:
+            yield
+        # Other versions of contourpy, Jinja2 and OpenCV fail in their own ways.
+        except Exception as error:
+            if arguments.is_interrupt(error):
+                raise
+            if name not in self._failed:
+                self._failed.add(name)
+                kind = '' if isinstance(error, StarcalError) else f'{type(error).__name__}: '
+                arguments.complain(
+                    f'warning: no {name}, the other results are complete: {kind}{error}'
+                )

@@ -1,0 +1,230 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""View of running nodes for a terminal: images, refusals, forecast sigmas, gate, health."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Group
+from rich.panel import Panel
+from rich.style import Style
+from rich.table import Table
+from rich.text import Text
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
+from starcal_ros.text import printable, significant
+
+_HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
+_STALE = ('stale', 'yellow')
+_UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
+    'focal_temperature_1': ' /degC',
+    'focal_temperature_2': ' /degC²',
+    'tau_x': ' rad',
+    'tau_y': ' rad',
+}
+"""By parameter; the coefficients of the lens have none."""
+_SHADES = ' ░▒▓█'
+_TIGHTEST = 6  # gate checks shown of a calibration that passed
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Newest messages of each topic; None or empty before the first."""
+
+    images: int = 0
+    refused: Mapping[str, int] = field(default_factory=dict)
+    last: StarObservations | None = None
+    status: EnsembleStatus | None = None
+    active: Calibration | None = None
+    candidate: Calibration | None = None
+    health: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+
+    def with_image(self, observations: StarObservations) -> Seen:
+        """A copy with one more image."""
+        refused = Counter(self.refused)
+        if observations.refusal:
+            refused[observations.refusal] += 1
+        return dataclasses.replace(
+            self, images=self.images + 1, refused=dict(refused), last=observations
+        )
+
+
+class Line(Text):
+    """A line with control characters escaped, because other processes choose the names."""
+
+    def __init__(self, text: str = '', style: str = '') -> None:
+        super().__init__(printable(text), style)
+
+    def append(self, text: Text | str, style: Style | str | None = None) -> Line:
+        """Append words."""
+        super().append(printable(text) if isinstance(text, str) else text, style)
+        return self
+
+
+def _lines(lines: Iterable[Text]) -> Text:
+    return Text('\n').join(lines)
+
+
+def view(seen: Seen) -> Group:
+    """All panels in one column of 80 characters."""
+    return Group(
+        Panel(_images(seen), title='images', title_align='left'),
+        Panel(_ensemble(seen), title='ensemble', title_align='left'),
+        Panel(_calibration(seen), title='calibration', title_align='left'),
+        Panel(_health(seen.health), title='nodes', title_align='left'),
+    )
+
+
+def _images(seen: Seen) -> Text:
+    last = seen.last
+    if last is None:
+        return Line('no image since the start of this view', 'dim')
+    refused = sum(seen.refused.values())
+    lines = [Line(f'{seen.images} since the start of this view, {seen.images - refused} used')]
+    for reason, count in sorted(seen.refused.items(), key=lambda item: -item[1]):
+        lines.append(Line(f'  {count} refused: {reason.replace("_", " ")}', 'yellow'))
+    line = Line(f'last {utc_text(last.time_ns)}: ')
+    if last.refusal:
+        line.append(f'refused, {last.refusal.replace("_", " ")}: {last.detail}', 'yellow')
+    else:
+        line.append(f'{len(last)} stars', 'green')
+    return _lines([*lines, line])
+
+
+def _ensemble(seen: Seen) -> Group | Text:
+    status = seen.status
+    if status is None:
+        return Line('no status received from a calibrator', 'dim')
+    head = Line()
+    for there, needed, what in (
+        (status.images, status.min_images, 'images'),
+        (status.stars, status.min_stars, 'stars'),
+    ):
+        style = 'green' if there >= needed else 'yellow'
+        head.append(f'{there} of at least {needed} {what}', style).append('   ')
+    head.append(f'{status.images_saved} images on disk')
+    sigmas = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for name, justify in (('1-sigma of', 'left'), ('calibrated now', 'right'),
+                          ('active', 'right')):  # fmt: skip
+        sigmas.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    active = _sigmas(seen.active)
+    for name, sigma in zip(status.parameter_names, status.predicted_sigma, strict=True):
+        before = active.get(name)
+        style = 'green' if before is not None and sigma < before else ''
+        sigmas.add_row(
+            Line(name),
+            Line(_sigma_text(name, float(sigma)), style),
+            Line('' if before is None else _sigma_text(name, before)),
+        )
+    grid = Table.grid(padding=(0, 3))
+    grid.add_row(sigmas, coverage_text(status.coverage))
+    return Group(head, grid)
+
+
+def coverage_text(coverage: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Text:
+    """Coverage of the detector as shades, two characters per cell; empty cells are red."""
+    most = max(int(coverage.max(initial=0)), 1)
+    lines = [Line(f'most in a cell: {most}')]
+    for row in coverage:
+        line = Line()
+        for count in row:
+            if count == 0:
+                line.append('··', 'red')
+            else:
+                line.append(2 * _SHADES[1 + int(3 * count // most)], 'cyan')
+        lines.append(line)
+    return _lines(lines)
+
+
+def _sigmas(calibration: Calibration | None) -> dict[str, float]:
+    if calibration is None:
+        return {}
+    sigma: Floats = calibration.sigma
+    return dict(zip(calibration.parameter_names, sigma.tolist(), strict=True))
+
+
+def _sigma_text(name: str, sigma: float) -> str:
+    if not np.isfinite(sigma):
+        return 'unobservable'
+    if name.startswith('alignment'):
+        per = '/degC' if name.endswith('_temperature') else ''
+        return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
+    return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
+
+
+def _calibration(seen: Seen) -> Group | Text:
+    parts: list[Text | Table] = []
+    if seen.active is None:
+        parts.append(Line('none active: the prior is in use', 'dim'))
+    else:
+        active = seen.active
+        style = 'green' if active.accepted else 'bold red'
+        words = 'accepted by the gate' if active.accepted else 'activated against the gate'
+        parts.append(
+            Line(
+                f'active: number {active.number}, {words}, since'
+                f' {utc_text(active.active_since_ns)}, {active.images_used} images,'
+                f' residual {active.residual_rms_px:.3f} px',
+                style,
+            )
+        )
+    last = seen.candidate or seen.active
+    if seen.candidate is not None:
+        reasons = '; '.join(seen.candidate.reasons)
+        parts.append(Line(f'last candidate refused: {reasons}', 'bold red'))
+    if last is not None:
+        parts.append(_gate(last))
+    return Group(*parts)
+
+
+def _gate(calibration: Calibration) -> Table:
+    """Failed checks, then the passed ones closest to their limits."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column('gate check')
+    table.add_column('value', justify='right')
+    table.add_column('limit', justify='right')
+    table.add_column('of the limit')
+    failed = [check for check in calibration.gate if check.passed is False]
+    passed = sorted(
+        (check for check in calibration.gate if check.passed and share_of_limit(check) > 0),
+        key=share_of_limit,
+        reverse=True,
+    )
+    for check in [*failed, *passed[:_TIGHTEST]]:
+        share = min(share_of_limit(check), 1.0)
+        style = 'bold red' if check.passed is False else ''
+        table.add_row(
+            Line(check.name, style),
+            Line(check.found_text, style),
+            Line(check.limit_text),
+            Line('█' * round(10 * share) + '·' * (10 - round(10 * share)), style or 'cyan'),
+        )
+    return table
+
+
+def share_of_limit(check: GateCheck) -> float:
+    """Value of a check as a fraction of its limit; 0 without a number or a limit."""
+    if not (np.isfinite(check.found) and np.isfinite(check.limit) and check.limit > 0):
+        return 0.0
+    if check.is_least:
+        return check.limit / check.found if check.found > 0 else 1.0
+    return abs(check.found) / check.limit
+
+
+def _health(health: Mapping[str, tuple[int, str]]) -> Text:
+    lines = list(_health_lines(health))
+    return _lines(lines) if lines else Line('no diagnostics received', 'dim')
+
+
+def _health_lines(health: Mapping[str, tuple[int, str]]) -> Iterator[Text]:
+    for name, (level, message) in sorted(health.items()):
+        words, style = _HEALTH.get(level, _STALE)
+        yield Line(f'{name}: ').append(words, style).append(f' {message}')
