@@ -50,7 +50,7 @@ from starcal_ros.errors import ArchiveError
 from starcal_ros.pipeline.node_options import CalibratorOptions
 import starcal_ros.ros.star_observer
 from starcal_ros.ros.calibrator import Calibrator
-from starcal_ros.ros.kept.state import CalibratorState
+from starcal_ros.ros.state import CalibratorState
 assert not {'mcap', 'rosbags', 'threadpoolctl'} & sys.modules.keys()
 try:
     CalibratorState(int).open(None, CalibratorOptions(state_dir='state'))
