@@ -363,7 +363,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _software() -> str:
-    from starcal_ros.pipeline.provenance import software_version
+    from starcal_ros.pipeline.solve import software_version
 
     return f'starcal {software_version()}'
 

@@ -33,7 +33,7 @@ from starcal_ros.formats.products.product_files import (
     REPORT_FILE,
     write_atomically,
 )
-from starcal_ros.pipeline.provenance import inputs_of
+from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import Calibration, IMAGE_REFUSALS, parts_that_matter, StarObservations
 from starcal_ros.text import significant
 from starcal_ros.untrusted import json_value

@@ -30,7 +30,7 @@ from starcal_ros.formats.messages.message_fields import (
     STATUS_TYPE,
 )
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.node_options import PlayerOptions
+from starcal_ros.pipeline.setup import PlayerOptions
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import end_quietly, Executor, message_class, shut_down, until_told_to_end
 from starcal_ros.ros.parameters import OptionParameters

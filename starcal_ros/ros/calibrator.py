@@ -34,8 +34,7 @@ from starcal_ros.formats.messages.message_codec import record_to_message
 from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.pipeline.setup import CalibratorOptions, load_setup
 from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros.camera_info_client import CameraDriver
 from starcal_ros.ros.inputs import LATCHED

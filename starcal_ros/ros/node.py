@@ -38,8 +38,7 @@ from rclpy.node import Node
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.message_fields import Message
 from starcal_ros.options import unknown_option
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, Setup
 from starcal_ros.processes import return_freed_memory
 from starcal_ros.ros.inputs import Inputs
 from starcal_ros.ros.parameters import OptionParameters, unread_sections

@@ -38,8 +38,7 @@ from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.annotation import annotate
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
-from starcal_ros.pipeline.node_options import ObserverOptions
-from starcal_ros.pipeline.setup import aligned, load_setup
+from starcal_ros.pipeline.setup import aligned, load_setup, ObserverOptions
 from starcal_ros.records import (
     CameraGeometry,
     Image,

@@ -15,8 +15,7 @@ import numpy as np
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.errors import ArchiveError, missing_package, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
-from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import CalibratorOptions, Setup
 from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline import solve as solving
-from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.setup import CalibratorOptions, load_setup, Setup
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
 from starcal_ros.ros.archive import Archive, CHECKSUMS
 from starcal_ros.ros.state import Answer, CalibratorState

@@ -38,8 +38,7 @@ from starcal_ros.formats.products.calibration_json import (
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import load_setup, NODES
+from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, NODES
 from starcal_ros.records import Calibration, Ensemble, Image
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.state import Activation

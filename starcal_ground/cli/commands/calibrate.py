@@ -37,8 +37,8 @@ from starcal_ros.formats.products.product_folder import (
     write_products,
 )
 from starcal_ros.pipeline import campaign
-from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.setup import files_of, read_setup, read_values
+from starcal_ros.pipeline.solve import inputs_of, software_version
 from starcal_ros.pipeline.topics import Topics, without_attitudes
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 

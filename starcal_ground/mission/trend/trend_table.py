@@ -24,7 +24,7 @@ from typing import Any, get_type_hints
 from starcal_ground.mission.trend.rows import Row
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import replacing
-from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.pipeline.solve import software_version
 from starcal_ros.record_fields import json_object, read_record
 from starcal_ros.untrusted import json_value, regular_file
 

@@ -27,7 +27,7 @@ from starcal_ground.cli.arguments import EXIT_INTERRUPTED, parser
 from starcal_ground.cli.commands import demo
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.pipeline.solve import software_version
 from starcal_ros.processes import module_command
 from starcal_ros.records import Image
 
