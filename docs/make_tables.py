@@ -15,14 +15,14 @@ import re
 import sys
 from typing import Any
 
-from starcal_ros.pipeline.node_options import (
+from starcal_ros.pipeline.setup import (
     CalibratorOptions,
     NODE_OPTION_CLASSES,
     NodeOptions,
     ObserverOptions,
+    OPTION_CLASSES,
     PlayerOptions,
 )
-from starcal_ros.pipeline.setup import OPTION_CLASSES
 from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
 from tools.write_parameters import allowed, as_yaml, fields_of
 

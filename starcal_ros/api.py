@@ -28,8 +28,8 @@ from starcal_ros.formats.products.product_folder import calibration_file
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.pipeline.setup import load_setup, read_setup, read_values
+from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import Topics, without_attitudes
 from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
 from starcal_ros.records import Calibration, CameraGeometry, StarObservations

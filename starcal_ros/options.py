@@ -5,7 +5,7 @@ Options: dataclass fields with a description, a unit and a range; reading of par
 Each stage has a frozen options dataclass beside the function that it tunes.  ROS parameters, the
 parameter file and the documentation are generated from the fields made with `option`.  The tool
 reads them from a parameter file (`pipeline.setup.read_setup`); a node declares them as parameters
-(`ros.lifecycle_node.parameters.OptionParameters`) and gives their values to `load_setup`.
+(`ros.parameters.OptionParameters`) and gives their values to `load_setup`.
 """
 
 from __future__ import annotations

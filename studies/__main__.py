@@ -21,7 +21,7 @@ from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.formats.products.product_files import make_folder, write_atomically
-from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.pipeline.solve import software_version
 from studies import monte_carlo, paper, study_figures, summary
 from studies.monte_carlo import Design, Row
 from studies.workers import processors, run_each

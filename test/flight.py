@@ -205,7 +205,7 @@ class Flight:
         return instead if value == none else value
 
     def _send(self) -> None:
-        from starcal_ros.ros.lifecycle_node.message_factory import make_message
+        from starcal_ros.ros.node import make_message
 
         image, samples = self._campaign.frames[self.sent % len(self._campaign.frames)]
         time_ns = _FIRST_NS + self.sent * _STEP_NS

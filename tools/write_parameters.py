@@ -10,8 +10,12 @@ import textwrap
 from typing import Any
 
 from starcal_ros.options import option_fields
-from starcal_ros.pipeline.node_options import CalibratorOptions, NodeOptions, ObserverOptions
-from starcal_ros.pipeline.setup import OPTION_CLASSES
+from starcal_ros.pipeline.setup import (
+    CalibratorOptions,
+    NodeOptions,
+    ObserverOptions,
+    OPTION_CLASSES,
+)
 
 FILE = Path(__file__).parents[1] / 'config' / 'starcal.yaml'
 HEAD = """\

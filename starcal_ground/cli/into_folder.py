@@ -20,7 +20,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files, product_folder
 from starcal_ros.formats.products.product_folder import NotCalibrated
 from starcal_ros.pipeline import campaign
-from starcal_ros.pipeline.provenance import inputs_of, software_version
+from starcal_ros.pipeline.solve import inputs_of, software_version
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 if TYPE_CHECKING:

@@ -45,9 +45,8 @@ from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.provenance import inputs_of
-from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, Setup
+from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.catalog import load_catalog

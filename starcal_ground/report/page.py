@@ -39,7 +39,7 @@ from starcal_ros.formats.products.product_files import (
     write_atomically,
 )
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
-from starcal_ros.pipeline.provenance import inputs_of
+from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import (
     Calibration,
     IMAGE_REFUSALS,

@@ -13,7 +13,7 @@ import rclpy
 from std_srvs.srv import Trigger
 
 from starcal_ros.errors import StarcalError
-from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
+from starcal_ros.ros.node import end_quietly, until_told_to_end
 from starcal_ros.text import printable
 
 NAME = 'calibrate_client'

@@ -26,8 +26,8 @@ from starcal_ros.formats.messages.calibration_messages import (
     status_from_message,
 )
 from starcal_ros.formats.messages.observation_messages import observations_from_message
-from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
+from starcal_ros.ros.inputs import LATCHED
+from starcal_ros.ros.node import end_quietly, until_told_to_end
 
 NAME = 'monitor'
 _PREFIX = 'starcal: '  # of the diagnostics of our nodes

@@ -1,12 +1,21 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""From an ensemble to a calibration: collect, solve with the smallest lens, judge by the gate."""
+"""
+From an ensemble to a calibration: collect, solve with the smallest lens, judge by the gate.
+
+A calibration has its provenance: software, options, catalog, prior and observations.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import functools
+import hashlib
+import importlib.metadata
+import json
 import math
+import os
+from pathlib import Path
 import warnings
 
 import numpy as np
@@ -21,12 +30,11 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.conversion import convert, ros_fit
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import TooFewObservations
+from starcal_ros.errors import errors_as, OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.identification.star_finder import realigned
 from starcal_ros.options import check_value
-from starcal_ros.pipeline.provenance import provenance_of
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import (
@@ -37,6 +45,7 @@ from starcal_ros.records import (
     factored_field,
     StarObservations,
 )
+from starcal_ros.untrusted import regular_file
 
 _FEWEST_STARS = 3  # two fit their mirror image
 _MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
@@ -285,3 +294,70 @@ def estimate_with_smallest_lens(
     if best is None:
         raise TooFewObservations('no lens model describes the prior camera')
     return best
+
+
+def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:
+    """
+    Provenance of a calibration, sufficient to repeat it.
+
+    ``inputs`` maps the name of each input file to its digest.
+    """
+    prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
+    return {
+        'software': f'starcal {software_version()}',
+        'camera_name': setup.camera_name,
+        'catalog': setup.catalog.digest,
+        'options': json.dumps(setup.options(), sort_keys=True),
+        'prior': json.dumps(prior.tolist()),
+        'observations_sha256': _digest(ensemble),
+        **{f'input {name}': value for name, value in inputs.items()},
+    }
+
+
+def inputs_of(
+    files: Iterable[Path], is_stopped: Callable[[], bool] = lambda: False
+) -> dict[str, str]:
+    """
+    SHA-256 of the files that a calibration is made from, by their paths.
+
+    ``is_stopped`` is polled between blocks of 1 MB, so that another thread can stop it early; the
+    digests are then invalid.
+    """
+    digests = {}
+    for path in files:
+        digest = hashlib.sha256()
+        with errors_as(OptionError, path), regular_file(path) as file:
+            while not is_stopped() and (block := file.read(1 << 20)):
+                digest.update(block)
+        # The bytes of a name that is not UTF-8 are written as Python writes them, \\xff.
+        name = os.fsencode(path).decode(errors='backslashreplace')
+        digests[name] = f'sha256:{digest.hexdigest()}'
+    return digests
+
+
+def _digest(ensemble: Ensemble) -> str:
+    """
+    SHA-256 of all input that an estimate reads from its images, in their order.
+
+    For each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
+    column catalog numbers (int64), directions, pixels and covariances, last the temperature if
+    known.  It can be recomputed from recorded observations.
+    """
+    digest = hashlib.sha256()
+    for image in ensemble.images:
+        digest.update(np.array([image.time_ns, len(image)], '<i8').tobytes())
+        digest.update(image.icrf_from_star_tracker_xyzw.astype('<f8').tobytes())
+        digest.update(image.catalog_id.astype('<i8').tobytes())
+        for column in (image.direction_icrf, image.measured_px, image.covariance_px2):
+            digest.update(column.astype('<f8').tobytes())
+        if not math.isnan(image.temperature_degc):
+            digest.update(np.array(image.temperature_degc, '<f8').tobytes())
+    return digest.hexdigest()
+
+
+def software_version() -> str:
+    """Version of the installed package; 'unknown' in a source tree that is not installed."""
+    try:
+        return importlib.metadata.version('starcal_ros')
+    except importlib.metadata.PackageNotFoundError:
+        return 'unknown'

@@ -30,17 +30,11 @@ from starcal_ros.formats.messages.message_fields import (
     STATUS_TYPE,
 )
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.node_options import PlayerOptions
-from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.message_factory import message_class
-from starcal_ros.ros.lifecycle_node.node_process import (
-    end_quietly,
-    Executor,
-    shut_down,
-    until_told_to_end,
-)
-from starcal_ros.ros.lifecycle_node.parameters import OptionParameters
-from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
+from starcal_ros.pipeline.setup import PlayerOptions
+from starcal_ros.ros.inputs import LATCHED
+from starcal_ros.ros.node import end_quietly, Executor, message_class, shut_down, until_told_to_end
+from starcal_ros.ros.parameters import OptionParameters
+from starcal_ros.ros.printable_log import PrintableLog
 
 NAME = 'bag_player'
 # A writer ahead of its readers by more than its history loses messages, reliable or not.  Images

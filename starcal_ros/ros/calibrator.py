@@ -34,15 +34,21 @@ from starcal_ros.formats.messages.message_codec import record_to_message
 from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.pipeline.setup import CalibratorOptions, load_setup
 from starcal_ros.records import IMAGE_REFUSALS
-from starcal_ros.ros.kept.state import Answer, CalibratorState
-from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, StarcalNode, WARN
-from starcal_ros.ros.lifecycle_node.message_factory import make_message, message_class
-from starcal_ros.ros.lifecycle_node.node_process import run
-from starcal_ros.ros.set_camera_info_client import CameraDriver
+from starcal_ros.ros.camera_info_client import CameraDriver
+from starcal_ros.ros.inputs import LATCHED
+from starcal_ros.ros.node import (
+    ERROR,
+    Health,
+    make_message,
+    message_class,
+    OK,
+    run,
+    StarcalNode,
+    WARN,
+)
+from starcal_ros.ros.state import Answer, CalibratorState
 
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)

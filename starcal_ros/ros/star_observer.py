@@ -38,8 +38,7 @@ from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.annotation import annotate
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
-from starcal_ros.pipeline.node_options import ObserverOptions
-from starcal_ros.pipeline.setup import aligned, load_setup
+from starcal_ros.pipeline.setup import aligned, load_setup, ObserverOptions
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -47,12 +46,9 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
-from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting
-from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import Health, OK, StarcalNode, WARN
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
-from starcal_ros.ros.lifecycle_node.node_process import run
-from starcal_ros.ros.unmatched import Unmatched
+from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Unmatched, Waiting
+from starcal_ros.ros.inputs import LATCHED
+from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
 from starcal_ros.sky.attitude import attitude_sample
 
 NAME = 'star_observer'

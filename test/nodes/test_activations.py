@@ -29,8 +29,8 @@ from starcal_ros.formats.messages.calibration_messages import (
 )
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.calibrator import Calibrator
-from starcal_ros.ros.kept.state import Answer
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.node import make_message
+from starcal_ros.ros.state import Answer
 
 pytestmark = pytest.mark.nodes
 

@@ -31,9 +31,9 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.observation_messages import observations_to_message
 from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Ensemble, IMAGE_REFUSALS
-from starcal_ros.ros.kept.archive import Archive
-from starcal_ros.ros.kept.state import Activation
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.archive import Archive
+from starcal_ros.ros.node import make_message
+from starcal_ros.ros.state import Activation
 
 pytestmark = pytest.mark.nodes
 

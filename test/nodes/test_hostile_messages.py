@@ -42,7 +42,7 @@ from starcal_ros.formats.messages.image_messages import image_to_message
 from starcal_ros.formats.messages.observation_messages import observations_to_message
 from starcal_ros.formats.messages.telemetry import attitude_to_message
 from starcal_ros.records import Image as ImageRecord
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.node import make_message
 
 pytestmark = [pytest.mark.nodes, pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -66,7 +66,7 @@ from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.records import refused_image
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 

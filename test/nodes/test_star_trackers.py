@@ -29,7 +29,7 @@ from starcal_ros.formats.messages.calibration_messages import calibration_from_m
 from starcal_ros.formats.messages.image_messages import image_to_message
 from starcal_ros.formats.messages.telemetry import attitude_to_message
 from starcal_ros.records import Image as ImageRecord
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 

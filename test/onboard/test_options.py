@@ -23,8 +23,12 @@ from starcal_ros.options import (
     read_parameter_file,
     section_applies,
 )
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
-from starcal_ros.pipeline.setup import OPTION_CLASSES, read_values
+from starcal_ros.pipeline.setup import (
+    NODE_OPTION_CLASSES,
+    OPTION_CLASSES,
+    PlayerOptions,
+    read_values,
+)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ import yaml
 
 from starcal_ros.formats.products.camera_yaml import read_camera_info, with_camera_url_from
 from starcal_ros.options import check_value, option_fields, read_parameter_file
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
+from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, OPTION_CLASSES
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'

@@ -25,8 +25,12 @@ from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import parser
 from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.options import names_of, read_parameter_file
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
-from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
+from starcal_ros.pipeline.setup import (
+    load_setup,
+    NODE_OPTION_CLASSES,
+    OPTION_CLASSES,
+    PlayerOptions,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])

@@ -38,11 +38,10 @@ from starcal_ros.formats.products.calibration_json import (
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import load_setup, NODES
+from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, NODES
 from starcal_ros.records import Calibration, Ensemble, Image
-from starcal_ros.ros.kept.archive import Archive
-from starcal_ros.ros.kept.state import Activation
+from starcal_ros.ros.archive import Archive
+from starcal_ros.ros.state import Activation
 
 SCENARIO = scenario('tiny')
 BAG = Path(__file__).parents[2] / 'bags' / 'tiny'
@@ -184,7 +183,7 @@ def test_observations() -> None:
         checked_observations,
         observations_to_message,
     )
-    from starcal_ros.ros.lifecycle_node.message_factory import make_message
+    from starcal_ros.ros.node import make_message
 
     images = true_observations(SCENARIO).images
     brightest = images[0].select(np.argsort(np.argsort(-images[0].flux_dn)) < 20)

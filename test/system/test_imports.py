@@ -21,7 +21,7 @@ MODULES = {
 }
 WITHOUT_ROS = [
     name for name in MODULES
-    if '.ros.' not in name or '.ros.kept' in name or '.ros.image_queue' in name
+    if '.ros.' not in name or name.endswith(('.ros.archive', '.ros.image_queue', '.ros.state'))
 ]  # fmt: skip
 BLOCKS = ('body', 'orelse', 'handlers', 'finalbody')  # of an if, a try, a class
 

@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 
 from starcal_ros.options import names_of
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
-from starcal_ros.pipeline.setup import OPTION_CLASSES
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, PlayerOptions
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))

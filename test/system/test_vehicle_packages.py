@@ -47,10 +47,10 @@ def test_the_nodes_run_and_what_needs_more_costs_one_line(vehicle: dict[str, str
     source = """
 import sys
 from starcal_ros.errors import ArchiveError
-from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import CalibratorOptions
 import starcal_ros.ros.star_observer
 from starcal_ros.ros.calibrator import Calibrator
-from starcal_ros.ros.kept.state import CalibratorState
+from starcal_ros.ros.state import CalibratorState
 assert not {'mcap', 'rosbags', 'threadpoolctl'} & sys.modules.keys()
 try:
     CalibratorState(int).open(None, CalibratorOptions(state_dir='state'))

@@ -48,8 +48,8 @@ from starcal_ros.formats.products import calibration_json, product_files
 from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
 from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
+from starcal_ros.pipeline.solve import software_version
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Calibration, StarObservations

@@ -28,7 +28,7 @@ from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import COMMANDS, parser
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.pipeline.solve import software_version
 from starcal_ros.processes import module_command
 from starcal_ros.records import Image
 

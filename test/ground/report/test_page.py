@@ -31,8 +31,8 @@ from starcal_ros.formats.products.calibration_json import (
 )
 from starcal_ros.formats.products.product_files import REPORT_FILE
 from starcal_ros.records import Ensemble
-from starcal_ros.ros.kept.archive import Archive
-from starcal_ros.ros.kept.state import Activation
+from starcal_ros.ros.archive import Archive
+from starcal_ros.ros.state import Activation
 from starcal_ros.text import significant
 
 FIGURES = (

@@ -11,8 +11,7 @@ import pytest
 import starcal_ros
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.options import names_of
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import OPTION_CLASSES
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 from starcal_ros.records import IMAGE_REFUSALS
 
 OPTIONS = names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)

@@ -19,7 +19,7 @@ from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image
-from starcal_ros.ros.unmatched import Unmatched
+from starcal_ros.ros.image_queue import Unmatched
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 

@@ -121,7 +121,7 @@ def test_every_transition_in_every_state(
 SIGNALLED = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
+from starcal_ros.ros.node import end_quietly, until_told_to_end
 
 def work():
     if 'told' in sys.argv:
@@ -148,7 +148,7 @@ def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said:
 SIGNALLED_AGAIN = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
+from starcal_ros.ros.node import end_quietly, until_told_to_end
 
 def tell():
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
@@ -179,7 +179,7 @@ def test_signals_do_not_cut_the_end_short() -> None:
 SIGNALLED_AT_AN_ENTRY = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
+from starcal_ros.ros.node import end_quietly, until_told_to_end
 
 class Lock:
     def __enter__(self):
@@ -214,7 +214,7 @@ EXECUTOR_OF_A_NODE = """
 import os, signal, sys
 import rclpy
 from starcal_ros.ros import bag_player, calibrator
-from starcal_ros.ros.lifecycle_node import node_process
+from starcal_ros.ros import node as node_module
 
 def told_of(module, name):
     kind = getattr(module, name)
@@ -228,9 +228,9 @@ def end():
     shut_down()
     print('signals answered no more')
 rclpy.try_shutdown = end
-told_of(node_process, 'Executor')
+told_of(node_module, 'Executor')
 told_of(bag_player, 'Executor')
-node_process._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
+node_module._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
 bag_player.BagPlayer.play = lambda player: os.kill(os.getpid(), signal.SIGTERM) or 0
 node = {'calibrator': calibrator, 'bag_player': bag_player}[sys.argv.pop(1)]
 node.main(sys.argv[1:])
@@ -250,7 +250,7 @@ def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_ba
 
 EXECUTOR_AFTER_THE_SHUTDOWN = """
 import rclpy
-from starcal_ros.ros.lifecycle_node.node_process import Executor
+from starcal_ros.ros.node import Executor
 
 rclpy.init()
 rclpy.shutdown()
@@ -325,7 +325,7 @@ import os
 import signal
 
 import rclpy
-from starcal_ros.ros.lifecycle_node.node_process import shut_down
+from starcal_ros.ros.node import shut_down
 
 signal.signal(signal.SIGTERM, lambda *_: None)
 for _ in range(10_000):
@@ -350,7 +350,7 @@ import threading
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from starcal_ros.ros.calibrator import Calibrator
-from starcal_ros.ros.lifecycle_node.node_process import run
+from starcal_ros.ros.node import run
 
 class Slow(Calibrator):
     destroyed = threading.Event()

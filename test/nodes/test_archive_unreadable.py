@@ -16,7 +16,7 @@ import pytest
 
 from starcal_ros.errors import ArchiveError
 from starcal_ros.records import Ensemble
-from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.archive import Archive
 
 NOBODY = 65534
 IMAGE, REFUSED = 'ensemble/00000001.mcap', 'ensemble/refused.json'
@@ -129,6 +129,6 @@ def test_only_what_was_read_and_is_wrong_is_set_aside(
 
 
 if __name__ == '__main__':
-    test = Path(__file__).parents[2]
+    test = Path(__file__).parents[1]
     sys.path[:0] = [str(test.parent), str(test)]
     main(Path(sys.argv[1]))

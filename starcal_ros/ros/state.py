@@ -15,13 +15,11 @@ import numpy as np
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.errors import ArchiveError, missing_package, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
-from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import CalibratorOptions, Setup
 from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
-from starcal_ros.ros.kept.seal import read_seal
 
 if TYPE_CHECKING:
-    from starcal_ros.ros.kept.archive import Archive
+    from starcal_ros.ros.archive import Archive
 
 _HISTORY = 20  # activations kept for roll-back, under 1 MB each
 
@@ -99,7 +97,7 @@ class CalibratorState:
                 self._choose_active()
             return
         try:
-            from starcal_ros.ros.kept.archive import Archive
+            from starcal_ros.ros.archive import Archive, read_seal
         except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
             raise ArchiveError(
                 f'state_dir: {missing_package(error, "")}, or leave state_dir empty: then a'

@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import EnsembleStatus, StarObservations
 from starcal_ros.formats.messages.observation_messages import observations_to_message
-from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 

@@ -16,7 +16,7 @@ pytest.importorskip('starcal.msg')
 
 from rcl_interfaces.srv import GetParameters
 
-from starcal_ros.ros.lifecycle_node.parameters import unread_sections
+from starcal_ros.ros.parameters import unread_sections
 
 pytestmark = pytest.mark.nodes
 
@@ -42,7 +42,7 @@ def test_a_section_in_a_namespace(
 def test_a_node_starts_with_the_minimal_file(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    params = Path(__file__).parents[3] / 'config' / 'minimal.yaml'
+    params = Path(__file__).parents[2] / 'config' / 'minimal.yaml'
     camera = f'camera_info_url:=file://{tiny_bag / "camera.yaml"}'
     node = start_node('calibrator', ros=('--params-file', str(params), '-p', camera))
     client.until(lambda: 'active, listening to' in node.said())

@@ -11,7 +11,7 @@ from typing import Any
 from rclpy.callback_groups import ReentrantCallbackGroup
 from sensor_msgs.srv import SetCameraInfo
 
-from starcal_ros.ros.lifecycle_node.lifecycle import StarcalNode
+from starcal_ros.ros.node import StarcalNode
 
 _TIMEOUT_S = 5.0  # of the service, and of its answer: a driver may write to flash memory
 _LOOK_S = 0.5  # period of checks for the service and the timeout

@@ -30,7 +30,7 @@ from starcal_ros.formats.messages.observation_messages import (
     observations_to_message,
 )
 from starcal_ros.records import Image
-from starcal_ros.ros.lifecycle_node.message_factory import make_message, message_class
+from starcal_ros.ros.node import make_message, message_class
 
 pytestmark = pytest.mark.nodes
 

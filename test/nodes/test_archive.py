@@ -22,11 +22,10 @@ from sample_records import assert_same, calibration_of_0_1, observations  # type
 from starcal_ros.errors import ArchiveError
 from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.records import Ensemble
-from starcal_ros.ros.kept.archive import Archive, TOPIC
-from starcal_ros.ros.kept.seal import Seal
-from starcal_ros.ros.kept.state import Activation
+from starcal_ros.ros.archive import Archive, Seal, TOPIC
+from starcal_ros.ros.state import Activation
 
-WRITTEN_BY_0_1 = Path(__file__).resolve().parents[2] / 'data' / 'written_by_0_1'
+WRITTEN_BY_0_1 = Path(__file__).resolve().parents[1] / 'data' / 'written_by_0_1'
 
 
 def numbers(history: tuple[Activation, ...]) -> list[tuple[int, int]]:
@@ -131,7 +130,7 @@ def test_killed_at_any_instant(tmp_path: Path) -> None:
     """What was told of as kept is there after each of ten kills, and nothing is damaged."""
     processes = multiprocessing.get_context('forkserver')
     processes.set_forkserver_preload(
-        ['starcal_ros.ros.kept.archive', 'starcal_ground.simulation.scenario']
+        ['starcal_ros.ros.archive', 'starcal_ground.simulation.scenario']
     )
     random = np.random.default_rng(5)
     for _ in range(10):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from starcal_ros.errors import OptionError
-from starcal_ros.ros.kept.seal import CHECKSUMS, read_seal, Seal
+from starcal_ros.ros.archive import CHECKSUMS, read_seal, Seal
 
 KEYED = Seal(b'sixteen bytes...')
 CONTENT = {'number': 3, 'list': [0.1, None, 'µ'], 'schema': 1}

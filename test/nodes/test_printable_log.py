@@ -14,8 +14,8 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from starcal_ros.ros.bag_player import BagPlayer
-from starcal_ros.ros.lifecycle_node.lifecycle import StarcalNode
-from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
+from starcal_ros.ros.node import StarcalNode
+from starcal_ros.ros.printable_log import PrintableLog
 
 pytestmark = pytest.mark.nodes
 

@@ -19,8 +19,8 @@ from starcal_ros.formats.messages.observation_messages import (
 )
 from starcal_ros.options import names_of
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.provenance import inputs_of, provenance_of
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup
+from starcal_ros.pipeline.solve import inputs_of, provenance_of
 from starcal_ros.records import Ensemble, StarObservations
 
 

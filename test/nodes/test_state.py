@@ -18,12 +18,10 @@ from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline import solve as solving
-from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.setup import CalibratorOptions, load_setup, Setup
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
-from starcal_ros.ros.kept.archive import Archive
-from starcal_ros.ros.kept.seal import CHECKSUMS
-from starcal_ros.ros.kept.state import Answer, CalibratorState
+from starcal_ros.ros.archive import Archive, CHECKSUMS
+from starcal_ros.ros.state import Answer, CalibratorState
 
 SCENARIO = scenario('tiny', seed=7)
 
@@ -119,7 +117,7 @@ def test_history_is_bounded(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr('starcal_ros.ros.kept.state._HISTORY', 2)
+    monkeypatch.setattr('starcal_ros.ros.state._HISTORY', 2)
     state = started(setup, tmp_path)
     for image in shown:
         state.add(image)

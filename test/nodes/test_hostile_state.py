@@ -29,11 +29,10 @@ import pytest
 
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.errors import StarcalError
-from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import CalibratorOptions
 from starcal_ros.records import Ensemble
-from starcal_ros.ros.kept.archive import Archive
-from starcal_ros.ros.kept.seal import CHECKSUMS, Seal
-from starcal_ros.ros.kept.state import Activation, CalibratorState
+from starcal_ros.ros.archive import Archive, CHECKSUMS, Seal
+from starcal_ros.ros.state import Activation, CalibratorState
 
 pytestmark = pytest.mark.slow
 
