@@ -14,7 +14,7 @@ import numpy as np
 from bench.table import Table
 from starcal_ground.mission.export.c_camera import c_files, c_table
 from starcal_ros.camera.detector_field import term_count
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, ResidualField
 
 _PROGRAM = r"""

@@ -130,7 +130,7 @@ def _inspect(args: argparse.Namespace) -> int:
     from starcal_ground.cli import output
     from starcal_ground.planning import inspect
     from starcal_ros.formats.bag import reader
-    from starcal_ros.formats.messages.message_fields import (
+    from starcal_ros.formats.messages.message_codec import (
         COMPRESSED_TYPE,
         IMAGE_TYPE,
         OBSERVATIONS_TYPE,
@@ -178,7 +178,7 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ground import comparison
     from starcal_ground.cli import output
     from starcal_ground.cli.commands.demo import is_truth
-    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_files import read_calibration
     from starcal_ros.formats.products.product_folder import calibration_file
 
     files = [calibration_file(path) for path in (args.a, args.b)]
@@ -202,7 +202,7 @@ def _compare(args: argparse.Namespace) -> int:
 def _compare_with_truth(args: argparse.Namespace) -> int:
     """Compare a calibration with the truth of a simulated bag."""
     from starcal_ground.cli.commands import demo
-    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_files import read_calibration
     from starcal_ros.formats.products.product_folder import calibration_file
 
     if args.output:
@@ -221,7 +221,7 @@ def _lookup(args: argparse.Namespace) -> int:
     from starcal_ground.mission.export.lookup_table import write_lookup_table
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
-    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_files import read_calibration
     from starcal_ros.formats.products.product_folder import calibration_file
 
     file = calibration_file(args.calibration)

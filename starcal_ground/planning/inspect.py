@@ -15,10 +15,9 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_ahead
-from starcal_ros.formats.bag.mcap_reader import Damage
-from starcal_ros.formats.messages import message_fields
-from starcal_ros.formats.messages.image_messages import decode_png
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.bag.reader import Damage
+from starcal_ros.formats.messages import message_codec
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
     COMPRESSED_TYPE,
     IMAGE_TYPE,
@@ -27,7 +26,7 @@ from starcal_ros.formats.messages.message_fields import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message, decode_png
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis import bags
 from starcal_ros.pipeline.diagnosis.bags import placed, refusals, Refused
@@ -188,7 +187,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
             except BagError:
                 bad[raw.topic] += 1
             else:
-                stamp_ns = message_fields.stamp_ns(message.header.stamp)
+                stamp_ns = message_codec.stamp_ns(message.header.stamp)
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
                 elif raw.type_name == ATTITUDE_TYPE:

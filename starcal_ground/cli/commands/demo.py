@@ -28,9 +28,13 @@ from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.files import mark
-from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.formats.products.product_files import (
+    prior_of,
+    read_calibration,
+    read_text,
+    write_atomically,
+)
 from starcal_ros.processes import module_command
 from starcal_ros.records import Calibration, CameraGeometry
 from starcal_ros.text import significant, to_sigma

@@ -23,7 +23,7 @@ from starcal_ground.images.photographs import image_paths, Photograph
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.message_fields import ATTITUDE_TYPES, VELOCITY_TYPE
+from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPES, VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.formats.products.product_files import check_outputs, make_folder, write_atomically
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags

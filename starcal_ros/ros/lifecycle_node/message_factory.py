@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ros.formats.messages.message_fields import Message
+from starcal_ros.formats.messages.message_codec import Message
 
 _CODES = {
     np.dtype(np.int8): 'b',

@@ -24,7 +24,7 @@ from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
 from starcal_ros.camera.detector_field import term_count
 from starcal_ros.estimation.temperature import camera_at
-from starcal_ros.formats.products.calibration_json import write_calibration
+from starcal_ros.formats.products.product_files import write_calibration
 from starcal_ros.records import Calibration, factored_field, ResidualField, SigmaPart
 
 pytestmark = pytest.mark.slow  # compilers run

@@ -11,7 +11,7 @@ import pytest
 from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.observation_messages import (
+from starcal_ros.formats.messages.record_messages import (
     checked_observations,
     observations_from_message,
     observations_to_message,

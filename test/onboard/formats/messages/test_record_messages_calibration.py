@@ -24,14 +24,13 @@ from starcal_ros.camera import line_of_sight, project
 from starcal_ros.estimation import levenberg_marquardt
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE, NOT_KNOWN
+from starcal_ros.formats.messages.record_messages import (
     alignment_to_message,
     calibration_from_message,
     calibration_to_message,
     camera_info_to_message,
 )
-from starcal_ros.formats.messages.message_codec import NOT_KNOWN
-from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
 from starcal_ros.records import GateCheck, TemperatureTerms
 
 ROOT = Path(__file__).resolve().parents[4]

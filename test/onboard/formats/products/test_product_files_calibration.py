@@ -25,9 +25,9 @@ from sample_records import (  # type: ignore[import-not-found]
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.messages.calibration_messages import calibration_to_message
-from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
-from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE
+from starcal_ros.formats.messages.record_messages import calibration_to_message
+from starcal_ros.formats.products.product_files import read_calibration, write_calibration
 from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms
 
 WRITTEN_BY_0_1 = Path(__file__).resolve().parents[3] / 'data' / 'written_by_0_1'
