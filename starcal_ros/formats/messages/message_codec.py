@@ -196,7 +196,7 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
     """
     Plain values of the message of a record by the names of its fields; arrays have their shapes.
 
-    Fields that a message of an older version lacks are omitted.
+    Fields that the message does not have are omitted.
 
     Raises ValueError with the name of an array whose size contradicts other fields.
     """

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 from typing import Annotated
 
 import numpy as np
@@ -18,7 +17,6 @@ from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
-    flat_array,
     Make,
     make_header,
     Message,
@@ -51,34 +49,18 @@ _NOT_SENT = 'model_checks'
 def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
     """Return a starcal/StarObservations; ``frame_id`` is the camera's."""
     values = plain_record(record)
-    # The message has kept the two arrays of version 0.1 for this mapping.
-    refused = values.pop('refused_stars')
-    return make(
-        OBSERVATIONS_TYPE,
-        **message_fields(StarObservations, values, make, frame_id),
-        refused_star_reasons=list(refused),
-        refused_star_counts=flat_array(list(refused.values()), np.uint32),
-    )
+    return make(OBSERVATIONS_TYPE, **message_fields(StarObservations, values, make, frame_id))
 
 
 def observations_from_message(message: Message) -> StarObservations:
     """
     Observations of a starcal/StarObservations.
 
-    Recordings of version 0.1 are read: an attitude gap of -1 is NaN, and missing fields have their
-    defaults.
-
     Raises ValueError when the arrays of the message do not fit each other or hold values that no
     star can have.
     """
     values = plain_message(StarObservations, message)
-    reasons, counts = message.refused_star_reasons, message.refused_star_counts
-    if len(reasons) != len(counts):
-        raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
-    values['refused_stars'] = dict(zip(reasons, counts, strict=True))
     values['detail'] = values['detail'][:_LONGEST_DETAIL]
-    if values['attitude_gap_s'] < 0:
-        values['attitude_gap_s'] = math.nan
     record = read_record(StarObservations, values)
     _check_stars(record)
     return record

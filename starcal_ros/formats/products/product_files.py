@@ -131,7 +131,7 @@ class _Published:
     alignment: _Alignment
     parameter_names: tuple[str, ...]
     image: _ImageSize
-    model: str = 'plumb_bob'  # files of version 0.1 do not name it
+    model: str
 
     def geometry(self) -> CameraGeometry:
         """Camera and alignment; raises ValueError for parameters of another camera model."""
