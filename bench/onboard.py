@@ -13,9 +13,9 @@ import numpy as np
 
 from bench.table import Table
 from starcal_ground.mission.export.c_camera import c_files, c_table
-from starcal_ros.camera.detector_field import term_count
-from starcal_ros.formats.products.calibration_json import read_calibration
-from starcal_ros.records import Calibration, ResidualField
+import starcal_ros
+from starcal_ros.camera.detector_field import DetectorField, term_count
+from starcal_ros.records import Calibration, factored_field, MapCovariance
 
 _PROGRAM = r"""
 #include "starcal_camera.h"
@@ -39,24 +39,28 @@ int main(void)
   return 0;
 }
 """
-_CALIBRATION = Path(__file__).parents[1] / 'test/data/written_by_0_1/calibration.json'
+_TINY = Path(__file__).parents[1] / 'bags/tiny'
 _OCTAVES = 4
 
 
 def run(quick: bool) -> Iterator[Table]:
     """Compile the C of a calibration without and with a field, and time its functions."""
-    plain = read_calibration(_CALIBRATION)
+    made = starcal_ros.calibrate_bag(_TINY, _TINY / 'params.yaml')
+    camera = dataclasses.replace(made.geometry.camera, field=None)
+    geometry = dataclasses.replace(made.geometry, camera=camera)
+    plain = dataclasses.replace(made, geometry=geometry, field=None)
     yield _timed(plain, 'no field')
     yield _timed(_with_field(plain), f'{_OCTAVES} octaves')
 
 
 def _with_field(plain: Calibration) -> Calibration:
     camera = plain.geometry.camera
-    count = term_count(camera.width, camera.height, _OCTAVES, 'cosine')
+    size = camera.width, camera.height
+    count = term_count(*size, _OCTAVES)
     joint = 1e-8 * np.eye(len(plain.covariance) + 2 * count)
     joint[: len(plain.covariance), : len(plain.covariance)] = plain.covariance
-    field = ResidualField(_OCTAVES, np.full((2, count), 1e-3), joint, family='cosine')
-    return dataclasses.replace(plain, field=field)
+    field = DetectorField(*size, _OCTAVES, np.full((2, count), 1e-3))
+    return dataclasses.replace(plain, field=factored_field(field, MapCovariance(joint)))
 
 
 def _timed(calibration: Calibration, title: str) -> Table:

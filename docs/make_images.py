@@ -35,8 +35,8 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats, Picture
 from starcal_ros.assessment.observability import coverage
-from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.camera_yaml import write_camera_info
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe as observing
 from starcal_ros.pipeline import solve

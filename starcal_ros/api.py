@@ -23,7 +23,7 @@ from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products import calibration_json
+from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_folder import calibration_file
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
@@ -236,7 +236,7 @@ def read_calibration(path: Path | str) -> Calibration:
     ProductError
         Naming the file and the key that is missing or wrong.
     """
-    return calibration_json.read_calibration(calibration_file(Path(path)))
+    return product_files.read_calibration(calibration_file(Path(path)))
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
@@ -249,8 +249,8 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
         When the file cannot be written.
     """
     path = Path(path)
-    file = path / calibration_json.CALIBRATION_FILE if path.is_dir() else path
-    calibration_json.write_calibration(calibration, file)
+    file = path / product_files.CALIBRATION_FILE if path.is_dir() else path
+    product_files.write_calibration(calibration, file)
 
 
 def lines_of_sight(

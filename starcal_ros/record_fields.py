@@ -90,13 +90,12 @@ class Most:
 @dataclass(frozen=True)
 class Named:
     """
-    Names of a field that differ from its own: in messages, and in files of version 0.1.
+    Name of a field in messages, where it differs from its own.
 
-    In messages, the name of a time has no ``_ns``, and ``time_ns`` is that of the header.
+    The name of a time has no ``_ns`` there, and ``time_ns`` is that of the header.
     """
 
-    in_messages: str = ''
-    formerly: str = ''
+    in_messages: str
 
 
 Count = Annotated[int, Within(0)]
@@ -112,9 +111,8 @@ class FieldType:
 
     ``kind`` is bool, int, float or str, a record, or tuple, dict or numpy.ndarray; ``item`` is the
     type of the items of a tuple or of a mapping from str, ``dtype`` that of an array.
-    ``optional`` allows None, ``are_different`` forbids an item twice, ``in_messages`` and
-    ``formerly`` are other names of the field.  The other attributes are those of the marks;
-    without a `Shape` there is one dimension of any length.
+    ``optional`` allows None, ``are_different`` forbids an item twice.  The other attributes are
+    those of the marks; without a `Shape` there is one dimension of any length.
     """
 
     kind: type[Any]
@@ -124,7 +122,6 @@ class FieldType:
     item: FieldType | None = None
     dtype: np.dtype[Any] | None = None
     in_messages: str = ''
-    formerly: str = ''
     dimensions: tuple[int | str, ...] = ('',)
     low: float | None = None
     high: float | None = None
@@ -157,7 +154,6 @@ def fields_of(record_type: Any) -> dict[str, FieldType]:
             kind,
             has_default=field.default is not missing or field.default_factory is not missing,
             in_messages=kind.in_messages or {'time_ns': 'header.stamp'}.get(field.name, name),
-            formerly=kind.formerly or field.name,
         )
     return found
 
@@ -244,7 +240,7 @@ def read_record(record_type: type[T], content: object, path: str = '') -> T:
     sizes: dict[str, int] = {}
     of_type: Any = record_type
     for name, kind in fields_of(of_type).items():
-        names = (name, kind.in_messages, kind.formerly)
+        names = (name, kind.in_messages)
         key = next((key for key in names if key in content), None)
         if key is not None:
             values[name] = read_value(kind, content[key], _inside(path, key), sizes)

@@ -9,8 +9,14 @@ import numpy as np
 from sample_records import without_field  # type: ignore[import-not-found]
 
 from starcal_ros.camera import CameraModel
-from starcal_ros.camera.detector_field import degrees
-from starcal_ros.records import Calibration, CameraGeometry, ResidualField, TemperatureTerms
+from starcal_ros.camera.detector_field import DetectorField, term_count
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    factored_field,
+    MapCovariance,
+    TemperatureTerms,
+)
 
 _COEFFICIENTS = {
     'plumb_bob': [-0.051, 0.117, 0.01, 5.1e-4, 3.2e-4],
@@ -48,10 +54,10 @@ def calibration(
     )
     if not with_field:
         return made
-    t = len(degrees(4))
-    coefficients_px = np.random.default_rng(5).normal(0, 0.03, (2, t))
-    field = ResidualField(4, coefficients_px, np.eye(p + 2 * t) * 1e-8)
-    return dataclasses.replace(made, field=field)
+    t = term_count(1296, 1024, 2)
+    field = DetectorField(1296, 1024, 2, np.random.default_rng(5).normal(0, 0.03, (2, t)))
+    covariance = MapCovariance(np.eye(p + 2 * t) * 1e-8)
+    return dataclasses.replace(made, field=factored_field(field, covariance))
 
 
 def unit(xyzw: list[float]) -> np.ndarray:

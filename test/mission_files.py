@@ -15,7 +15,10 @@ import numpy as np
 import spiceypy
 
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.telemetry import attitude_from_message, velocity_from_message
+from starcal_ros.formats.messages.sensor_messages import (
+    attitude_from_message,
+    velocity_from_message,
+)
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[1] / 'bags/tiny'

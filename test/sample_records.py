@@ -120,11 +120,11 @@ def calibration() -> Calibration:
         model_checks=model_checks(),
         field=ResidualField(
             1,
-            np.array([[0.011, -0.007, 0.003], [0.005, 0.0025, -0.0125]]),
+            np.array([[11, -7, 3, 2, -1], [5, 2.5, -12.5, 1, 4]]) / 1000,
             unresolved_px=0.0625,
-            covariance_factor=np.arange(38.0).reshape(19, 2) / 11,
-            remainder_unit_px=np.asarray(np.arange(1.0, 7.0) / 7e4, np.float64),
-            remainder=np.arange(-10, 11, dtype=np.int16),
+            covariance_factor=np.arange(46.0).reshape(23, 2) / 11,
+            remainder_unit_px=np.asarray(np.arange(1.0, 11.0) / 7e4, np.float64),
+            remainder=np.arange(-10, 45, dtype=np.int16),
         ),
         sigma_budget=(
             SigmaPart('total', 0.7, 12.5, ''),
@@ -162,33 +162,12 @@ def model_checks() -> ModelChecks:
     )
 
 
-def with_joint_covariance() -> Calibration:
-    """The calibration as files and messages before the factor held it."""
-    joint = np.arange(361.0).reshape(19, 19) / 11
-    coefficients_px = np.array([[0.011, -0.007, 0.003], [0.005, 0.0025, -0.0125]])
-    bare = without_field()
-    camera = dataclasses.replace(
-        bare.geometry.camera, field=ResidualField(1, coefficients_px).on(1296, 1024)
-    )
-    geometry = dataclasses.replace(bare.geometry, camera=camera)
-    return dataclasses.replace(
-        bare, geometry=geometry, field=ResidualField(1, coefficients_px, joint), sigma_budget=()
-    )
-
-
 def without_field() -> Calibration:
     """The calibration of a camera that has a lens model alone."""
     found = calibration()
     camera = dataclasses.replace(found.geometry.camera, field=None)
     geometry = dataclasses.replace(found.geometry, camera=camera)
     return dataclasses.replace(found, geometry=geometry, field=None)
-
-
-def calibration_of_0_1() -> Calibration:
-    """What a file of version 0.1 holds of it: no field, no checks of the model, one alignment."""
-    return dataclasses.replace(
-        without_field(), model_checks=None, star_trackers=(), sigma_budget=()
-    )
 
 
 def plain_calibration() -> Calibration:

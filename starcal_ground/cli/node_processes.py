@@ -77,8 +77,7 @@ def calibrate_with_nodes(
     """
     import yaml
 
-    from starcal_ros.formats.products.calibration_json import read_calibration
-    from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ros.formats.products.product_files import read_calibration, write_atomically
 
     params, *_ = outputs(folder)
     content = {'/**': {'ros__parameters': dict(parameters)}}

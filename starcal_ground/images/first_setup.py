@@ -18,7 +18,7 @@ from starcal_ground.images.photographs import Photograph
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.message_fields import ATTITUDE_TYPES, VELOCITY_TYPE
+from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPES, VELOCITY_TYPE
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.setup import load_setup

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from starcal_ground.images.time_systems import middle_of_exposure, number, TimeError
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import IngestError
-from starcal_ros.formats.images.image_files import Card, read_image
+from starcal_ros.formats.image_files import Card, read_image
 
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
 _FULL = 65000  # of 16 bit; the end of the range means saturation

@@ -42,7 +42,7 @@ from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
+from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, Setup

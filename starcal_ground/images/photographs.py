@@ -25,13 +25,7 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
-from starcal_ros.formats.images.image_files import (
-    Card,
-    content_of,
-    decoded,
-    MOST_VALUES,
-    read_fits,
-)
+from starcal_ros.formats.image_files import Card, content_of, decoded, MOST_VALUES, read_fits
 
 # Of files whose content says nothing, as of damaged ones.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts')

@@ -19,7 +19,7 @@ import erfa
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.images.image_files import Card
+from starcal_ros.formats.image_files import Card
 
 _DAY_S = 86400
 _UNIX_DAY = date(1970, 1, 1).toordinal()

@@ -207,7 +207,7 @@ def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
     turns = np.linalg.qr((by_rotation / sigma).reshape(n, 3))[0]
     # Aberration: d e = (v - e (e . v)) / c; the part along e moves no pixel.
     by_velocity = by_direction / SPEED_OF_LIGHT_M_S
-    waves = basis(xy, camera.width, camera.height, _OCTAVES, 'cosine') * _FIELD_PX
+    waves = basis(xy, camera.width, camera.height, _OCTAVES) * _FIELD_PX
     waves = waves / math.sqrt(waves.shape[1])
     by_field = np.einsum('ab,nt->nabt', np.eye(2), waves).reshape(len(e), 2, -1) / sigma
     by_common = np.concatenate([by_camera / sigma, by_velocity, by_field], axis=2).reshape(n, -1)

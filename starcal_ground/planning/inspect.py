@@ -15,10 +15,9 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_ahead
-from starcal_ros.formats.bag.mcap_reader import Damage
-from starcal_ros.formats.messages import message_fields
-from starcal_ros.formats.messages.image_messages import decode_png
-from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.bag.reader import Damage
+from starcal_ros.formats.messages import message_codec
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message, decode_png
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis import bags
 from starcal_ros.pipeline.diagnosis.bags import placed, refusals, Refused
@@ -27,13 +26,13 @@ from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
-_IMAGES = (message_fields.IMAGE_TYPE, message_fields.COMPRESSED_TYPE)
+_IMAGES = (message_codec.IMAGE_TYPE, message_codec.COMPRESSED_TYPE)
 _STAMPED = (
     *_IMAGES,
-    message_fields.ATTITUDE_TYPE,
-    message_fields.VELOCITY_TYPE,
-    message_fields.TEMPERATURE_TYPE,
-    message_fields.OBSERVATIONS_TYPE,
+    message_codec.ATTITUDE_TYPE,
+    message_codec.VELOCITY_TYPE,
+    message_codec.TEMPERATURE_TYPE,
+    message_codec.OBSERVATIONS_TYPE,
 )
 
 
@@ -179,10 +178,10 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
             except BagError:
                 bad[raw.topic] += 1
             else:
-                stamp_ns = message_fields.stamp_ns(message.header.stamp)
+                stamp_ns = message_codec.stamp_ns(message.header.stamp)
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
-                elif raw.type_name == message_fields.ATTITUDE_TYPE:
+                elif raw.type_name == message_codec.ATTITUDE_TYPE:
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
@@ -207,7 +206,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
     return tuple(found)
 
 
-def _kind(message: message_fields.Message) -> str:
+def _kind(message: message_codec.Message) -> str:
     """Encoding and size of an image message as text."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'

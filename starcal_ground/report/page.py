@@ -30,8 +30,8 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
-from starcal_ros.formats.products import calibration_json, product_folder
+from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
+from starcal_ros.formats.products import product_files, product_folder
 from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE
 from starcal_ros.formats.products.product_files import (
     OBSERVATIONS_FILE,
@@ -232,7 +232,7 @@ def used_images(
 
 _DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are written
 _PRODUCTS = (
-    calibration_json.CALIBRATION_FILE,
+    product_files.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
     product_folder.RESIDUALS_FILE,
     OBSERVATIONS_FILE,
@@ -275,7 +275,7 @@ def write_report(folder: Path) -> Path:
 def _read_folder(folder: Path) -> Found:
     residuals = folder / product_folder.RESIDUALS_FILE
     observations, ensemble = folder / OBSERVATIONS_FILE, folder / product_folder.STATE_ENSEMBLE
-    calibration = calibration_json.read_calibration(product_folder.calibration_file(folder))
+    calibration = product_files.read_calibration(product_folder.calibration_file(folder))
     recorded = None
     if observations.is_file():
         recorded = tuple(_observations(observations))
@@ -321,7 +321,7 @@ def render(found: Found, folder: Path) -> str:
 def _context(found: Found) -> Mapping[str, object]:
     calibration, residuals, pictures = found.calibration, found.residuals, found.pictures
     observations = found.observations or ()
-    prior = calibration_json.prior_of(calibration)
+    prior = product_files.prior_of(calibration)
     refused = calibration.images_refused
     return {
         'calibration': calibration,
@@ -397,7 +397,7 @@ def charts_of(
     calibration: Calibration, residuals: Residuals | None, observations: Sequence[StarObservations]
 ) -> Mapping[str, Chart]:
     """Charts by their name in the template; charts without data are left out."""
-    geometry, prior = calibration.geometry, calibration_json.prior_of(calibration)
+    geometry, prior = calibration.geometry, product_files.prior_of(calibration)
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, Chart | None] = {
         'vectors': figures.distortion_vectors(camera),

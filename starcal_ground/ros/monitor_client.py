@@ -21,11 +21,11 @@ from rich.live import Live
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.cli.monitor_view import Seen, view
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
+    observations_from_message,
     status_from_message,
 )
-from starcal_ros.formats.messages.observation_messages import observations_from_message
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import end_quietly, until_told_to_end
 

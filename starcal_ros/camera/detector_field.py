@@ -2,13 +2,10 @@
 """
 Smooth vector fields over a detector: displacements that no lens model describes.
 
-A field is a sum of functions of the pixel, one sum for each pixel axis.  The functions are of one
-of two families:
-
-- ``cosine``: products of cosines over a domain a fifth longer than the detector, ordered by
-  wavelength.  An octave has wavelengths from its longest to half of that; the first also has
-  everything longer than the detector.  A field is as rough at the border as in the middle.
-- ``legendre``: products of Legendre polynomials up to a total degree, as older calibrations have.
+A field is a sum of functions of the pixel, one sum for each pixel axis.  The functions are
+products of cosines over a domain a fifth longer than the detector, ordered by wavelength.  An
+octave has wavelengths from its longest to half of that; the first also has everything longer than
+the detector.  A field is as rough at the border as in the middle.
 
 All functions have a mean square near 1, so a coefficient is about the RMS displacement of its
 term in pixels.
@@ -25,7 +22,6 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices
 
-FAMILIES = ('legendre', 'cosine')
 # Domain of the cosines in detector sides: a field need not be flat at the border.
 COSINE_DOMAIN = 1.2
 
@@ -47,7 +43,9 @@ def cosine_terms(width: int, height: int, octaves: int) -> tuple[NDArray[np.int6
     return terms, found
 
 
-def _cosines(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
+def basis(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
+    """Return the functions (n, t) of a field at pixels (n, 2)."""
+    pixels = np.asarray(pixels, np.float64)
     terms, _ = cosine_terms(width, height, octaves)
     along = []
     for axis, size in enumerate((width, height)):
@@ -64,42 +62,9 @@ def _cosines(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
     return found.T
 
 
-def degrees(total: int) -> NDArray[np.int64]:
-    """Return the degrees (t, 2) in u and v of all products up to a total degree, ascending."""
-    return np.array([(d - j, j) for d in range(total + 1) for j in range(d + 1)], np.int64)
-
-
-def basis(pixels: Floats, width: int, height: int, degree: int, family: str) -> Floats:
-    """
-    Return the functions (n, t) of a family at pixels (n, 2).
-
-    ``degree`` is the total degree of Legendre polynomials, or the number of octaves of cosines.
-    """
-    pixels = np.asarray(pixels, np.float64)
-    if family == 'cosine':
-        return _cosines(pixels, width, height, degree)
-    along_u = _legendre((2.0 * pixels[:, 0] + 1.0) / width - 1.0, degree)
-    along_v = _legendre((2.0 * pixels[:, 1] + 1.0) / height - 1.0, degree)
-    of_u, of_v = degrees(degree).T
-    return np.asarray((along_u[of_u] * along_v[of_v]).T)
-
-
-def term_count(width: int, height: int, degree: int, family: str) -> int:
+def term_count(width: int, height: int, octaves: int) -> int:
     """Return the number of functions of `basis`."""
-    if family == 'cosine':
-        return len(cosine_terms(width, height, degree)[0])
-    return len(degrees(degree))
-
-
-def _legendre(x: Floats, degree: int) -> Floats:
-    """Return the Legendre polynomials (degree + 1, n) with mean square 1 over [-1, 1]."""
-    values = np.empty((degree + 1, len(x)))
-    values[0] = 1.0
-    if degree > 0:
-        values[1] = x
-    for n in range(1, degree):  # Bonnet's recursion
-        values[n + 1] = ((2 * n + 1) * x * values[n] - n * values[n - 1]) / (n + 1)
-    return np.asarray(values * np.sqrt(2.0 * np.arange(degree + 1) + 1.0)[:, None])
+    return len(cosine_terms(width, height, octaves)[0])
 
 
 @dataclass(frozen=True)
@@ -107,20 +72,19 @@ class DetectorField:
     """
     A displacement of every pixel: a star that the lens model places at u is measured at u + f(u).
 
-    ``coefficients`` is (2, t): px, of the functions of `basis` of ``degree`` and ``family``, for u
-    and for v.  The field is a function of the measured pixel.
+    ``coefficients`` is (2, t): px, of the functions of `basis` to ``octaves``, for u and for v.
+    The field is a function of the measured pixel.
     """
 
     width: int
     height: int
-    degree: int
+    octaves: int
     coefficients: Floats
-    family: str = 'legendre'
 
     def displacement_px(self, pixels: Floats) -> Floats:
         """Return the displacement (..., 2) at measured pixels (..., 2)."""
         pixels = np.asarray(pixels, np.float64)
-        # Polynomials grow without limit beyond the detector: the value at its border is used.
+        # Beyond the detector the stars show nothing: the value at its border is used.
         inside = np.clip(pixels.reshape(-1, 2), -0.5, [self.width - 0.5, self.height - 0.5])
         parts = [
             self.basis(inside[k : k + _CHUNK]) @ self.coefficients.T
@@ -130,14 +94,12 @@ class DetectorField:
 
     @property
     def orders(self) -> NDArray[np.int64]:
-        """Half waves, or degrees, (t, 2) of the functions along u and v."""
-        if self.family == 'cosine':
-            return cosine_terms(self.width, self.height, self.degree)[0]
-        return degrees(self.degree)
+        """Half waves (t, 2) of the functions along u and v."""
+        return cosine_terms(self.width, self.height, self.octaves)[0]
 
     def basis(self, pixels: Floats) -> Floats:
         """Return the functions (n, t) of the field at pixels (n, 2)."""
-        return basis(pixels, self.width, self.height, self.degree, self.family)
+        return basis(pixels, self.width, self.height, self.octaves)
 
 
 _CHUNK = 8192  # pixels at a time: their functions are a hundred times as many numbers

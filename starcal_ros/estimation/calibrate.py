@@ -378,7 +378,7 @@ def _check_not_mirrored(state: State) -> None:
 def field_of(layout: Layout, found: Posterior, size: tuple[int, int]) -> DetectorField:
     """Return the field of a posterior on a detector (width, height)."""
     coefficients = found.mean[layout.places['field']].reshape(2, -1)
-    return DetectorField(*size, FIELD_OCTAVES, coefficients, 'cosine')
+    return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
 def _residuals_px(

@@ -438,7 +438,7 @@ def _field(width: int, height: int) -> Unknown:
     terms, octave = cosine_terms(width, height, FIELD_OCTAVES)
 
     def functions(pixels: Floats) -> Floats:
-        return basis(pixels.T, width, height, FIELD_OCTAVES, 'cosine').T
+        return basis(pixels.T, width, height, FIELD_OCTAVES).T
 
     labels = tuple(f'field_{i}_{j}_{axis}_px' for axis in 'uv' for i, j in terms)
     sigma = 1.0 / np.sqrt(np.bincount(octave)[octave])
@@ -466,7 +466,7 @@ def _next_lens_term(width: int, height: int) -> Floats:
     term = from_centre * radial
     term /= np.sqrt((term**2).mean())
     pixels = (at.reshape(2, -1).T + 1.0) / 2.0 * np.array([width, height]) - 0.5
-    phi = basis(pixels, width, height, FIELD_OCTAVES, 'cosine')
+    phi = basis(pixels, width, height, FIELD_OCTAVES)
     found, *_ = np.linalg.lstsq(phi, term, rcond=_SHOWN)
     coefficients: Floats = np.asarray(found.T.ravel(), np.float64)
     coefficients.setflags(write=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.errors import IngestError, OptionError
-from starcal_ros.formats.images.image_files import read_image
+from starcal_ros.formats.image_files import read_image
 from starcal_ros.records import Image
 from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.hot_pixels import HotPixels

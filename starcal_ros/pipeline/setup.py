@@ -26,12 +26,12 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.camera import CameraModel
-from starcal_ros.camera.conversion import convert
 from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, check_options
-from starcal_ros.formats.messages.image_messages import CHANNELS
+from starcal_ros.formats.messages.sensor_messages import CHANNELS
 from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.options import (

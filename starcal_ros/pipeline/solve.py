@@ -27,8 +27,8 @@ from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
-from starcal_ros.camera.conversion import convert, ros_fit
 from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.projection import convert, ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import errors_as, OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration

@@ -12,7 +12,7 @@ from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import Frame, read_frames
 from starcal_ros.formats.bag.reader import Topics as Topics
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
     ATTITUDE_TYPES,
     COMPRESSED_TYPE,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.record_fields import Count, Finite, Named, Quaternion, Shape, Stamp
+from starcal_ros.record_fields import Count, Finite, Quaternion, Shape, Stamp
 from starcal_ros.records.calibration_parts import (
     MapCovariance,
     ModelChecks,
@@ -139,7 +139,7 @@ class GateCheck:
     found: float
     limit: float
     unit: str
-    passed: Annotated[bool | None, Named(formerly='kept')]
+    passed: bool | None
     note: str = ''
 
     @property
@@ -274,7 +274,7 @@ class Calibration:
     correlation: Correlation | None = None
     first_image_ns: Stamp = 0
     number: Count = 0
-    active_since_ns: Annotated[Stamp, Named(formerly='in_force_since_ns')] = 0
+    active_since_ns: Stamp = 0
     forced: bool = False
     star_trackers: tuple[StarTrackerAlignment, ...] = ()
     model_checks: ModelChecks | None = None
@@ -315,11 +315,6 @@ class Calibration:
         if self.field is None:
             return MapCovariance(self.covariance)
         return MapCovariance(self.field.covariance, self.field.unresolved_px)
-
-    @property
-    def joint_covariance(self) -> Floats:
-        """Covariance of `parameter_names`, then of the coefficients of a field."""
-        return self.map_covariance.matrix
 
     @property
     def sigma(self) -> Floats:

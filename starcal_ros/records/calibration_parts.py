@@ -9,7 +9,7 @@ sight.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import functools
 from typing import Annotated
 
@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera.detector_field import DetectorField, FAMILIES, term_count
-from starcal_ros.record_fields import Count, Finite, OneOf, Quaternion, Shape
+from starcal_ros.camera.detector_field import DetectorField, term_count
+from starcal_ros.record_fields import Count, Finite, Quaternion, Shape, Within
 
 TOTAL = 'total'
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
@@ -233,14 +233,10 @@ class ResidualField:
 
     Attributes
     ----------
-    degree : int
-        Total degree of its polynomials, or number of octaves of its cosines.
+    octaves : int
+        Of its cosines; `detector_field.basis` has them.
     coefficients : (2, t)
         px, for u and for v; a star that the lens model places at u is measured at u + f(u).
-    joint_covariance : (p + 2 t, p + 2 t)
-        As earlier versions wrote it; empty where there is a factor.
-    family : str
-        One of `detector_field.FAMILIES`, the kind of its functions.
     unresolved_px : float
         1-sigma per axis of structure finer than the field.
     covariance_factor : (p + 2 t, r)
@@ -250,22 +246,12 @@ class ResidualField:
         Rows of the triangle, one after the other: the coefficients, the parameters known.
     """
 
-    degree: Count
+    octaves: Annotated[int, Within(1, 8)]
     coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
-    joint_covariance: Annotated[Floats, Finite(), Shape(('joint', 'joint'))] = field(
-        default_factory=lambda: np.empty((0, 0))
-    )
-    family: Annotated[str, OneOf(FAMILIES)] = 'legendre'
-    unresolved_px: Annotated[float, Finite()] = 0.0
-    covariance_factor: Annotated[Floats, Finite(), Shape(('factor_rows', 'factor_cols'))] = field(
-        default_factory=lambda: np.empty((0, 0))
-    )
-    remainder_unit_px: Annotated[Floats, Finite(), Shape(('c',))] = field(
-        default_factory=lambda: np.empty(0)
-    )
-    remainder: Annotated[NDArray[np.int16], Shape(('n',))] = field(
-        default_factory=lambda: np.empty(0, np.int16)
-    )
+    unresolved_px: Annotated[float, Finite()]
+    covariance_factor: Annotated[Floats, Finite(), Shape(('factor_rows', 'factor_cols'))]
+    remainder_unit_px: Annotated[Floats, Finite(), Shape(('c',))]
+    remainder: Annotated[NDArray[np.int16], Shape(('n',))]
 
     def __post_init__(self) -> None:
         """Check the size of the remainder."""
@@ -279,13 +265,11 @@ class ResidualField:
     @property
     def rows(self) -> int:
         """Number of rows of the covariance."""
-        return len(self.joint_covariance) or len(self.covariance_factor)
+        return len(self.covariance_factor)
 
     @functools.cached_property
     def covariance(self) -> Floats:
         """(p + 2 t, p + 2 t): of the parameters of the calibration and the coefficients."""
-        if len(self.joint_covariance):
-            return self.joint_covariance
         F = self.covariance_factor
         covariance: Floats = F @ F.T
         count = len(self.remainder_unit_px)
@@ -298,13 +282,11 @@ class ResidualField:
 
     def on(self, width: int, height: int) -> DetectorField:
         """Return the field on a detector; raises ValueError for a wrong number of terms."""
-        if self.family not in FAMILIES:
-            raise ValueError(f'field.family: {self.family!r} is not one of {", ".join(FAMILIES)}')
         found = self.coefficients.shape[1]
-        expected = term_count(width, height, self.degree, self.family)
+        expected = term_count(width, height, self.octaves)
         if found != expected:
             raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
-        return DetectorField(width, height, self.degree, self.coefficients, self.family)
+        return DetectorField(width, height, self.octaves, self.coefficients)
 
 
 def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualField:
@@ -333,9 +315,8 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
     # The triangle of the QR decomposition of a root exists for deficient rank too.
     _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
     return ResidualField(
-        degree=of.degree,
+        octaves=of.octaves,
         coefficients=of.coefficients,
-        family=of.family,
         unresolved_px=covariance.unresolved_px,
         covariance_factor=factor,
         remainder_unit_px=unit_px,

@@ -169,7 +169,7 @@ class StarObservations:
     refused_stars : mapping
         Name of `STAR_REFUSALS` -> number of predicted stars refused for this reason.
     refused_catalog_id : (m,) int64
-        The refused stars; empty in older recordings.
+        The refused stars.
     refused_px : (m, 2) float32
         Predicted (u, v) of each refused star; for display only.
     refused_reason : (m,) uint8
@@ -201,7 +201,7 @@ class StarObservations:
     refusal: Annotated[str, _REFUSAL]
     detail: str
     icrf_from_star_tracker_xyzw: Annotated[_Attitude, Named('attitude')]
-    attitude_gap_s: _FiniteOrNaN
+    attitude_gap_s: Annotated[float, Within(0)]
     catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
     direction_icrf: Annotated[Floats, Finite(), Shape(('n', 3)), Unit(1e-6)]
     magnitude: _FloatsOrNaN

@@ -41,14 +41,14 @@ from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.bag.writer import BagWriter, FileSpan, metadata_text, TopicSummary
-from starcal_ros.formats.messages import calibration_messages
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages import record_messages
+from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
     OBSERVATIONS_TYPE,
 )
-from starcal_ros.formats.products import calibration_json
+from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.formats.products.product_folder import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_folder import STATE_ENSEMBLE as _ENSEMBLE
@@ -330,7 +330,7 @@ class Archive:
         if record.event in self._events:
             return
         content = {
-            **calibration_json.calibration_content(record.calibration),
+            **product_files.calibration_content(record.calibration),
             'archive': json_object(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
         }
         name = f'{record.event:08d}_calibration_{record.calibration.number:08d}.json'
@@ -445,7 +445,7 @@ class Archive:
         return found[0]
 
     def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
-        content = self._unsealed(path, calibration_json.SCHEMA)
+        content = self._unsealed(path, product_files.SCHEMA)
         if content is None:
             return None
         archive = content.get('archive')
@@ -454,7 +454,7 @@ class Archive:
             return None
         try:
             keys = read_record(_ActivationKeys, archive, 'archive')
-            calibration = calibration_json.calibration_from_content(path, content)
+            calibration = product_files.calibration_from_content(path, content)
             if (keys.event, calibration.number) != (event, number):
                 raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
             if keys.before >= event:
@@ -520,9 +520,9 @@ def check_publishable(calibration: Calibration) -> None:
     Raises ValueError naming the message.
     """
     for kind, make in (
-        (CALIBRATION_TYPE, calibration_messages.calibration_to_message),
-        (CAMERA_INFO_TYPE, calibration_messages.camera_info_to_message),
-        (ALIGNMENT_TYPE, calibration_messages.alignment_to_message),
+        (CALIBRATION_TYPE, record_messages.calibration_to_message),
+        (CAMERA_INFO_TYPE, record_messages.camera_info_to_message),
+        (ALIGNMENT_TYPE, record_messages.alignment_to_message),
     ):
         try:
             with np.errstate(all='ignore'):

@@ -19,8 +19,8 @@ from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages import message_fields
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages import message_codec
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
     ATTITUDE_TYPES,
     CALIBRATION_TYPE,
@@ -50,7 +50,7 @@ _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (
     CALIBRATION_TYPE,
     STATUS_TYPE,
-    message_fields.CAMERA_INFO_TYPE,
+    message_codec.CAMERA_INFO_TYPE,
 )
 
 

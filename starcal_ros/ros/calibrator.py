@@ -23,16 +23,15 @@ from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages.message_codec import make_header, record_to_message
+from starcal_ros.formats.messages.record_messages import (
     alignment_to_message,
     calibration_to_message,
     camera_info_to_message,
+    checked_observations,
     mountings_to_messages,
     status_to_message,
 )
-from starcal_ros.formats.messages.message_codec import record_to_message
-from starcal_ros.formats.messages.message_fields import make_header
-from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import CalibratorOptions, load_setup
 from starcal_ros.records import IMAGE_REFUSALS

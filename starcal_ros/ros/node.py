@@ -36,7 +36,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from starcal_ros.errors import OptionError, StarcalError
-from starcal_ros.formats.messages.message_fields import Message
+from starcal_ros.formats.messages.message_codec import Message
 from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, Setup
 from starcal_ros.processes import return_freed_memory

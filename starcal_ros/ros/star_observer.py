@@ -25,15 +25,18 @@ from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.messages import telemetry
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages import sensor_messages
+from starcal_ros.formats.messages.message_codec import nearest_stamp_ns, offset_ns, stamp_ns
+from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     camera_info_to_message,
+    observations_to_message,
 )
-from starcal_ros.formats.messages.image_messages import color_image_to_message, image_from_message
-from starcal_ros.formats.messages.message_fields import nearest_stamp_ns, offset_ns, stamp_ns
-from starcal_ros.formats.messages.observation_messages import observations_to_message
-from starcal_ros.formats.messages.telemetry import latest_at
+from starcal_ros.formats.messages.sensor_messages import (
+    color_image_to_message,
+    image_from_message,
+    latest_at,
+)
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.annotation import annotate
@@ -244,7 +247,7 @@ class StarObserver(StarcalNode):
             self._camera_infos.publish(camera_info)
 
     def _on_attitude(self, message: Any) -> None:
-        time_ns, quaternion = telemetry.attitude_from_message(message)
+        time_ns, quaternion = sensor_messages.attitude_from_message(message)
         self._unmatched.add_attitude(time_ns, quaternion)
         history = self._star_trackers.histories[0]
         before_ns = history.latest_ns
@@ -255,7 +258,7 @@ class StarObserver(StarcalNode):
         self._attitude_step_s.add(step_ns / NANOSECONDS_PER_SECOND)
 
     def _add_attitude(self, which: int, message: Any) -> None:
-        time_ns, quaternion = telemetry.attitude_from_message(message)
+        time_ns, quaternion = sensor_messages.attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
         self._star_trackers.add(which, time_ns, attitude_sample(time_ns, quaternion, direction))
         if self._awaiting:
@@ -264,7 +267,7 @@ class StarObserver(StarcalNode):
 
     def _on_velocity(self, message: Any) -> None:
         try:
-            self._velocities.append(telemetry.velocity_from_message(message))
+            self._velocities.append(sensor_messages.velocity_from_message(message))
             self._bad_velocity = ''
         except ValueError as error:
             self._bad_velocity = str(error)
@@ -273,7 +276,7 @@ class StarObserver(StarcalNode):
                 self.get_logger().warning(self._bad_velocity)
 
     def _on_temperature(self, message: Any) -> None:
-        self._temperatures.append(telemetry.temperature_from_message(message))
+        self._temperatures.append(sensor_messages.temperature_from_message(message))
 
     def _on_calibration(self, message: Any) -> None:
         calibration = calibration_from_message(message)

@@ -21,7 +21,7 @@ from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.formats.products.product_files import read_calibration, write_calibration
 from starcal_ros.records import Calibration, TemperatureTerms
 
 

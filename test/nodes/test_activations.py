@@ -22,7 +22,7 @@ from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages.record_messages import (
     alignment_to_message,
     calibration_from_message,
     camera_info_to_message,

@@ -17,15 +17,13 @@ from kept_state import activation, collect, images, opened  # type: ignore[impor
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from sample_records import assert_same, calibration_of_0_1, observations  # type: ignore[import-not-found]
+from sample_records import assert_same  # type: ignore[import-not-found]
 
 from starcal_ros.errors import ArchiveError
 from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.archive import Archive, Seal, TOPIC
 from starcal_ros.ros.state import Activation
-
-WRITTEN_BY_0_1 = Path(__file__).resolve().parents[1] / 'data' / 'written_by_0_1'
 
 
 def numbers(history: tuple[Activation, ...]) -> list[tuple[int, int]]:
@@ -196,45 +194,6 @@ def test_a_damaged_file_is_never_believed(tmp_path: Path, pattern: str, kind: st
         assert history[-1].calibration.residual_rms_px == expected[-1][1] / 7
     # Flips in the white space of JSON, or in the index of a bag, change nothing that is read.
     assert set_aside >= (12 if kind == 'flip' else 22)
-
-
-def test_a_folder_of_version_0_1_is_read(tmp_path: Path) -> None:
-    """Written by that version; its unknown attitude gap was -1."""
-    shutil.copytree(WRITTEN_BY_0_1 / 'state', tmp_path / 'state')
-    with opened(tmp_path / 'state') as archive:
-        ensemble, history = archive.read_ensemble(), archive.read_history()
-        assert archive.damage == []
-    first, second = ensemble.images
-    without = {
-        'star_tracker_rate_rad_s': np.full(3, np.nan),
-        'velocity_sigma_m_s': np.nan,
-        'zenith_icrf': np.full(3, np.nan),
-        'refraction_arcsec': np.zeros(2),
-    }
-    assert_same(first, dataclasses.replace(observations(), **without))
-    assert np.isnan(second.attitude_gap_s) and len(second) == 0
-    assert ensemble.refused == {'no_match': 2}
-    (record,) = history
-    found = record.calibration
-    assert (record.event, found.number, found.active_since_ns) == (7, 3, 123)
-    expected = dataclasses.replace(
-        calibration_of_0_1(), number=3, active_since_ns=123, gate=found.gate
-    )
-    assert_same(found, expected)
-    assert [check.passed for check in found.gate] == [False, True, None]
-
-
-def test_a_calibration_of_before_the_gate_told_is_read(tmp_path: Path) -> None:
-    with opened(tmp_path) as archive:
-        archive.keep(Ensemble(), (activation(1),))
-    (path,) = tmp_path.glob('calibrations/*.json')
-    content = json.loads(path.read_text())
-    del content['sha256'], content['gate']
-    path.write_text(Seal().sealed(content))
-    with opened(tmp_path) as archive:
-        (record,) = archive.read_history()
-        assert archive.damage == []
-    assert record.calibration.gate == ()
 
 
 def test_a_damaged_rollback_still_goes_back(tmp_path: Path) -> None:

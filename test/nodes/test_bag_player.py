@@ -23,7 +23,7 @@ from rclpy.executors import SingleThreadedExecutor
 from starcal.msg import StarObservations
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages.message_codec import (
     COMPRESSED_TYPE,
     make_header,
     POSE_TYPE,

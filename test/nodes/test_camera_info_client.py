@@ -28,7 +28,7 @@ from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
 
 from starcal.msg import EnsembleStatus, StarObservations
-from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.formats.messages.record_messages import observations_to_message
 from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes

@@ -28,8 +28,8 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.observation_messages import observations_to_message
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.formats.messages.record_messages import observations_to_message
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Ensemble, IMAGE_REFUSALS
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.node import make_message

@@ -23,7 +23,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from starcal.msg import EnsembleStatus
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import stamp_ns
+from starcal_ros.formats.messages.message_codec import stamp_ns
 from starcal_ros.records import Image
 
 ROOT = Path(__file__).parents[2]

@@ -24,11 +24,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.ros.monitor_client import Monitor
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages.record_messages import (
     calibration_to_message,
+    observations_to_message,
     status_to_message,
 )
-from starcal_ros.formats.messages.observation_messages import observations_to_message
 from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes

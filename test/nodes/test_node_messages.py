@@ -17,18 +17,16 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag import typestore as bag_types
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages.record_messages import (
     alignment_to_message,
     calibration_from_message,
     calibration_to_message,
     camera_info_to_message,
-    status_to_message,
-)
-from starcal_ros.formats.messages.image_messages import image_from_message, image_to_message
-from starcal_ros.formats.messages.observation_messages import (
     observations_from_message,
     observations_to_message,
+    status_to_message,
 )
+from starcal_ros.formats.messages.sensor_messages import image_from_message, image_to_message
 from starcal_ros.records import Image
 from starcal_ros.ros.node import make_message, message_class
 

@@ -44,20 +44,22 @@ from starcal_ground.cli.main import main
 from starcal_ros.assessment.lookup import COLUMNS
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages import message_fields
-from starcal_ros.formats.messages.calibration_messages import (
+from starcal_ros.formats.messages import message_codec
+from starcal_ros.formats.messages.message_codec import make_header
+from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     calibration_to_message,
     camera_info_to_message,
-)
-from starcal_ros.formats.messages.image_messages import image_from_message, image_to_message
-from starcal_ros.formats.messages.message_fields import make_header
-from starcal_ros.formats.messages.observation_messages import (
     observations_from_message,
     observations_to_message,
 )
-from starcal_ros.formats.messages.telemetry import attitude_to_message, temperature_to_message
-from starcal_ros.formats.products.calibration_json import (
+from starcal_ros.formats.messages.sensor_messages import (
+    attitude_to_message,
+    image_from_message,
+    image_to_message,
+    temperature_to_message,
+)
+from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
     read_calibration,
     write_calibration,
@@ -299,8 +301,8 @@ def test_every_image_gets_one_answer(
     for k in range(30):
         attitudes.publish(attitude(k * 500_000_000))
     client.until(lambda: len(answers) == len(sent))
-    stamps = [message_fields.stamp_ns(m.header.stamp) for m, _ in sent]
-    assert [message_fields.stamp_ns(a.header.stamp) for a in answers] == stamps
+    stamps = [message_codec.stamp_ns(m.header.stamp) for m, _ in sent]
+    assert [message_codec.stamp_ns(a.header.stamp) for a in answers] == stamps
     assert [a.refusal for a in answers] == [reason for _, reason in sent]
     assert all(a.detail for a in answers)
     images.publish(blank(60_000_000_000))
@@ -783,7 +785,7 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
         got = image_from_message(message)
         assert got.time_ns == image.time_ns and isinstance(image, ImageRecord)
         np.testing.assert_array_equal(got.pixels, image.pixels)
-    stamps = [message_fields.stamp_ns(m.header.stamp) for m in attitudes]
+    stamps = [message_codec.stamp_ns(m.header.stamp) for m in attitudes]
     assert stamps == sorted(stamps)
 
 

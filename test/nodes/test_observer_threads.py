@@ -14,8 +14,8 @@ pytest.importorskip('starcal.msg')
 
 import rclpy
 
-from starcal_ros.formats.messages.calibration_messages import calibration_to_message
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.formats.messages.record_messages import calibration_to_message
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
 

@@ -23,7 +23,7 @@ import pytest
 from starcal_ground.cli import main
 from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import parser
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import names_of, read_parameter_file
 from starcal_ros.pipeline.setup import (
     load_setup,

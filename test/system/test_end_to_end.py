@@ -26,8 +26,8 @@ from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, proje
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
-from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, CameraGeometry, Image
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 TINY = EXAMPLES.parent / 'bags' / 'tiny'

@@ -25,17 +25,17 @@ from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
-from starcal_ros.camera.conversion import ros_fit
+from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.products.calibration_json import (
+from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
     prior_of,
     read_calibration,
     write_calibration,
 )
-from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, NODES
@@ -179,7 +179,7 @@ def test_observations() -> None:
     pytest.importorskip('rclpy')
     from mutants import mutants  # type: ignore[import-not-found]
 
-    from starcal_ros.formats.messages.observation_messages import (
+    from starcal_ros.formats.messages.record_messages import (
         checked_observations,
         observations_to_message,
     )

@@ -28,7 +28,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.state import Activation

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
     from starcal_ros.formats.bag.reader import read_observations
-    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_files import read_calibration
     from starcal_ros.formats.products.product_folder import calibration_file, OBSERVATIONS_TOPIC
 
     calibration = read_calibration(calibration_file(args.calibration))

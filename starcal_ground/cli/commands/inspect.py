@@ -42,7 +42,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.planning import inspect
     from starcal_ros.formats.bag import reader
-    from starcal_ros.formats.messages import message_fields
+    from starcal_ros.formats.messages import message_codec
 
     setup = None
     if args.params:
@@ -50,9 +50,9 @@ def run(args: argparse.Namespace) -> int:
 
         setup = read_setup(args.params)
     kinds = (
-        message_fields.IMAGE_TYPE,
-        message_fields.COMPRESSED_TYPE,
-        message_fields.OBSERVATIONS_TYPE,
+        message_codec.IMAGE_TYPE,
+        message_codec.COMPRESSED_TYPE,
+        message_codec.OBSERVATIONS_TYPE,
     )
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:

@@ -26,15 +26,14 @@ from starcal_ros.camera import pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.temperature import camera_at
-from starcal_ros.formats.products.calibration_json import calibration_text
-from starcal_ros.records import Calibration, factored_field, ResidualField
+from starcal_ros.formats.products.product_files import calibration_text
+from starcal_ros.records import Calibration, ResidualField
 
 TABLE_FILE = 'starcal_camera.bin'
 _MAGIC = b'STARCALT'
 _VERSION = 1  # STARCAL_TABLE_VERSION
 _MOST_WAVES = 128  # STARCAL_MAX_WAVES
 _NAME_SIZE = 32  # STARCAL_NAME_SIZE
-_FAMILIES = {'legendre': 1, 'cosine': 2}
 _VECTORS_A_SIDE = 5
 _VECTOR_STEP_K = 7.0  # of the temperature from one vector to the next
 _NO_FOLD = sys.float_info.max  # the table has finite numbers only
@@ -103,17 +102,15 @@ def c_table(calibration: Calibration) -> bytes:
     body += terms.astype('<u2').tobytes()
     body += triangle.T[np.triu_indices(len(triangle))].astype('<i2').tobytes()
     head = struct.pack(
-        '<10Ixxxxq32s16x',
+        '<8I12xq32s16x',
         list(COEFFICIENTS).index(camera.model),
         camera.width,
         camera.height,
-        _FAMILIES[field.family] if len(terms) else 0,
         len(terms),
         field.covariance_factor.shape[1],
         len(calibration.sigma_budget),
         len(vectors),
         len(camera.parameters),
-        0,
         calibration.time_ns,
         identity(calibration),
     )
@@ -131,14 +128,12 @@ def _factored(calibration: Calibration) -> ResidualField:
     """Return the field with its covariance as a factor; of no terms where there is none."""
     field, camera = calibration.field, calibration.geometry.camera
     if field is not None and camera.field is not None:
-        if len(field.covariance_factor):
-            return field
-        return factored_field(camera.field, calibration.map_covariance)
+        return field
     scale = np.where(calibration.sigma > 0, calibration.sigma, 1.0)
     values, vectors = np.linalg.eigh(calibration.covariance / np.outer(scale, scale))
     used = values > _NO_VARIANCE * max(values.max(), 0.0)
     factor = scale[:, None] * vectors[:, used] * np.sqrt(values[used])
-    return ResidualField(0, np.empty((2, 0)), covariance_factor=factor)
+    return ResidualField(0, np.empty((2, 0)), 0.0, factor, np.empty(0), np.empty(0, np.int16))
 
 
 def _temperature(calibration: Calibration) -> list[float]:

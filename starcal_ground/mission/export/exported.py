@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
-from starcal_ros.camera.conversion import nearest_camera
+from starcal_ros.camera.projection import nearest_camera
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration
 

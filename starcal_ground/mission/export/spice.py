@@ -218,16 +218,10 @@ def _instrument_kernel(
     return kernel_text(f'Camera {camera_frame}', comments, prefix, values)
 
 
-_FAMILY_IN_WORDS = {
-    'cosine': (
-        f'   P(0; x) = 1, P(n; x) = sqrt(2) cos(pi n (x / {2.0 * COSINE_DOMAIN:g} + 0.5)),',
-        '   a = (2 U + 1) / PIXEL_SAMPLES - 1, b = (2 V + 1) / PIXEL_LINES - 1.',
-    ),
-    'legendre': (
-        '   P(n; x) = sqrt(2 n + 1) times the Legendre polynomial of degree n,',
-        '   a = (2 U + 1) / PIXEL_SAMPLES - 1, b = (2 V + 1) / PIXEL_LINES - 1.',
-    ),
-}
+_FIELD_IN_WORDS = (
+    f'   P(0; x) = 1, P(n; x) = sqrt(2) cos(pi n (x / {2.0 * COSINE_DOMAIN:g} + 0.5)),',
+    '   a = (2 U + 1) / PIXEL_SAMPLES - 1, b = (2 V + 1) / PIXEL_LINES - 1.',
+)
 
 
 def _lens_values(camera: CameraModel) -> dict[str, Value]:
@@ -247,7 +241,6 @@ def _lens_values(camera: CameraModel) -> dict[str, Value]:
     if (field := camera.moving_field) is not None:
         orders = field.orders
         values |= {
-            'FIELD_FAMILY': field.family,
             'FIELD_ORDERS_U': orders[:, 0].tolist(),
             'FIELD_ORDERS_V': orders[:, 1].tolist(),
             'FIELD_U_PX': field.coefficients[0].tolist(),
@@ -274,7 +267,7 @@ def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
             '   U = u + f_u(U, V), V = v + f_v(U, V)',
             'where f is the sum over k of FIELD_U_PX(k) (FIELD_V_PX(k)) times',
             '   P(i; a) P(j; b), i = FIELD_ORDERS_U(k), j = FIELD_ORDERS_V(k), and',
-            *_FAMILY_IN_WORDS[camera.moving_field.family if camera.moving_field else 'cosine'],
+            *_FIELD_IN_WORDS,
             'Beyond the detector f is that at its edge.',
         ]
     if names.pixel_size_um:

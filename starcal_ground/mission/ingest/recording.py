@@ -25,7 +25,7 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.images.image_files import is_fits
+from starcal_ros.formats.image_files import is_fits
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Image

@@ -26,7 +26,7 @@ from starcal_ground.mission.ingest import ccsds, kernels, mission_records
 from starcal_ground.mission.ingest.mission_records import Attitudes, EME2000_NOTE, Velocities
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.errors import IngestError, needing
-from starcal_ros.formats.images.image_files import is_fits
+from starcal_ros.formats.image_files import is_fits
 from starcal_ros.untrusted import regular_file
 
 

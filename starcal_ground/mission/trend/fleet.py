@@ -43,10 +43,9 @@ from starcal_ground.mission.trend.trend_table import (
 from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
-from starcal_ros.formats.products import calibration_json, product_files
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
-from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
+from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
+from starcal_ros.formats.products import product_files
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, OBSERVATIONS_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
 from starcal_ros.pipeline.solve import software_version
@@ -378,7 +377,7 @@ def _answer(task: Task, path: Path) -> Answer:
         campaign = calibrate_bags([path], setup, Topics())
         made, records = campaign.calibration, campaign.observations
         row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
-        text = calibration_json.calibration_text(made)
+        text = product_files.calibration_text(made)
         return Answer(key, _of_task(row, task, path), text)
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
@@ -412,14 +411,14 @@ def _custom_data(metadata: Path) -> dict[str, str]:
 def _recorded(path: Path) -> tuple[Calibration, float]:
     """A recorded calibration and its mean temperature."""
     temperature = _temperature(path.with_name(OBSERVATIONS_FILE))
-    return calibration_json.read_calibration(path), temperature
+    return product_files.read_calibration(path), temperature
 
 
 def _setup_beside(bag: Path) -> Setup:
     """The setup of the calibration beside a bag: its options and its prior."""
     path = bag.with_name(CALIBRATION_FILE)
-    calibration = calibration_json.read_calibration(path)
-    prior = calibration_json.prior_of(calibration)
+    calibration = product_files.read_calibration(path)
+    prior = product_files.prior_of(calibration)
     try:
         options = untrusted.json_value(calibration.provenance['options'])
     except (KeyError, ValueError) as error:
@@ -434,7 +433,7 @@ def _setup_beside(bag: Path) -> Setup:
 def _is_older(calibration: Path, version: str) -> bool:
     """True for a calibration by another version; False for none."""
     try:
-        software = calibration_json.read_calibration(calibration).provenance.get('software', '')
+        software = product_files.read_calibration(calibration).provenance.get('software', '')
     except StarcalError:
         return False  # named by its own task
     return software != f'starcal {version}'

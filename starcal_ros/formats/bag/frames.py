@@ -24,9 +24,16 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.formats.bag.mcap_reader import Damage, RawMessage
-from starcal_ros.formats.bag.reader import decode, image_of, log_damage, read_raw, Topics
-from starcal_ros.formats.messages.telemetry import (
+from starcal_ros.formats.bag.reader import (
+    Damage,
+    decode,
+    image_of,
+    log_damage,
+    RawMessage,
+    read_raw,
+    Topics,
+)
+from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
     latest_at,
     temperature_from_message,

@@ -16,7 +16,7 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 from starcal_ros.errors import BagError
-from starcal_ros.formats.messages.message_fields import Message
+from starcal_ros.formats.messages.message_codec import Message
 
 _TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
 # The largest definition of starcal has 4,718 characters, its longest array nine items.

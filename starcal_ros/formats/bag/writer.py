@@ -19,16 +19,16 @@ from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
 from starcal_ros.formats.bag.typestore import described, make_message, typestore
-from starcal_ros.formats.messages import telemetry
-from starcal_ros.formats.messages.image_messages import image_to_message
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages import sensor_messages
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
     IMAGE_TYPE,
     OBSERVATIONS_TYPE,
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.formats.messages.record_messages import observations_to_message
+from starcal_ros.formats.messages.sensor_messages import image_to_message
 from starcal_ros.records import Image, StarObservations
 
 if TYPE_CHECKING:
@@ -116,21 +116,23 @@ class BagWriter:
 
     def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
         """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
-        message = telemetry.attitude_to_message(time_ns, xyzw, frame_id, make_message)
+        message = sensor_messages.attitude_to_message(time_ns, xyzw, frame_id, make_message)
         self._write(topic, ATTITUDE_TYPE, time_ns, message)
 
     def write_velocity(
         self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
     ) -> None:
         """Write a geometry_msgs/TwistStamped."""
-        message = telemetry.velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
+        message = sensor_messages.velocity_to_message(
+            time_ns, velocity_m_s, frame_id, make_message
+        )
         self._write(topic, VELOCITY_TYPE, time_ns, message)
 
     def write_temperature(
         self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
     ) -> None:
         """Write a sensor_msgs/Temperature."""
-        message = telemetry.temperature_to_message(
+        message = sensor_messages.temperature_to_message(
             time_ns, temperature_degc, frame_id, make_message
         )
         self._write(topic, TEMPERATURE_TYPE, time_ns, message)

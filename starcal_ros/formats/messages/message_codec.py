@@ -21,34 +21,107 @@ tuple of records                       sequence
 mapping of counts                      sequence of starcal/ReasonCount
 mapping of texts                       sequence of starcal/KeyValue
 =====================================  ==============================================
+
+Readers accept any object with the fields of the message, from rclpy or from rosbags.  Writers take
+``make``, which builds a message from its type and its fields; sequences of numbers are passed as
+flat numpy arrays of the field's type.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 import math
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.formats.messages.message_fields import (
-    flat_array,
-    Make,
-    make_header,
-    make_time,
-    Message,
-    quaternion_from_message,
-    quaternion_to_message,
-    stamp_ns,
-)
+from starcal_ros.arrays import Floats
+from starcal_ros.constants import MAX_STAMP_NS, NANOSECONDS_PER_SECOND
 from starcal_ros.record_fields import fields_of, FieldType, plain_record, read_record
 
-T = TypeVar('T')
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
+VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
+TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
+CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
+ALIGNMENT_TYPE = 'geometry_msgs/msg/TransformStamped'
+POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+IMU_TYPE = 'sensor_msgs/msg/Imu'
+OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
+CALIBRATION_TYPE = 'starcal/msg/Calibration'
+STATUS_TYPE = 'starcal/msg/EnsembleStatus'
 
+ATTITUDE_TYPES = {
+    'quaternion': ATTITUDE_TYPE,
+    'pose': POSE_TYPE,
+    'transform': ALIGNMENT_TYPE,
+    'imu': IMU_TYPE,
+}
+"""Values of the option `attitude_message`, and the type of message of each."""
+
+Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
+T = TypeVar('T')
 NOT_KNOWN = 2  # of a bool or None
 _KNOWN = {0: False, 1: True, NOT_KNOWN: None}
 _ENTRIES = {int: ('ReasonCount', 'reason', 'count'), str: ('KeyValue', 'key', 'value')}
+
+
+class Make(Protocol):
+    """Builds a message of a type, ``'pkg/msg/Name'``, from its fields."""
+
+    def __call__(self, type_name: str, /, **fields: object) -> Message:
+        """Return the message."""
+
+
+def stamp_ns(stamp: Message) -> int:
+    """Nanoseconds of a builtin_interfaces/Time, exactly."""
+    return int(stamp.sec) * NANOSECONDS_PER_SECOND + int(stamp.nanosec)
+
+
+def nearest_stamp_ns(time_ns: int) -> int:
+    """The nearest time that a ROS message can hold."""
+    return min(max(time_ns, 0), MAX_STAMP_NS)
+
+
+def offset_ns(seconds: float) -> int:
+    """Whole nanoseconds of an offset in seconds."""
+    return round(seconds * NANOSECONDS_PER_SECOND)
+
+
+def make_header(time_ns: int, frame_id: str, make: Make) -> Message:
+    """Return a std_msgs/Header of a time in nanoseconds."""
+    return make('std_msgs/msg/Header', stamp=make_time(time_ns, make), frame_id=frame_id)
+
+
+def make_time(time_ns: int, make: Make) -> Message:
+    """Return a builtin_interfaces/Time of a time in nanoseconds."""
+    sec, nanosec = divmod(time_ns, NANOSECONDS_PER_SECOND)
+    return make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+
+
+def quaternion_to_message(xyzw: Floats, make: Make) -> Message:
+    """Return a geometry_msgs/Quaternion of (4,)."""
+    x, y, z, w = (float(value) for value in xyzw)
+    return make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
+
+
+def quaternion_from_message(quaternion: Message) -> Floats:
+    """Components (4,) of a geometry_msgs/Quaternion, x y z w, not validated."""
+    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], np.float64)
+
+
+def vector_to_message(xyz: Floats, make: Make) -> Message:
+    """Return a geometry_msgs/Vector3 of (3,)."""
+    x, y, z = (float(value) for value in xyz)
+    return make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
+
+
+def flat_array(values: object, dtype: type[np.generic]) -> NDArray[Any]:
+    """Numbers of any shape as a flat, contiguous array of the type of the field."""
+    # Flat and contiguous: rclpy serialises a nested array as garbage without an error.
+    return np.ascontiguousarray(values, dtype).reshape(-1)
 
 
 def record_to_message(record: Any, make: Make) -> Message:
@@ -123,7 +196,7 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
     """
     Plain values of the message of a record by the names of its fields; arrays have their shapes.
 
-    Fields that a message of an older version lacks are omitted.
+    Fields that the message does not have are omitted.
 
     Raises ValueError with the name of an array whose size contradicts other fields.
     """

@@ -16,8 +16,8 @@ import numpy as np
 import yaml
 
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.camera.conversion import ros_fit
 from starcal_ros.camera.lens import from_ros_distortion, ros_distortion
+from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_text, write_atomically
 from starcal_ros.record_fields import Finite, read_record, Shape

@@ -1,20 +1,47 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Files of products: text of limited size, and contents written whole or not at all."""
+"""
+Files of products: written whole or not at all; ``calibration.json``, both ways.
+
+Most keys of ``calibration.json`` are the fields of `Calibration`, by `record_fields`.  Camera and
+alignment have the shape that the interface document publishes, which is described here.  Numbers
+are written with the shortest digits that read back to the same double, so a calibration that was
+written and read is equal to the last bit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 import contextlib
+import dataclasses
+from dataclasses import dataclass
+import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
 
 from starcal_ros import untrusted
+from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import is_marked, replacing, same_as_one_of
+from starcal_ros.record_fields import Count, Finite, json_object, Quaternion, read_record
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    CameraGeometry,
+    check_calibration,
+    check_drawable,
+)
+from starcal_ros.untrusted import json_value, shown
 
 OBSERVATIONS_FILE = 'observations.mcap'
 REPORT_FILE = 'report.html'
+SCHEMA = 1
+_LONGEST_REASON = 500  # characters: a text of the file may be in it
+CALIBRATION_FILE = 'calibration.json'
+_INTRINSICS = 5  # the first parameters of every camera model: fx, skew, fy, cx, cy
+_REPLACED = ('geometry', 'parent_frame', 'child_frame')  # by the keys of `_Published`
 
 
 def read_text(path: Path, most_bytes: int) -> str:
@@ -72,3 +99,157 @@ def _is_own(path: Path) -> bool:
     with contextlib.suppress(OSError, ValueError), untrusted.regular_file(path, False) as file:
         return is_marked(file)
     return False
+
+
+@dataclass(frozen=True)
+class _Alignment:
+    """The key ``alignment``."""
+
+    parent: str
+    child: str
+    quaternion_xyzw: Quaternion
+
+
+@dataclass(frozen=True)
+class _ImageSize:
+    """The key ``image``."""
+
+    width: Count
+    height: Count
+
+
+@dataclass(frozen=True)
+class _Published:
+    """
+    Camera and alignment as the interface document has them.
+
+    ``alignment_covariance_rad2`` repeats a block of the covariance for readers of the file.
+    """
+
+    intrinsics: Mapping[str, Annotated[float, Finite()]]
+    distortion: Mapping[str, Annotated[float, Finite()]]
+    alignment: _Alignment
+    parameter_names: tuple[str, ...]
+    image: _ImageSize
+    model: str
+
+    def geometry(self) -> CameraGeometry:
+        """Camera and alignment; raises ValueError for parameters of another camera model."""
+        names = self.parameter_names[: -len(ALIGNMENT_NAMES)]
+        given = {'intrinsics': names[:_INTRINSICS], 'distortion': names[_INTRINSICS:]}
+        parameters = []
+        for group, expected in given.items():
+            values: Mapping[str, float] = getattr(self, group)
+            for name in expected:
+                if name not in values:
+                    raise ValueError(f'key {f"{group}.{name}"!r} is missing')
+                parameters.append(values[name])
+        size = self.image
+        camera = CameraModel(size.width, size.height, np.array(parameters), self.model)
+        expected_names = camera.parameter_names + ALIGNMENT_NAMES
+        if self.parameter_names != expected_names:
+            raise ValueError(f'parameter_names: not {", ".join(expected_names)}')
+        return CameraGeometry(camera, self.alignment.quaternion_xyzw)
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Write ``calibration.json``, NaN and infinity as null; raises ProductError if it cannot."""
+    write_atomically(path, calibration_text(calibration))
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """Content of ``calibration.json``."""
+    return f'{_text(calibration_content(calibration))}\n'
+
+
+def _text(value: object, margin: str = '\n') -> str:
+    """JSON text: a key or an item on a line, a list of numbers, as a row of a grid, on one."""
+    inner = f'{margin} '
+    if isinstance(value, dict) and value:
+        rows = [f'{json.dumps(key)}: {_text(item, inner)}' for key, item in value.items()]
+        return f'{{{inner}{f",{inner}".join(rows)}{margin}}}'
+    if isinstance(value, list) and {dict, list, str} & set(map(type, value)):
+        return f'[{inner}{f",{inner}".join(_text(item, inner) for item in value)}{margin}]'
+    return json.dumps(value, allow_nan=False)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration in a file, equal to the one written; raises ProductError with the key."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise ProductError(f'{path}: not a calibration (no JSON object)')
+    return calibration_from_content(path, content)
+
+
+def calibration_from_content(path: Path, content: Mapping[str, Any]) -> Calibration:
+    """
+    The calibration in the JSON object of a ``calibration.json``; other keys are ignored.
+
+    Raises ProductError naming the file ``path`` and the key that is missing or wrong.
+    """
+    if 'schema' not in content:
+        raise ProductError(f'{path}: not a calibration (no key schema)')
+    if content['schema'] != SCHEMA:
+        raise ProductError(f'{path}: schema {shown(content["schema"])} is not {SCHEMA}')
+    try:
+        published = read_record(_Published, content)
+        nested = {
+            'geometry': published.geometry(),
+            'parent_frame': published.alignment.parent,
+            'child_frame': published.alignment.child,
+        }
+        calibration = read_record(Calibration, {**content, **nested})
+        check_calibration(calibration)
+        return calibration
+    except ValueError as error:
+        reason = ' '.join(str(error).split())
+        raise ProductError(f'{path}: {reason[:_LONGEST_REASON]}') from error
+
+
+def prior_of(calibration: Calibration) -> CameraGeometry | None:
+    """Camera and alignment before a calibration, of its model; None if not recorded."""
+    camera = calibration.geometry.camera
+    count = len(camera.parameters)
+    try:
+        numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
+        if numbers.shape != (count + 4,):
+            return None
+        camera = dataclasses.replace(camera, parameters=numbers[:count])
+        check_plausible(camera)
+        prior = CameraGeometry(camera, numbers[count:])
+        check_drawable(prior)
+        return prior
+    except (KeyError, ValueError, TypeError, OverflowError):
+        return None
+
+
+def calibration_content(calibration: Calibration) -> dict[str, object]:
+    """The JSON object of a calibration: the keys of the interface document, then the others."""
+    camera = calibration.geometry.camera
+    named = list(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+    published = json_object(
+        _Published(
+            intrinsics=dict(named[:_INTRINSICS]),
+            distortion=dict(named[_INTRINSICS:]),
+            alignment=_Alignment(
+                calibration.parent_frame,
+                calibration.child_frame,
+                calibration.geometry.star_tracker_from_camera_xyzw,
+            ),
+            parameter_names=calibration.parameter_names,
+            image=_ImageSize(camera.width, camera.height),
+            model=camera.model,
+        )
+    )
+    others = json_object(calibration)
+    for key in _REPLACED:
+        del others[key]
+    covariance = others.pop('covariance')
+    angles = len(camera.parameters)
+    return {
+        'schema': SCHEMA,
+        **published,
+        'covariance': covariance,
+        'alignment_covariance_rad2': [row[angles:] for row in covariance[angles:]],
+        **others,
+    }

@@ -17,17 +17,18 @@ import numpy as np
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, write_calibration
 from starcal_ros.formats.products.camera_yaml import (
     CAMERA_INFO_FILE,
     DEFAULT_CAMERA_NAME,
     write_camera_info,
 )
 from starcal_ros.formats.products.product_files import (
+    CALIBRATION_FILE,
     OBSERVATIONS_FILE,
     read_json,
     REPORT_FILE,
     write_atomically,
+    write_calibration,
 )
 from starcal_ros.record_fields import json_object, plain_record, read_record
 from starcal_ros.records import Calibration, StarObservations

@@ -16,7 +16,7 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_frames
-from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
 from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, found_alignment

@@ -35,8 +35,7 @@ from starcal_ground.cli import entry_point, main
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.calibration_json import read_calibration
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.products.product_files import read_calibration, write_atomically
 from starcal_ros.records import Image
 
 SLOWEST_S = 300.0

@@ -365,8 +365,8 @@ def test_bags_without_a_usable_image(run: Run, tmp_path: Path) -> None:
 def test_images_of_a_wrong_encoding(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from starcal_ros.formats.messages.image_messages import image_to_message
-    from starcal_ros.formats.messages.message_fields import Make, Message
+    from starcal_ros.formats.messages.message_codec import Make, Message
+    from starcal_ros.formats.messages.sensor_messages import image_to_message
 
     def colour(image: Image, frame_id: str, make: Make) -> Message:
         message = image_to_message(image, frame_id, make)

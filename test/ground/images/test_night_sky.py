@@ -27,7 +27,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import load_catalog
 

@@ -19,8 +19,8 @@ from starcal_ground.simulation import simulated_bag
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, make_header
-from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline import topics
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics

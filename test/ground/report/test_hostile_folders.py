@@ -18,7 +18,7 @@ import pytest
 from starcal_ground.cli import main
 from starcal_ground.report.thumbnails import Thumbnail, THUMBNAILS_FOLDER, write_thumbnails
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 
 pytestmark = pytest.mark.slow
 

@@ -23,13 +23,13 @@ from starcal_ground.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
 from starcal_ground.report import page as report
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products import product_folder
-from starcal_ros.formats.products.calibration_json import (
+from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
     prior_of,
     read_calibration,
+    REPORT_FILE,
     write_calibration,
 )
-from starcal_ros.formats.products.product_files import REPORT_FILE
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.state import Activation

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_ground.report import verdict
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import GateCheck, SigmaPart, TemperatureTerms
 
 GATE = (

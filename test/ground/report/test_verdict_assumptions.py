@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from starcal_ground.report.verdict import model_rows
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import HeldTerm
 
 

@@ -374,7 +374,7 @@ def test_a_star_tracker_that_drifts_is_named(
         assert 'leave it out of more_star_trackers' in said[0]
 
 
-def test_a_calibration_of_an_older_file_has_no_checks_of_the_model() -> None:
+def test_a_calibration_of_a_message_has_no_checks_of_the_model() -> None:
     found = checks(dataclasses.replace(GOOD, model_checks=None), GateOptions())
     assert 'max_detector_step_px' not in found and 'max_image_variation_px' not in found
 

@@ -18,16 +18,16 @@ from starcal_ros.assessment.lookup import (
     pixels_every,
 )
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
-from starcal_ros.camera.detector_field import degrees, DetectorField
+from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.records import MapCovariance
 
 LENS = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.1, 4e-4, -3e-4]))
-DEGREE = 3
-TERMS = len(degrees(DEGREE))
+OCTAVES = 2
+TERMS = term_count(640, 512, OCTAVES)
 FIELD = DetectorField(
-    640, 512, DEGREE, np.random.default_rng(1).normal(scale=0.3, size=(2, TERMS))
+    640, 512, OCTAVES, np.random.default_rng(1).normal(scale=0.3, size=(2, TERMS))
 )
 WITH_FIELD = CameraModel(640, 512, LENS.parameters, field=FIELD)
 CAMERAS = pytest.mark.parametrize('camera', [LENS, WITH_FIELD], ids=['lens', 'field'])
@@ -53,7 +53,7 @@ def moved(camera: CameraModel, change: np.ndarray) -> tuple[CameraModel, Rotatio
     field = camera.field
     if field is not None:
         coefficients = field.coefficients + change[p + 3 :].reshape(2, -1)
-        field = DetectorField(field.width, field.height, field.degree, coefficients)
+        field = DetectorField(field.width, field.height, field.octaves, coefficients)
     parameters = camera.parameters + change[:p]
     # camera_from_star_tracker <- exp(-[dtheta x]) camera_from_star_tracker (Eq. 11).
     rotation = Rotation.from_rotvec(change[p : p + 3])

@@ -19,7 +19,6 @@ from starcal_ros.camera import (
     project_jacobians,
     project_parameters,
 )
-from starcal_ros.camera.conversion import convert, ros_fit
 from starcal_ros.camera.lens import (
     coefficient_jacobian,
     COEFFICIENTS,
@@ -28,6 +27,7 @@ from starcal_ros.camera.lens import (
     fold_radius2,
     ideal_points,
 )
+from starcal_ros.camera.projection import convert, ros_fit
 
 #           k1   k2    k3    p1     p2     k4    k5   k6
 RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]

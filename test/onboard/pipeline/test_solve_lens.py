@@ -12,7 +12,7 @@ from random_pointings import honesty, of_random_pointings  # type: ignore[import
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
-from starcal_ros.camera.conversion import convert
+from starcal_ros.camera.projection import convert
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.pipeline.solve import estimate_with_smallest_lens
 

@@ -13,7 +13,7 @@ import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 from tiny_campaign import ensemble, values  # type: ignore[import-not-found]
 
-from starcal_ros.formats.messages.observation_messages import (
+from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )

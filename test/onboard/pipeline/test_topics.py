@@ -13,7 +13,7 @@ import pytest
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPES,
     IMAGE_TYPE,
     make_header,

@@ -15,14 +15,14 @@ from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages.message_codec import (
     make_header,
     Message,
     quaternion_to_message,
     vector_to_message,
 )
-from starcal_ros.formats.messages.telemetry import attitude_from_message
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'

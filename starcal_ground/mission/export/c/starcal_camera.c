@@ -18,8 +18,7 @@ enum {
   PART_SIZE = STARCAL_NAME_SIZE + 16,
   MAX_TERMS = 1 << 14,
   INTRINSICS = 5,
-  EQUIDISTANT = 4,
-  COSINE = 2
+  EQUIDISTANT = 4
 };
 
 static const unsigned char MAGIC[8] = {'S', 'T', 'A', 'R', 'C', 'A', 'L', 'T'};
@@ -114,12 +113,11 @@ static void read_header(starcal_camera *camera, const unsigned char *table)
   camera->model = u32_at(table + 20);
   camera->width = u32_at(table + 24);
   camera->height = u32_at(table + 28);
-  camera->family = u32_at(table + 32);
-  camera->term_count = u32_at(table + 36);
-  camera->rank = u32_at(table + 40);
-  camera->part_count = u32_at(table + 44);
-  camera->vector_count = u32_at(table + 48);
-  camera->parameter_count = u32_at(table + 52);
+  camera->term_count = u32_at(table + 32);
+  camera->rank = u32_at(table + 36);
+  camera->part_count = u32_at(table + 40);
+  camera->vector_count = u32_at(table + 44);
+  camera->parameter_count = u32_at(table + 48);
   {
     const uint64_t bits = (uint64_t)u32_at(table + 64) | (uint64_t)u32_at(table + 68) << 32;
     memcpy(&camera->time_ns, &bits, sizeof bits);
@@ -129,8 +127,8 @@ static void read_header(starcal_camera *camera, const unsigned char *table)
 
 static int plausible_header(const starcal_camera *camera)
 {
-  return camera->model <= EQUIDISTANT && camera->family <= COSINE && camera->width > 0 &&
-         camera->height > 0 && camera->width <= 65536 && camera->height <= 65536 &&
+  return camera->model <= EQUIDISTANT && camera->width > 0 && camera->height > 0 &&
+         camera->width <= 65536 && camera->height <= 65536 &&
          camera->parameter_count == INTRINSICS + COEFFICIENT_COUNT[camera->model] &&
          camera->term_count <= MAX_TERMS && camera->rank <= MAX_TERMS &&
          camera->part_count <= 256 && camera->vector_count <= 4096;
@@ -459,35 +457,14 @@ static void cosines(double x, double by_pixel, uint32_t count, double *f, double
   }
 }
 
-static void polynomials(double x, double by_pixel, uint32_t count, double *f, double *slope)
-{
-  uint32_t n;
-  f[0] = 1.0;
-  f[1] = x;
-  slope[0] = 0.0;
-  slope[1] = 1.0;
-  for (n = 1; n + 1 < count; ++n) { /* Bonnet's recursion and its derivative */
-    f[n + 1] = ((2 * n + 1) * x * f[n] - n * f[n - 1]) / (n + 1);
-    slope[n + 1] = ((2 * n + 1) * (f[n] + x * slope[n]) - n * slope[n - 1]) / (n + 1);
-  }
-  for (n = 0; n < count; ++n) {
-    f[n] *= sqrt(2.0 * n + 1);
-    slope[n] *= sqrt(2.0 * n + 1) * by_pixel;
-  }
-}
-
 /* Beyond the detector the field is that at its border. */
 static void waves_along(const starcal_camera *camera, double pixel, uint32_t size, double *f,
                         double *slope)
 {
   const double inside = pixel < -0.5 ? -0.5 : pixel > size - 0.5 ? size - 0.5 : pixel;
   const double moves = inside == pixel ? 1.0 : 0.0;
-  if (camera->family == COSINE) {
-    cosines(((inside + 0.5) / size - 0.5) / DOMAIN_SIDES + 0.5, moves / (DOMAIN_SIDES * size),
-            camera->wave_count, f, slope);
-  } else {
-    polynomials((2 * inside + 1) / size - 1, 2 * moves / size, camera->wave_count, f, slope);
-  }
+  cosines(((inside + 0.5) / size - 0.5) / DOMAIN_SIDES + 0.5, moves / (DOMAIN_SIDES * size),
+          camera->wave_count, f, slope);
 }
 
 static void waves_at(const starcal_camera *camera, const double pixel[2], waves *found)
@@ -506,7 +483,7 @@ static void field_at(const starcal_camera *camera, const double pixel[2], double
   if (slope != NULL) {
     slope[0] = slope[1] = slope[2] = slope[3] = 0.0;
   }
-  if (camera->family == 0) {
+  if (camera->term_count == 0) {
     return;
   }
   waves_at(camera, pixel, &found);
@@ -591,7 +568,7 @@ starcal_status starcal_project(const starcal_camera *camera, const double direct
   }
   at[0] = lens[0];
   at[1] = lens[1];
-  for (k = 0; k < FIELD_STEPS && camera->family != 0; ++k) {
+  for (k = 0; k < FIELD_STEPS && camera->term_count != 0; ++k) {
     const double before[2] = {at[0], at[1]};
     field_at(camera, at, moved, NULL);
     at[0] = lens[0] + moved[0];

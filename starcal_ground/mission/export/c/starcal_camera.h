@@ -51,8 +51,8 @@ typedef struct {
   uint32_t model; /* 0 plumb_bob, 1 rational_polynomial, 2 thin_prism, 3 tilted, 4 equidistant */
   uint32_t width, height;
   uint32_t parameter_count;
-  uint32_t family; /* 0 no field, 1 Legendre polynomials, 2 cosines */
-  uint32_t term_count, rank, part_count, vector_count;
+  uint32_t term_count; /* of the field; 0: no field */
+  uint32_t rank, part_count, vector_count;
   uint32_t wave_count; /* of the field, along the axis that has more */
   int64_t time_ns; /* stamp of the last image of the calibration, Unix */
   unsigned char identity[STARCAL_IDENTITY_SIZE]; /* SHA-256 of the calibration */

@@ -11,7 +11,7 @@ import pytest
 from sample_records import calibration, without_field  # type: ignore[import-not-found]
 
 from starcal_ground.cli.commands.calibrate import print_calibration
-from starcal_ros.camera.conversion import convert
+from starcal_ros.camera.projection import convert
 from starcal_ros.records import SigmaPart
 
 

@@ -11,7 +11,7 @@ import pytest
 import spiceypy
 
 from starcal_ground.cli.main import main
-from starcal_ros.formats.products.calibration_json import write_calibration
+from starcal_ros.formats.products.product_files import write_calibration
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, IMAGE_TYPE, make_header
-from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TYPE, make_header
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
 pytestmark = pytest.mark.slow

@@ -22,7 +22,7 @@ import yaml
 from starcal_ground.mission.export.export_formats import export, Exported, FORMATS
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid, project
-from starcal_ros.camera.conversion import nearest_camera
+from starcal_ros.camera.projection import nearest_camera
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Calibration, SigmaPart

@@ -22,9 +22,9 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.telemetry import attitude_from_message
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.formats.products.product_files import read_calibration
 
 CAMERA = pinhole((1200, 900), 4000.0)
 TURN = Rotation.from_euler('zyx', [40.0, -35.0, 100.0], degrees=True)  # icrf_from_camera

@@ -23,7 +23,7 @@ from starcal_ground.mission.trend.trend_table import (
     Table,
 )
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 
 CAMERAS = Cameras(params=str(TINY / 'params.yaml'))
 

@@ -20,7 +20,7 @@ from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
 from starcal_ground.mission.trend.trend_table import COMPUTED, Table
-from starcal_ros.formats.products.calibration_json import write_calibration
+from starcal_ros.formats.products.product_files import write_calibration
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import pytest
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import frames as frames_module
-from starcal_ros.formats.bag import mcap_reader
+from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag import writer as writer_module
 from starcal_ros.formats.bag.frames import Frame, read_frames, read_telemetry, Telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
@@ -97,7 +97,7 @@ def chunks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         sizes.append(chunk.uncompressed_size)
         return decompress(chunk, validate_crc=validate_crc)
 
-    monkeypatch.setattr(mcap_reader, 'get_chunk_data_stream', counted)
+    monkeypatch.setattr(reader, 'get_chunk_data_stream', counted)
     monkeypatch.setattr(writer_module, '_CHUNK_BYTES', 600)
     return sizes
 

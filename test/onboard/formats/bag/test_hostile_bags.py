@@ -12,7 +12,7 @@ import pytest
 
 from starcal_ground.cli import main
 from starcal_ros.formats.bag.typestore import described
-from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
+from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 
 HEAD = b'\0\1\0\0'  # of CDR, little-endian
 END = '=' * 80

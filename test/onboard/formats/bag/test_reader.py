@@ -24,17 +24,16 @@ from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.formats.bag import writer as writer_module
 from starcal_ros.formats.bag.frames import read_telemetry
-from starcal_ros.formats.bag.mcap_reader import Damage
-from starcal_ros.formats.bag.reader import Topics
+from starcal_ros.formats.bag.reader import Damage, Topics
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.image_messages import color_image_to_message, image_to_message
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
     CALIBRATION_TYPE,
     IMAGE_TYPE,
     stamp_ns,
 )
+from starcal_ros.formats.messages.sensor_messages import color_image_to_message, image_to_message
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 

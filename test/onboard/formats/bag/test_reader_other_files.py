@@ -22,7 +22,7 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import ATTITUDE_TYPE
+from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'

@@ -8,7 +8,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import described, typestore, typestore_of, typestore_with
-from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE, OBSERVATIONS_TYPE
+from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE, OBSERVATIONS_TYPE
 
 END = '=' * 80
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
-from starcal_ros.camera.conversion import ros_fit
+from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.camera_yaml import (
     read_camera_info,

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Calibration and ensemble status to messages and back; standard messages for a camera."""
+"""Star observations, calibration and ensemble status to messages and back."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
-from starcal_ros.camera.conversion import ros_fit
 from starcal_ros.camera.lens import ros_distortion
+from starcal_ros.camera.projection import ros_fit
+from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages.message_codec import (
-    message_fields,
-    plain_message,
-    record_from_message,
-    record_to_message,
-)
-from starcal_ros.formats.messages.message_fields import (
     ALIGNMENT_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
     Make,
     make_header,
     Message,
+    message_fields,
+    OBSERVATIONS_TYPE,
+    plain_message,
     quaternion_to_message,
+    record_from_message,
+    record_to_message,
     STATUS_TYPE,
     vector_to_message,
 )
+from starcal_ros.formats.messages.sensor_messages import refused_from_message
 from starcal_ros.record_fields import Named, plain_record, Quaternion, read_record
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
@@ -36,10 +37,71 @@ from starcal_ros.records import (
     CameraGeometry,
     check_calibration,
     EnsembleStatus,
+    StarObservations,
 )
 
+_VARIANCE_PX2 = (1e-10, 1e6)  # of a measured star, smallest and largest
+_LONGEST_DETAIL = 500  # characters
 # No software on board reads it: it is in calibration.json alone.
 _NOT_SENT = 'model_checks'
+
+
+def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
+    """Return a starcal/StarObservations; ``frame_id`` is the camera's."""
+    values = plain_record(record)
+    return make(OBSERVATIONS_TYPE, **message_fields(StarObservations, values, make, frame_id))
+
+
+def observations_from_message(message: Message) -> StarObservations:
+    """
+    Observations of a starcal/StarObservations.
+
+    Raises ValueError when the arrays of the message do not fit each other or hold values that no
+    star can have.
+    """
+    values = plain_message(StarObservations, message)
+    values['detail'] = values['detail'][:_LONGEST_DETAIL]
+    record = read_record(StarObservations, values)
+    _check_stars(record)
+    return record
+
+
+def checked_observations(message: Message) -> StarObservations:
+    """
+    Observations of a starcal/StarObservations, refused where they hold impossible values.
+
+    The refusal is ``bad_observations``, with the field and its value.
+
+    Raises AttributeError when the message lacks fields.
+    """
+    try:
+        return observations_from_message(message)
+    except ValueError as error:
+        detail = ' '.join(str(error).split())[:_LONGEST_DETAIL]
+        return refused_from_message(message, 0.0, ImageRefused('bad_observations', detail))
+
+
+def _check_stars(record: StarObservations) -> None:
+    """Raise ValueError for values of one field that those of another exclude."""
+    reasons = len(record.refused_stars)
+    if (record.refused_reason >= reasons).any():
+        raise ValueError(
+            f'refused_star_reason: {int(record.refused_reason.max())} is not one of {reasons}'
+            ' reasons'
+        )
+    # The first pixel reaches from -0.5 to 0.5.
+    inside = (record.measured_px >= -1.0) & (record.measured_px <= (record.width, record.height))
+    if not inside.all():
+        u, v = record.measured_px[~inside.all(axis=1)][0]
+        raise ValueError(f'measured_px: ({u:.6g}, {v:.6g}) is outside of the image')
+    uu, uv, vv = record.covariance_px2.T
+    low, high = _VARIANCE_PX2
+    with np.errstate(over='ignore'):
+        definite = (uu > 0) & (uu * vv > uv * uv)
+    if not definite.all():
+        raise ValueError('covariance_px2: not positive definite')
+    if not ((np.minimum(uu, vv) >= low) & (np.maximum(uu, vv) <= high)).all():
+        raise ValueError(f'covariance_px2: a variance is not within {low:g} to {high:g}')
 
 
 @dataclass(frozen=True)

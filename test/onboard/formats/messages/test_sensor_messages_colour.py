@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.messages.image_messages import (
+from starcal_ros.formats.messages.sensor_messages import (
     BAYER_ENCODINGS,
     CHANNELS,
     decode_image,

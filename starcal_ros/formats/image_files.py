@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.file_kinds import FITS, kind_of
-from starcal_ros.formats.images.file_header import (
+from starcal_ros.formats.file_kinds import (
+    FITS,
     has_surplus,
     is_cut_jpeg,
+    kind_of,
     png_header,
     tiff_header,
 )
-from starcal_ros.formats.messages.image_messages import CHANNELS, of_mosaic, plane
+from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import regular_file
 
 _RGB, _GREY = 3, 2

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
-from starcal_ros.formats.messages.message_fields import make_header, stamp_ns
+from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
 
 
 @pytest.mark.parametrize('time_ns', [0, 1, 999_999_999, TIME_NS, -1])

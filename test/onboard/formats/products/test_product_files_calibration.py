@@ -13,24 +13,16 @@ from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from sample_records import (  # type: ignore[import-not-found]
-    assert_same,
-    calibration,
-    calibration_of_0_1,
-    plain_calibration,
-    with_joint_covariance,
-    without_field,
-)
+from sample_records import assert_same, calibration, plain_calibration, without_field  # type: ignore[import-not-found]
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.messages.calibration_messages import calibration_to_message
-from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
-from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE
+from starcal_ros.formats.messages.record_messages import calibration_to_message
+from starcal_ros.formats.products.product_files import read_calibration, write_calibration
 from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms
 
-WRITTEN_BY_0_1 = Path(__file__).resolve().parents[3] / 'data' / 'written_by_0_1'
 GATE = (
     GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
     GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
@@ -149,56 +141,14 @@ def test_a_row_of_a_grid_is_a_line(tmp_path: Path) -> None:
     assert_same(written, read_calibration(path))
 
 
-def test_a_file_of_version_0_1_is_read() -> None:
-    """Written by that version from the sample record; keys have other names since."""
-    found = read_calibration(WRITTEN_BY_0_1 / 'calibration.json')
-    last = GateCheck(
-        'turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'no calibration was in force'
-    )
-    assert repr(found.gate[-1]) == repr(last)
-    assert_same(calibration_of_0_1(), dataclasses.replace(found, gate=found.gate[:-1]))
-
-
-def test_an_older_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / 'c.json'
-    write_calibration(calibration(), path)
-    content = json.loads(path.read_text())
-    del content['temperature'], content['maps'], content['correlation']
-    del (
-        content['gate'],
-        content['star_trackers'],
-        content['model_checks'],
-        content['field'],
-        content['sigma_budget'],
-    )
-    path.write_text(json.dumps(content))
-    assert_same(plain_calibration(), read_calibration(path))
-
-
-def test_a_file_with_the_covariance_of_a_field_itself_is_read(tmp_path: Path) -> None:
-    record = with_joint_covariance()
-    write_calibration(record, tmp_path / 'c.json')
-    content = json.loads((tmp_path / 'c.json').read_text())
-    for name in ('unresolved_px', 'covariance_factor', 'remainder_unit_px', 'remainder'):
-        del content['field'][name]
-    content['field'].update(length=0.4375, amplitude_px=0.02)  # keys of that time
-    (tmp_path / 'c.json').write_text(json.dumps(content))
-    found = read_calibration(tmp_path / 'c.json')
-    assert_same(record, found)
-    assert found.map_covariance.unresolved_px == 0.0
-    assert found.field is not None
-    np.testing.assert_array_equal(found.map_covariance.matrix, found.field.joint_covariance)
-
-
 def test_a_covariance_of_a_field_is_its_factor_and_remainder(tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / 'c.json')
     found = read_calibration(tmp_path / 'c.json')
-    F = np.arange(38.0).reshape(19, 2) / 11
+    F = np.arange(46.0).reshape(23, 2) / 11
     expected = F @ F.T
-    R = np.array([
-        [-10, 0, 0, 0, 0, 0], [-9, -8, 0, 0, 0, 0], [-7, -6, -5, 0, 0, 0], [-4, -3, -2, -1, 0, 0],
-        [0, 1, 2, 3, 4, 0], [5, 6, 7, 8, 9, 10],
-    ]) * np.arange(1.0, 7.0)[:, None] / 7e4  # fmt: skip
+    R = np.zeros((10, 10))
+    R[np.tril_indices(10)] = np.arange(-10, 45)
+    R *= np.arange(1.0, 11.0)[:, None] / 7e4
     expected[13:, 13:] += R @ R.T
     np.testing.assert_allclose(found.map_covariance.matrix, expected, rtol=1e-14)
     assert found.map_covariance.unresolved_px == 0.0625
@@ -257,21 +207,21 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
             lambda c: c['model_checks']['held'][1].update(sigma='a'),
             r"model_checks.held\[1\].sigma: 'a' is not a number",
         ),
-        (lambda c: c['field'].update(degree=2), 'field.coefficients: 3 for an axis, not 6'),
-        (
-            lambda c: c['field'].update(joint_covariance=[[1.0]]),
-            'field: covariance of 1 rows, not 19',
-        ),
-        (lambda c: c['field']['remainder'].pop(), 'field.remainder: 20 numbers, not 21'),
+        (lambda c: c['field'].update(octaves=2), 'field.coefficients: 5 for an axis, not 17'),
+        (lambda c: c['field'].update(octaves=40), 'field.octaves: 40 is not within 1 to 8'),
+        (lambda c: c.pop('model'), "key 'model' is missing"),
+        (lambda c: c['gate'][0].update(kept=c['gate'][0].pop('passed')), 'passed. is missing'),
+        (lambda c: c['field'].pop('covariance_factor'), "key 'field.covariance_factor' is miss"),
+        (lambda c: c['field']['remainder'].pop(), 'field.remainder: 54 numbers, not 55'),
         (
             lambda c: c['field']['remainder'].__setitem__(0, 40000),
             'field.remainder: a number is out of the range of int16',
         ),
         (
             lambda c: c['field'].update(remainder_unit_px=[1.0], remainder=[1]),
-            'field.remainder_unit_px: 1 numbers, not 6',
+            'field.remainder_unit_px: 1 numbers, not 10',
         ),
-        (lambda c: c['field']['covariance_factor'].pop(), 'field: covariance of 18 rows, not 19'),
+        (lambda c: c['field']['covariance_factor'].pop(), 'field: covariance of 22 rows, not 23'),
         (
             lambda c: c['sigma_budget'][1].update(map_arcsec='a'),
             r"sigma_budget\[1\].map_arcsec: 'a' is not a number",

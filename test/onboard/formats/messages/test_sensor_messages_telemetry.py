@@ -10,13 +10,13 @@ import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_fields import (
+from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPES,
     make_header,
     quaternion_to_message,
     vector_to_message,
 )
-from starcal_ros.formats.messages.telemetry import (
+from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
     attitude_to_message,
     latest_at,

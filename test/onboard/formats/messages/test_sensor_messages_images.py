@@ -18,17 +18,17 @@ from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.image_messages import (
+from starcal_ros.formats.messages.message_codec import make_header
+from starcal_ros.formats.messages.record_messages import (
+    observations_from_message,
+    observations_to_message,
+)
+from starcal_ros.formats.messages.sensor_messages import (
     decode_image,
     decode_png,
     image_from_message,
     image_to_message,
     refused_from_message,
-)
-from starcal_ros.formats.messages.message_fields import make_header
-from starcal_ros.formats.messages.observation_messages import (
-    observations_from_message,
-    observations_to_message,
 )
 from starcal_ros.records import Image
 

@@ -11,11 +11,8 @@ import pytest
 from sample_records import plain, status, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.calibration_messages import (
-    status_from_message,
-    status_to_message,
-)
-from starcal_ros.formats.messages.message_fields import stamp_ns
+from starcal_ros.formats.messages.message_codec import stamp_ns
+from starcal_ros.formats.messages.record_messages import status_from_message, status_to_message
 from starcal_ros.records import EnsembleStatus
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.observation_messages import (
+from starcal_ros.formats.messages.record_messages import (
     checked_observations,
     observations_from_message,
     observations_to_message,
@@ -34,7 +35,11 @@ def test_observations_round_trip(make: Any) -> None:
         ('measured_px', np.zeros(9), 'measured_px: 9 numbers, not 5 x 2'),
         ('measured_px', np.full(10, np.nan), r'measured_px\[0\]\[0\]: nan is not a finite number'),
         ('covariance_px2', np.zeros(15), 'not positive definite'),
-        ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
+        (
+            'refused_stars',
+            [SimpleNamespace(reason='blend', count=-1)],
+            'refused_stars.blend: -1 is not',
+        ),
         ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
         ('refused_star_px', np.full(8, np.inf), r'refused_star_px\[0\]\[0\]: inf is not a finite'),
         ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is not one of 2 reasons'),
@@ -63,6 +68,7 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
             np.array([0, 0, np.inf]),
             r'star_tracker_rate_rad_s\[2\]: inf',
         ),
+        ('attitude_gap_s', -1.0, 'attitude_gap_s: -1.0 is not at least 0'),
         ('background_dn', np.inf, 'background_dn: inf is not a finite number'),
         ('width', 2**32 - 1, 'width: 4294967295 is not within 0 to 65536'),
         (
@@ -120,17 +126,3 @@ def test_refused_stars_are_found_by_reason() -> None:
     assert list(places) == ['blend', 'saturated']
     np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
-
-
-def test_older_observations_are_read() -> None:
-    """Fields that were added since have their defaults; an unknown attitude gap was -1."""
-    message = observations_to_message(observations(), 'cam', plain)
-    del message.temperature_degc
-    message.attitude_gap_s = -1.0
-    del message.refused_star_id, message.refused_star_px, message.refused_star_reason
-    del message.star_tracker_rate_rad_s, message.velocity_sigma_m_s
-    record = observations_from_message(message)
-    assert np.isnan(record.temperature_degc) and np.isnan(record.attitude_gap_s)
-    assert np.isnan(record.star_tracker_rate_rad_s).all() and np.isnan(record.velocity_sigma_m_s)
-    assert record.refused_stars == {'blend': 3, 'saturated': 1}
-    assert record.refused_px.shape == (0, 2)
