@@ -25,11 +25,117 @@ from starcal_ros.records import (
 )
 from starcal_ros.text import p_value_text, significant
 
-_PRIOR_FACTOR = 5.0  # of the limits on changes: a prior is not as good as a calibration
+_PRIOR_FACTOR = 5.0  # of the limit on the map: a prior is not as good as a calibration
+_PRIOR_ROTATION = 13.0  # of the limit on the rotation: 1.5 degrees, and 5 degrees in roll
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
 _PART_TOLERANCE = 0.05  # largest accepted deviation of a normalised residual from 1
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
+
+
+@dataclass(frozen=True)
+class GateOptions:
+    """Limits of the gate: a calibration that exceeds one is not activated."""
+
+    max_rejected_fraction: float = option(
+        0.25,
+        'largest fraction of stars rejected as outliers, and of images with an attitude that'
+        ' contradicts the other images',
+        low=0.0,
+        high=1.0,
+    )
+    min_coverage: float = option(
+        0.3, 'smallest fraction of detector cells with a star used', low=0.0, high=1.0
+    )
+    max_map_sigma_px: float = option(
+        0.5,
+        'largest 1-sigma of the distortion map on the detector, common rotation removed, px',
+        low=0.0,
+        high=100.0,
+    )
+    max_change_px: float = option(
+        10.0,
+        'largest change of the distortion map from the active calibration, common rotation'
+        ' removed, px; without one five times as much from the prior',
+        low=0.0,
+        high=1e5,
+    )
+    max_rotation_deg: float = option(
+        0.4,
+        'largest rotation of the lines of sight from the active calibration in the star tracker'
+        ' frame, degrees; without one 13 times as much from the prior, and the angle of 3 % of the'
+        ' longer image side',
+        low=0.0,
+        high=180.0,
+    )
+    max_line_of_sight_sigma_arcsec: float = option(
+        120.0,
+        'largest 1-sigma of a line of sight on the detector in the star tracker frame, arcsec',
+        low=0.0,
+        high=3600.0,
+    )
+    max_held_term_sigma: float = option(
+        5.0,
+        'largest difference between the prior and the estimate from the stars, in sigma, for each'
+        ' unknown that is held or has a stated prior',
+        low=0.0,
+        high=1e6,
+    )
+    max_detector_step_px: float = option(
+        0.2, 'largest step between two parts of the detector, px', low=0.0, high=1e5
+    )
+    max_image_variation_px: float = option(
+        0.3,
+        'largest 1-sigma change of the camera from image to image at a detector corner, px;'
+        ' smaller ones are in the covariance of the camera that images share',
+        low=0.0,
+        high=1e5,
+    )
+    max_cross_validated_residual: float = option(
+        1.2,
+        'largest RMS of residuals over their predicted sigma in any group of stars (by radius,'
+        ' magnitude or time), with each image predicted from the others',
+        low=1.0,
+        high=100.0,
+    )
+    max_star_tracker_drift_arcsec: float = option(
+        30.0,
+        'largest drift of each star tracker over its own images, if there are several, arcsec',
+        low=0.0,
+        high=648000.0,
+    )
+
+
+def limit_check(
+    options: GateOptions | CalibrationOptions,
+    option: str,
+    name: str,
+    found: float,
+    unit: str = '',
+    remedy: str = '',
+    factor: float = 1.0,
+    more: float = 0.0,
+) -> GateCheck:
+    """
+    A value against a multiple of the limit of an option, and something more.
+
+    The remedy is the note of a check that failed.
+    """
+    limit = factor * float(getattr(options, option)) + more
+    # The condition is the one that must hold, so that NaN fails: a comparison with it is false.
+    passed = found >= limit if option.startswith('min_') else found <= limit
+    note = '' if passed else remedy
+    return GateCheck(name, option, float(found), limit, unit, bool(passed), note)
+
+
+def _worse(*checks: GateCheck) -> GateCheck:
+    """Return the check with the larger share of its limit: limits on one question are one row."""
+
+    def share(check: GateCheck) -> float:
+        part = check.found / max(check.limit, 1e-300)
+        return math.inf if math.isnan(part) else part
+
+    return max(checks, key=share)
 
 
 def judge(
@@ -70,7 +176,7 @@ def judge(
         *star_tracker_gate(calibration.star_trackers, options),
         *_fit(calibration, options, estimation),
         *_precision(calibration, options),
-        *_changes(calibration, prior, active, options),
+        _changes(calibration, prior, active, options, estimation),
         *_predicted(calibration.model_checks, options),
     )
 
@@ -103,11 +209,12 @@ def _numbers(calibration: Calibration) -> GateCheck:
             calibration.geometry.camera.parameters,
             calibration.geometry.star_tracker_from_camera_xyzw,
             calibration.covariance.ravel(),
+            [calibration.residual_rms_px],
         ]
     )
     note = ''
     if not np.isfinite(values).all():
-        note = 'a parameter or its covariance is not a finite number'
+        note = 'a parameter, its covariance or the residual is not a finite number'
     elif (np.diag(calibration.covariance) < 0).any():
         note = 'a variance is negative'
     name = 'numbers finite, variances positive'
@@ -117,11 +224,8 @@ def _numbers(calibration: Calibration) -> GateCheck:
 def _fit(
     calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
 ) -> Iterator[GateCheck]:
-    """Residuals, outliers, and the number of images that fit."""
+    """Outliers, and the number of images that fit."""
     stars = max(calibration.stars_used + calibration.stars_rejected, 1)
-    yield limit_check(
-        options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
-    )
     images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
     rejected = (
         (calibration.stars_rejected / stars, 'fraction of stars left out as outliers'),
@@ -143,21 +247,23 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         'fraction of the detector with stars that fit',
         float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
     )
-    yield limit_check(
-        options,
-        'max_map_sigma_px',
-        'largest 1-sigma of the distortion map',
-        _map_sigma_px(calibration),
-        'px',
-    )
     aligned = calibration.has_alignment  # otherwise the common rotation has no meaning
     sigma_arcsec = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
-    yield limit_check(
-        options,
-        'max_line_of_sight_sigma_arcsec',
-        'largest 1-sigma of a line of sight',
-        float(sigma_arcsec.max()),
-        'arcsec',
+    yield _worse(
+        limit_check(
+            options,
+            'max_map_sigma_px',
+            'largest 1-sigma of the distortion map',
+            _map_sigma_px(calibration),
+            'px',
+        ),
+        limit_check(
+            options,
+            'max_line_of_sight_sigma_arcsec',
+            'largest 1-sigma of a line of sight',
+            float(sigma_arcsec.max()),
+            'arcsec',
+        ),
     )
 
 
@@ -174,30 +280,42 @@ def _changes(
     prior: CameraGeometry,
     active: Calibration | None,
     options: GateOptions,
-) -> Iterator[GateCheck]:
-    """Change from the active calibration, or from the prior if none is active."""
-    before, name, factor = prior, 'the prior', _PRIOR_FACTOR
+    estimation: CalibrationOptions,
+) -> GateCheck:
+    """
+    Change from the active calibration, or from the prior if none is active.
+
+    An alignment follows the principal point, which a prior has within a part of the image.
+    """
+    before, name, factors, centre_deg = prior, 'the prior', (_PRIOR_FACTOR, _PRIOR_ROTATION), 0.0
     if active is not None:
-        before, name, factor = active.geometry, 'the active calibration', 1.0
+        before, name, factors = active.geometry, 'the active calibration', (1.0, 1.0)
+    else:
+        camera = prior.camera
+        centre_px = estimation.principal_point_prior * max(camera.width, camera.height)
+        centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
     rotation_rad, left_px = movement(before, calibration.geometry)
     lens = 'the prior camera or its lens model does not match this lens (lens_model)'
-    yield limit_check(
-        options,
-        'max_change_px',
-        f'largest change of the distortion map from {name}',
-        float(left_px.max()),
-        'px',
-        REMEDIES['change of the camera'] if active else lens,
-        factor,
-    )
-    yield limit_check(
-        options,
-        'max_rotation_deg',
-        f'rotation of the lines of sight from {name}',
-        math.degrees(rotation_rad),
-        'deg',
-        REMEDIES['change of the mounting'] if active else '',
-        factor,
+    return _worse(
+        limit_check(
+            options,
+            'max_change_px',
+            f'largest change of the distortion map from {name}',
+            float(left_px.max()),
+            'px',
+            REMEDIES['change of the camera'] if active else lens,
+            factors[0],
+        ),
+        limit_check(
+            options,
+            'max_rotation_deg',
+            f'rotation of the lines of sight from {name}',
+            math.degrees(rotation_rad),
+            'deg',
+            REMEDIES['change of the mounting'] if active else '',
+            factors[1],
+            centre_deg,
+        ),
     )
 
 
@@ -312,99 +430,3 @@ def _significant(
     if not check.passed and not likely:
         note += f'; {remedy}'
     return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)
-
-
-@dataclass(frozen=True)
-class GateOptions:
-    """Limits of the gate: a calibration that exceeds one is not activated."""
-
-    max_residual_rms_px: float = option(
-        1.0, 'largest RMS residual per axis of the stars used, px', low=0.0, high=100.0
-    )
-    max_rejected_fraction: float = option(
-        0.25,
-        'largest fraction of stars rejected as outliers, and of images with an attitude that'
-        ' contradicts the other images',
-        low=0.0,
-        high=1.0,
-    )
-    min_coverage: float = option(
-        0.3, 'smallest fraction of detector cells with a star used', low=0.0, high=1.0
-    )
-    max_map_sigma_px: float = option(
-        0.5,
-        'largest 1-sigma of the distortion map on the detector, common rotation removed, px',
-        low=0.0,
-        high=100.0,
-    )
-    max_change_px: float = option(
-        10.0,
-        'largest change of the distortion map from the active calibration, common rotation'
-        ' removed, px; without one five times as much from the prior',
-        low=0.0,
-        high=1e5,
-    )
-    max_rotation_deg: float = option(
-        0.4,
-        'largest rotation of the lines of sight from the active calibration in the star tracker'
-        ' frame, degrees; without one five times as much from the prior',
-        low=0.0,
-        high=180.0,
-    )
-    max_line_of_sight_sigma_arcsec: float = option(
-        120.0,
-        'largest 1-sigma of a line of sight on the detector in the star tracker frame, arcsec',
-        low=0.0,
-        high=3600.0,
-    )
-    max_held_term_sigma: float = option(
-        5.0,
-        'largest difference between the prior and the estimate from the stars, in sigma, for each'
-        ' unknown that is held or has a stated prior',
-        low=0.0,
-        high=1e6,
-    )
-    max_detector_step_px: float = option(
-        0.2, 'largest step between two parts of the detector, px', low=0.0, high=1e5
-    )
-    max_image_variation_px: float = option(
-        0.3,
-        'largest 1-sigma change of the camera from image to image at a detector corner, px;'
-        ' smaller ones are in the covariance of the camera that images share',
-        low=0.0,
-        high=1e5,
-    )
-    max_cross_validated_residual: float = option(
-        1.2,
-        'largest RMS of residuals over their predicted sigma in any group of stars (by radius,'
-        ' magnitude or time), with each image predicted from the others',
-        low=1.0,
-        high=100.0,
-    )
-    max_star_tracker_drift_arcsec: float = option(
-        30.0,
-        'largest drift of each star tracker over its own images, if there are several, arcsec',
-        low=0.0,
-        high=648000.0,
-    )
-
-
-def limit_check(
-    options: GateOptions | CalibrationOptions,
-    option: str,
-    name: str,
-    found: float,
-    unit: str = '',
-    remedy: str = '',
-    factor: float = 1.0,
-) -> GateCheck:
-    """
-    A value against a multiple of the limit of an option.
-
-    The remedy is the note of a check that failed.
-    """
-    limit = factor * float(getattr(options, option))
-    # The condition is the one that must hold, so that NaN fails: a comparison with it is false.
-    passed = found >= limit if option.startswith('min_') else found <= limit
-    note = '' if passed else remedy
-    return GateCheck(name, option, float(found), limit, unit, bool(passed), note)

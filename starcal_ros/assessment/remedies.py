@@ -24,7 +24,6 @@ REMEDIES: Mapping[str, str] = {
     'glare': 'keep Sun, Moon and Earth out of the field',
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
     # Checks of the gate, by option, with the section of the report.
-    'max_residual_rms_px': 'look for smeared images and a wrong lens model (Residuals)',
     'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'
     ' attitudes and stamps of misfit images (Alignment)',
     'min_images': 'take more images',
