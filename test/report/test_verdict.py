@@ -64,6 +64,16 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
     assert verdict.next_step(refused).startswith('Do not use it for navigation')
 
 
+def test_the_statement_that_lowers_a_sigma_most_is_the_last_of_the_next_step(
+    tiny_products: Path,
+) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    assert calibration.statements[0].option == 'star_tracker_slow_arcsec'
+    assert verdict.next_step(calibration).endswith(
+        f'To lower a sigma most, {calibration.statements[0]}.'
+    )
+
+
 def test_a_refusal_states_the_measures_against_its_failed_checks(tiny_products: Path) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
 

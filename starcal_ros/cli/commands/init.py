@@ -7,6 +7,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
+import itertools
 from pathlib import Path
 import shlex
 import sys
@@ -18,18 +19,18 @@ import yaml
 from starcal_ros.camera import CameraModel
 from starcal_ros.cli.arguments import EXIT_ACCEPTED
 from starcal_ros.cli.terminal import print_text
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.images.photographs import image_paths, Photograph
 from starcal_ros.formats.messages.message_fields import ATTITUDE_TYPES, VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.formats.products.product_files import check_outputs, make_folder, write_atomically
-from starcal_ros.pipeline import night_sky
+from starcal_ros.pipeline import campaign, night_sky, solve
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.from_stars import FromStars
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, Topics
+from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, read, Topics
 from starcal_ros.records import CameraGeometry
 
 CAMERA_FILE, _PARAMS_FILE = 'camera.yaml', 'params.yaml'
@@ -101,7 +102,25 @@ def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
         return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
     options, attitudes = _aligned(bags, asked, camera, kinds[0])
     to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
-    return FirstSetup(camera.camera, options, (words, attitudes), to_state)
+    worth = _worth_stating(bags, asked, camera.camera, options)
+    return FirstSetup(camera.camera, options, (words, attitudes), (*worth, *to_state))
+
+
+def _worth_stating(
+    bags: Sequence[Path], asked: Topics, camera: CameraModel, options: Mapping[str, object]
+) -> tuple[str, ...]:
+    """What to state to lower the sigma of a calibration of the first images; none without one."""
+    prior = CameraGeometry(camera, np.array(options['prior_alignment']))
+    others = {name: value for name, value in options.items() if name != 'prior_alignment'}
+    setup = dataclasses.replace(load_setup(others, prior=prior), is_aligned=True)
+    source = campaign.source_of(bags, setup, asked)
+    images = itertools.islice(read(bags, source.topics, setup), _LOOKED_AT)
+    try:
+        calibration = solve.solve(solve.ensemble_of(images, setup), setup)
+    except TooFewObservations:
+        return ()
+    by = f'by a calibration of {calibration.images_used} images'
+    return tuple(f'{str(row).removeprefix("state ")}, {by}' for row in calibration.statements)
 
 
 def _aligned(

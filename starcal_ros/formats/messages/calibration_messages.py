@@ -38,8 +38,8 @@ from starcal_ros.records import (
     EnsembleStatus,
 )
 
-# No software on board reads it: it is in calibration.json alone.
-_NOT_SENT = 'model_checks'
+# No software on board reads them: they are in calibration.json alone.
+_NOT_SENT = ('model_checks', 'statements')
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,8 @@ class Alignment:
 
 
 def calibration_to_message(calibration: Calibration, make: Make) -> Message:
-    """Return a starcal/Calibration: the record without ``model_checks``."""
-    values = plain_record(calibration)
-    del values[_NOT_SENT]
+    """Return a starcal/Calibration: the record without the parts that nobody on board reads."""
+    values = {k: v for k, v in plain_record(calibration).items() if k not in _NOT_SENT}
     geometry = values.pop('geometry')
     frames = values.pop('parent_frame'), values.pop('child_frame')
     camera = calibration.geometry.camera
