@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
+import itertools
 from pathlib import Path
 import textwrap
 
@@ -16,13 +17,14 @@ from starcal_ground.images import night_sky
 from starcal_ground.images.from_stars import FromStars
 from starcal_ground.images.photographs import Photograph
 from starcal_ros.camera import CameraModel
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPES, VELOCITY_TYPE
+from starcal_ros.pipeline import campaign, solve
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, Topics
+from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, read, Topics
 from starcal_ros.records import CameraGeometry
 
 CAMERA_FILE = 'camera.yaml'  # beside the parameter file
@@ -94,7 +96,25 @@ def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
         return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
     options, attitudes = _aligned(bags, asked, camera, kinds[0])
     to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
-    return FirstSetup(camera.camera, options, (words, attitudes), to_state)
+    worth = _worth_stating(bags, asked, camera.camera, options)
+    return FirstSetup(camera.camera, options, (words, attitudes), (*worth, *to_state))
+
+
+def _worth_stating(
+    bags: Sequence[Path], asked: Topics, camera: CameraModel, options: Mapping[str, object]
+) -> tuple[str, ...]:
+    """Sentences on what to state, by a calibration of the first images; none without one."""
+    prior = CameraGeometry(camera, np.array(options['prior_alignment']))
+    others = {name: value for name, value in options.items() if name != 'prior_alignment'}
+    setup = dataclasses.replace(load_setup(others, prior=prior), is_aligned=True)
+    source = campaign.source_of(bags, setup, asked)
+    images = itertools.islice(read(bags, source.topics, setup), _LOOKED_AT)
+    try:
+        calibration = solve.solve(solve.ensemble_of(images, setup), setup)
+    except TooFewObservations:
+        return ()
+    by = f'by a calibration of {calibration.images_used} images'
+    return tuple(f'{str(row).removeprefix("state ")}, {by}' for row in calibration.statements)
 
 
 def _aligned(

@@ -122,7 +122,7 @@ def _against_sigma(calibration: records.Calibration) -> list[str]:
             steps.append(
                 f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
             )
-    return steps
+    return steps + [f'To lower a sigma most, {row}.' for row in calibration.statements[:1]]
 
 
 @dataclass(frozen=True)

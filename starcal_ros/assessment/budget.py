@@ -32,7 +32,7 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.posterior import common_shape, ErrorParts, TRACKER_NOISE, TRACKER_SLOW
-from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, TOTAL
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, Statement, TOTAL
 from starcal_ros.text import significant
 
 _KNOWN_SHAPE_PX = 1e-7  # moves no pixel by a measurable amount
@@ -46,6 +46,9 @@ _UNKNOWNS = {
     'temperature': ('focal', 'rate'),
 }
 """Entries of the list of unknowns by cause."""
+_SIGMAS = {'stamps': 'stamp_sigma_s', 'mountings': 'star_tracker_mounting_sigma_arcsec'}
+"""Options that are a sigma, by cause: a tenth may be stated."""
+_WORTH_STATING = 0.9  # of the sigma before
 _OF_TRACKERS = (TRACKER_NOISE, TRACKER_SLOW, 'mountings', 'stamps')
 
 
@@ -106,6 +109,59 @@ def sigma_budget(
         for part in found
         if part.cause not in _OF_TRACKERS
     )
+
+
+def statements(
+    parts: Sequence[SigmaPart], estimate: Estimate, options: CalibrationOptions
+) -> tuple[Statement, ...]:
+    """
+    Return what to state to lower the sigma of a budget, the largest fall first.
+
+    The variance of a cause that the stars do not show is in proportion to that of its prior.
+    """
+    total = next(part for part in parts if part.cause == TOTAL)
+    has_alignment = any(part.cause in _OF_TRACKERS for part in parts)
+    scopes = (('camera', 'map_arcsec'), ('pointing', 'pointing_arcsec'))[: 1 + has_alignment]
+    rows = []
+    for part in parts:
+        option, value, left = _to_state(part.cause, estimate, options)
+        for scope, of in scopes if option else ():
+            before, gone = getattr(total, of), getattr(part, of)
+            after = math.sqrt(max(before**2 - (1.0 - left) * gone**2, 0.0))
+            rows.append(Statement(option, value, scope, before, after))
+    by_option: dict[str, Statement] = {}
+    for row in sorted(rows, key=lambda row: row.after_arcsec / max(row.before_arcsec, 1e-300)):
+        if row.after_arcsec < _WORTH_STATING * row.before_arcsec:
+            by_option.setdefault(row.option, row)
+    return tuple(by_option.values())
+
+
+def _to_state(
+    cause: str, estimate: Estimate, options: CalibrationOptions
+) -> tuple[str, str, float]:
+    """
+    Return an option that is not stated, a usual value, and its variance over that assumed.
+
+    The option is empty where there is nothing to state.
+    """
+    layout = estimate.linear.layout
+    if cause == TRACKER_SLOW and not options.star_tracker_slow_arcsec:
+        noise = options.star_tracker_sigma_arcsec
+        if not tracker_sigma_is_given(options):
+            noise = tuple(estimate.star_tracker_sigma_rad / ARCSECOND_RAD)
+        usual = 0.5 * min(noise)
+        return 'star_tracker_slow_arcsec', significant(usual, 2), (usual / _slow(estimate)) ** 2
+    if cause == 'velocity' and options.velocity_sigma_m_s < 0:
+        velocity = 'observer_velocity_m_s, or record the topic velocity'
+        return velocity, 'known to 10 m/s', (10.0 / layout['velocity'].sigma[0]) ** 2
+    if cause == 'read-out' and options.shutter == 'unknown':
+        return 'shutter (and readout_s)', 'global, or rolling with a known readout_s', 0.0
+    if cause == 'refraction':
+        return 'latitude_deg and longitude_deg', 'known', 0.0
+    for name, option in _SIGMAS.items():
+        if cause == name:
+            return option, significant(0.1 * getattr(options, option), 2), 0.01
+    return '', '', 1.0
 
 
 def _part(cause: _Cause) -> SigmaPart:
@@ -301,11 +357,16 @@ def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
         return ''
     stated = options.star_tracker_slow_arcsec
     assumed = f'{significant(stated, 3)}″ stated' if stated else 'not given: as the noise assumed'
+    ratio = max(one.likelihood_ratio for one in estimate.tracker_errors)
+    slow = significant(_slow(estimate), 3)
+    return f'{assumed}; estimated: {slow}″, 2 log L {max(ratio, 0.0):.1f}'
+
+
+def _slow(estimate: Estimate) -> float:
+    """Return the 1-sigma of the slow error of the star trackers, arcsec."""
     noise = float(np.mean([one.noise for one in estimate.tracker_errors]))
     slow = float(np.mean([one.slow for one in estimate.tracker_errors]))
-    unit = float(estimate.star_tracker_sigma_rad.mean()) / max(noise, 1e-12) / ARCSECOND_RAD
-    ratio = max(one.likelihood_ratio for one in estimate.tracker_errors)
-    return f'{assumed}; estimated: {significant(slow * unit, 3)}″, 2 log L {max(ratio, 0.0):.1f}'
+    return slow * float(estimate.star_tracker_sigma_rad.mean()) / max(noise, 1e-12) / ARCSECOND_RAD
 
 
 def _of_held(estimate: Estimate) -> str:

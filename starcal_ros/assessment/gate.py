@@ -25,302 +25,17 @@ from starcal_ros.records import (
 )
 from starcal_ros.text import p_value_text, significant
 
-_PRIOR_FACTOR = 5.0  # of the limits on changes: a prior is not as good as a calibration
+_PRIOR_FACTOR = 5.0  # of the limit on the map: a prior is not as good as a calibration
+_PRIOR_ROTATION = 13.0  # of the limit on the rotation: 1.5 degrees, and 5 degrees in roll
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
-_PART_TOLERANCE = 0.05  # largest accepted deviation of a normalised residual from 1
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
-
-
-def judge(
-    calibration: Calibration,
-    prior: CameraGeometry,
-    active: Calibration | None,
-    options: GateOptions,
-    estimation: CalibrationOptions,
-) -> tuple[GateCheck, ...]:
-    """
-    The checks of the gate on a calibration, each with the value found and whether it passed.
-
-    Raises ValueError when the calibration has no maps.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        With its `DetectorMaps`; its verdict is not used.
-    prior : CameraGeometry
-        Camera and alignment before the calibration.
-    active : Calibration or None
-        The calibration that this one would replace.
-    estimation : CalibrationOptions
-        The options of the calibration; they hold some of the limits.
-
-    Returns
-    -------
-    tuple of GateCheck
-        Only the first two if a parameter or a variance is not finite, because the others use them.
-    """
-    checks = (_solver(calibration), _numbers(calibration))
-    if not checks[-1].passed:
-        return checks
-    # Causes come before their effects: the first reason of a refusal is what to mend.
-    return (
-        *checks,
-        *model_gate(calibration.model_checks, options),
-        *star_tracker_gate(calibration.star_trackers, options),
-        *_fit(calibration, options, estimation),
-        *_precision(calibration, options),
-        *_changes(calibration, prior, active, options),
-        *_predicted(calibration.model_checks, options),
-    )
-
-
-def reasons_of(checks: Iterable[GateCheck]) -> tuple[str, ...]:
-    """A sentence for each failed check; empty if all passed."""
-    return tuple(_reason(check) for check in checks if check.passed is False)
-
-
-def _reason(check: GateCheck) -> str:
-    if not check.option:
-        return check.note
-    side = 'under' if check.is_least else 'over'
-    note = f'; {check.note}' if check.note else ''
-    return (
-        f'{check.name} is {check.found_text}, {side} the limit of {check.limit_text} '
-        f'({check.option}){note}'
-    )
-
-
-def _solver(calibration: Calibration) -> GateCheck:
-    passed = calibration.termination == 'converged'
-    note = '' if passed else f'the solver did not converge ({calibration.termination})'
-    return GateCheck('solver converged', '', math.nan, math.nan, '', passed, note)
-
-
-def _numbers(calibration: Calibration) -> GateCheck:
-    values = np.concatenate(
-        [
-            calibration.geometry.camera.parameters,
-            calibration.geometry.star_tracker_from_camera_xyzw,
-            calibration.covariance.ravel(),
-        ]
-    )
-    note = ''
-    if not np.isfinite(values).all():
-        note = 'a parameter or its covariance is not a finite number'
-    elif (np.diag(calibration.covariance) < 0).any():
-        note = 'a variance is negative'
-    name = 'numbers finite, variances positive'
-    return GateCheck(name, '', math.nan, math.nan, '', not note, note)
-
-
-def _fit(
-    calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
-) -> Iterator[GateCheck]:
-    """Residuals, outliers, and the number of images that fit."""
-    stars = max(calibration.stars_used + calibration.stars_rejected, 1)
-    yield limit_check(
-        options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
-    )
-    images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
-    rejected = (
-        (calibration.stars_rejected / stars, 'fraction of stars left out as outliers'),
-        (misfits / max(images, 1), 'fraction of images whose attitude does not fit'),
-    )
-    fraction, name = max(rejected)
-    yield limit_check(options, 'max_rejected_fraction', name, fraction)
-    yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
-
-
-def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
-    """Coverage of the detector and precision of the result."""
-    maps = calibration.maps
-    if maps is None:
-        raise ValueError('calibration: the gate needs its detector maps')
-    yield limit_check(
-        options,
-        'min_coverage',
-        'fraction of the detector with stars that fit',
-        float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
-    )
-    yield limit_check(
-        options,
-        'max_map_sigma_px',
-        'largest 1-sigma of the distortion map',
-        _map_sigma_px(calibration),
-        'px',
-    )
-    aligned = calibration.has_alignment  # otherwise the common rotation has no meaning
-    sigma_arcsec = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
-    yield limit_check(
-        options,
-        'max_line_of_sight_sigma_arcsec',
-        'largest 1-sigma of a line of sight',
-        float(sigma_arcsec.max()),
-        'arcsec',
-    )
-
-
-def _map_sigma_px(calibration: Calibration) -> float:
-    """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
-    try:
-        return float(map_sigma_px(calibration.geometry.camera, calibration.map_covariance).max())
-    except np.linalg.LinAlgError:
-        return math.nan
-
-
-def _changes(
-    calibration: Calibration,
-    prior: CameraGeometry,
-    active: Calibration | None,
-    options: GateOptions,
-) -> Iterator[GateCheck]:
-    """Change from the active calibration, or from the prior if none is active."""
-    before, name, factor = prior, 'the prior', _PRIOR_FACTOR
-    if active is not None:
-        before, name, factor = active.geometry, 'the active calibration', 1.0
-    rotation_rad, left_px = movement(before, calibration.geometry)
-    lens = 'the prior camera or its lens model does not match this lens (lens_model)'
-    yield limit_check(
-        options,
-        'max_change_px',
-        f'largest change of the distortion map from {name}',
-        float(left_px.max()),
-        'px',
-        REMEDIES['change of the camera'] if active else lens,
-        factor,
-    )
-    yield limit_check(
-        options,
-        'max_rotation_deg',
-        f'rotation of the lines of sight from {name}',
-        math.degrees(rotation_rad),
-        'deg',
-        REMEDIES['change of the mounting'] if active else '',
-        factor,
-    )
-
-
-def star_tracker_gate(
-    found: tuple[StarTrackerAlignment, ...], options: GateOptions
-) -> Iterator[GateCheck]:
-    """The drift of each of several star trackers."""
-    for one in found:
-        if math.isfinite(one.drift_p_value):
-            yield _significant(
-                options,
-                'max_star_tracker_drift_arcsec',
-                f'drift of the attitude of {one.frame} against the stars',
-                one.drift_arcsec,
-                'arcsec',
-                one.drift_p_value,
-                'that star tracker or its mounting moves: leave it out of more_star_trackers, or'
-                ' collect images over a shorter time',
-                _DRIFT_P_VALUE,
-            )
-
-
-def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
-    """Contradictions between the stars and the model with its priors, each with the remedy."""
-    if found is None:
-        return
-    yield limit_check(
-        options,
-        'max_image_variation_px',
-        'change of the camera from image to image in a corner',
-        found.image_variation_px,
-        'px',
-        f'focal length or lens changes between images: {REMEDIES["change from image to image"]}',
-    )
-    step = found.step
-    yield _significant(
-        options,
-        'max_detector_step_px',
-        f'step of the detector in {step.moved} at {step.across} = {step.place_px:.0f}',
-        abs(step.size_px),
-        'px',
-        step.p_value,
-        REMEDIES['detector step'],
-        _STEP_P_VALUE,
-    )
-    for term in found.held:
-        check = limit_check(
-            options,
-            'max_held_term_sigma',
-            f'distance of {term.name} from its assumed value',
-            term.significance,
-            'sigma',
-        )
-        estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-        note = f'the stars put {term.name} at {estimated}, assumed is {assumed}'
-        if not check.passed:
-            note += '; ' + REMEDIES.get(
-                f'assumed {term.name.replace(" ", "_").partition("_")[0]}',
-                f'estimate {term.name}, or widen its prior (estimate, prior_sigma)',
-            )
-        yield dataclasses.replace(check, note=note)
-
-
-def _group(part: ResidualBin) -> str:
-    first = 1 if part.by == 'image' else 0  # images are numbered from 1 on the report
-    return f'{part.by} {part.low + first:.4g} to {part.high + first:.4g}'
-
-
-def _predicted(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
-    """The part of the data with the largest ratio of residuals to their predicted sigma."""
-    bins = found.predictions if found else ()
-    if not bins:
-        return
-
-    def excess(part: ResidualBin) -> float:
-        # The noise of a few stars must not fail a part.
-        return part.normalised - _PART_SIGMAS * part.sigma
-
-    worst = max(bins, key=excess)
-    doubtful = [
-        f'{_group(part)}: {part.normalised:.3f}'
-        for part in bins
-        if abs(part.normalised - 1.0) > max(_PART_TOLERANCE, _PART_SIGMAS * part.sigma)
-    ]
-    check = limit_check(
-        options,
-        'max_cross_validated_residual',
-        f'residual over predicted sigma at {_group(worst)}',
-        worst.normalised,
-    )
-    passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual
-    note = f'not within {_PART_TOLERANCE:.0%} of 1: {", ".join(doubtful)}' if doubtful else ''
-    if not passed:
-        note = 'the sigma is wrong there: check the PSF, the lens model or those images'
-    yield dataclasses.replace(check, passed=passed, note=note)
-
-
-def _significant(
-    options: GateOptions,
-    option: str,
-    name: str,
-    found: float,
-    unit: str,
-    p_value: float,
-    remedy: str,
-    least_p_value: float,
-) -> GateCheck:
-    """A check that fails if the value exceeds its limit and is significant."""
-    check = limit_check(options, option, name, found, unit)
-    likely = not p_value < least_p_value
-    note = f'p-value {p_value_text(p_value)}'
-    if not check.passed and not likely:
-        note += f'; {remedy}'
-    return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)
 
 
 @dataclass(frozen=True)
 class GateOptions:
     """Limits of the gate: a calibration that exceeds one is not activated."""
 
-    max_residual_rms_px: float = option(
-        1.0, 'largest RMS residual per axis of the stars used, px', low=0.0, high=100.0
-    )
     max_rejected_fraction: float = option(
         0.25,
         'largest fraction of stars rejected as outliers, and of images with an attitude that'
@@ -347,7 +62,8 @@ class GateOptions:
     max_rotation_deg: float = option(
         0.4,
         'largest rotation of the lines of sight from the active calibration in the star tracker'
-        ' frame, degrees; without one five times as much from the prior',
+        ' frame, degrees; without one 13 times as much from the prior, and the angle of 3 % of the'
+        ' longer image side',
         low=0.0,
         high=180.0,
     )
@@ -397,14 +113,313 @@ def limit_check(
     unit: str = '',
     remedy: str = '',
     factor: float = 1.0,
+    more: float = 0.0,
 ) -> GateCheck:
     """
-    A value against a multiple of the limit of an option.
+    A value against a multiple of the limit of an option, and something more.
 
     The remedy is the note of a check that failed.
     """
-    limit = factor * float(getattr(options, option))
+    limit = factor * float(getattr(options, option)) + more
     # The condition is the one that must hold, so that NaN fails: a comparison with it is false.
     passed = found >= limit if option.startswith('min_') else found <= limit
     note = '' if passed else remedy
     return GateCheck(name, option, float(found), limit, unit, bool(passed), note)
+
+
+def _worse(*checks: GateCheck) -> GateCheck:
+    """Return the check with the larger share of its limit: limits on one question are one row."""
+
+    def share(check: GateCheck) -> float:
+        part = check.found / max(check.limit, 1e-300)
+        return math.inf if math.isnan(part) else part
+
+    return max(checks, key=share)
+
+
+def judge(
+    calibration: Calibration,
+    prior: CameraGeometry,
+    active: Calibration | None,
+    options: GateOptions,
+    estimation: CalibrationOptions,
+) -> tuple[GateCheck, ...]:
+    """
+    The checks of the gate on a calibration, each with the value found and whether it passed.
+
+    Raises ValueError when the calibration has no maps.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its `DetectorMaps`; its verdict is not used.
+    prior : CameraGeometry
+        Camera and alignment before the calibration.
+    active : Calibration or None
+        The calibration that this one would replace.
+    estimation : CalibrationOptions
+        The options of the calibration; they hold some of the limits.
+
+    Returns
+    -------
+    tuple of GateCheck
+        Only the first two if a parameter or a variance is not finite, because the others use them.
+    """
+    checks = (_solver(calibration), _numbers(calibration))
+    if not checks[-1].passed:
+        return checks
+    # Causes come before their effects: the first reason of a refusal is what to mend.
+    return (
+        *checks,
+        *model_gate(calibration.model_checks, options),
+        *star_tracker_gate(calibration.star_trackers, options),
+        *_fit(calibration, options, estimation),
+        *_precision(calibration, options),
+        _changes(calibration, prior, active, options, estimation),
+        *_predicted(calibration.model_checks, options),
+    )
+
+
+def reasons_of(checks: Iterable[GateCheck]) -> tuple[str, ...]:
+    """A sentence for each failed check; empty if all passed."""
+    return tuple(_reason(check) for check in checks if check.passed is False)
+
+
+def _reason(check: GateCheck) -> str:
+    if not check.option:
+        return check.note
+    side = 'under' if check.is_least else 'over'
+    note = f'; {check.note}' if check.note else ''
+    return (
+        f'{check.name} is {check.found_text}, {side} the limit of {check.limit_text} '
+        f'({check.option}){note}'
+    )
+
+
+def _solver(calibration: Calibration) -> GateCheck:
+    passed = calibration.termination == 'converged'
+    note = '' if passed else f'the solver did not converge ({calibration.termination})'
+    return GateCheck('solver converged', '', math.nan, math.nan, '', passed, note)
+
+
+def _numbers(calibration: Calibration) -> GateCheck:
+    values = np.concatenate(
+        [
+            calibration.geometry.camera.parameters,
+            calibration.geometry.star_tracker_from_camera_xyzw,
+            calibration.covariance.ravel(),
+            [calibration.residual_rms_px],
+        ]
+    )
+    note = ''
+    if not np.isfinite(values).all():
+        note = 'a parameter, its covariance or the residual is not a finite number'
+    elif (np.diag(calibration.covariance) < 0).any():
+        note = 'a variance is negative'
+    name = 'numbers finite, variances positive'
+    return GateCheck(name, '', math.nan, math.nan, '', not note, note)
+
+
+def _fit(
+    calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
+) -> Iterator[GateCheck]:
+    """Outliers, and the number of images that fit."""
+    stars = max(calibration.stars_used + calibration.stars_rejected, 1)
+    images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
+    rejected = (
+        (calibration.stars_rejected / stars, 'fraction of stars left out as outliers'),
+        (misfits / max(images, 1), 'fraction of images whose attitude does not fit'),
+    )
+    fraction, name = max(rejected)
+    yield limit_check(options, 'max_rejected_fraction', name, fraction)
+    yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
+
+
+def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
+    """Coverage of the detector and precision of the result."""
+    maps = calibration.maps
+    if maps is None:
+        raise ValueError('calibration: the gate needs its detector maps')
+    yield limit_check(
+        options,
+        'min_coverage',
+        'fraction of the detector with stars that fit',
+        float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
+    )
+    aligned = calibration.has_alignment  # otherwise the common rotation has no meaning
+    sigma_arcsec = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
+    yield _worse(
+        limit_check(
+            options,
+            'max_map_sigma_px',
+            'largest 1-sigma of the distortion map',
+            _map_sigma_px(calibration),
+            'px',
+        ),
+        limit_check(
+            options,
+            'max_line_of_sight_sigma_arcsec',
+            'largest 1-sigma of a line of sight',
+            float(sigma_arcsec.max()),
+            'arcsec',
+        ),
+    )
+
+
+def _map_sigma_px(calibration: Calibration) -> float:
+    """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
+    try:
+        return float(map_sigma_px(calibration.geometry.camera, calibration.map_covariance).max())
+    except np.linalg.LinAlgError:
+        return math.nan
+
+
+def _changes(
+    calibration: Calibration,
+    prior: CameraGeometry,
+    active: Calibration | None,
+    options: GateOptions,
+    estimation: CalibrationOptions,
+) -> GateCheck:
+    """
+    Change from the active calibration, or from the prior if none is active.
+
+    An alignment follows the principal point, which a prior has within a part of the image.
+    """
+    before, name, factors, centre_deg = prior, 'the prior', (_PRIOR_FACTOR, _PRIOR_ROTATION), 0.0
+    if active is not None:
+        before, name, factors = active.geometry, 'the active calibration', (1.0, 1.0)
+    else:
+        camera = prior.camera
+        centre_px = estimation.principal_point_prior * max(camera.width, camera.height)
+        centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
+    rotation_rad, left_px = movement(before, calibration.geometry)
+    lens = 'the prior camera or its lens model does not match this lens (lens_model)'
+    return _worse(
+        limit_check(
+            options,
+            'max_change_px',
+            f'largest change of the distortion map from {name}',
+            float(left_px.max()),
+            'px',
+            REMEDIES['change of the camera'] if active else lens,
+            factors[0],
+        ),
+        limit_check(
+            options,
+            'max_rotation_deg',
+            f'rotation of the lines of sight from {name}',
+            math.degrees(rotation_rad),
+            'deg',
+            REMEDIES['change of the mounting'] if active else '',
+            factors[1],
+            centre_deg,
+        ),
+    )
+
+
+def star_tracker_gate(
+    found: tuple[StarTrackerAlignment, ...], options: GateOptions
+) -> Iterator[GateCheck]:
+    """The drift of each of several star trackers."""
+    for one in found:
+        if math.isfinite(one.drift_p_value):
+            yield _significant(
+                options,
+                'max_star_tracker_drift_arcsec',
+                f'drift of the attitude of {one.frame} against the stars',
+                one.drift_arcsec,
+                'arcsec',
+                one.drift_p_value,
+                'leave it out of more_star_trackers, or take images over a shorter time',
+                _DRIFT_P_VALUE,
+            )
+
+
+def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
+    """Contradictions between the stars and the model with its priors, each with the remedy."""
+    if found is None:
+        return
+    yield limit_check(
+        options,
+        'max_image_variation_px',
+        'change of the camera from image to image in a corner',
+        found.image_variation_px,
+        'px',
+        f'focal length or lens changes: {REMEDIES["change from image to image"]}',
+    )
+    step = found.step
+    yield _significant(
+        options,
+        'max_detector_step_px',
+        f'step of the detector in {step.moved} at {step.across} = {step.place_px:.0f}',
+        abs(step.size_px),
+        'px',
+        step.p_value,
+        REMEDIES['detector step'],
+        _STEP_P_VALUE,
+    )
+    for term in found.held:
+        check = limit_check(
+            options,
+            'max_held_term_sigma',
+            f'distance of {term.name} from its assumed value',
+            term.significance,
+            'sigma',
+        )
+        estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
+        note = f'{estimated} by the stars, {assumed} assumed'
+        if not check.passed:
+            note += '; ' + REMEDIES.get(
+                f'assumed {term.name.replace(" ", "_").partition("_")[0]}',
+                'estimate it, or widen its prior (estimate, prior_sigma)',
+            )
+        yield dataclasses.replace(check, note=note)
+
+
+def _group(part: ResidualBin) -> str:
+    first = 1 if part.by == 'image' else 0  # images are numbered from 1 on the report
+    return f'{part.by} {part.low + first:.4g} to {part.high + first:.4g}'
+
+
+def _predicted(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
+    """The part of the data with the largest ratio of residuals to their predicted sigma."""
+    bins = found.predictions if found else ()
+    if not bins:
+        return
+
+    def excess(part: ResidualBin) -> float:
+        # The noise of a few stars must not fail a part.
+        return part.normalised - _PART_SIGMAS * part.sigma
+
+    worst = max(bins, key=excess)
+    check = limit_check(
+        options,
+        'max_cross_validated_residual',
+        f'residual over predicted sigma at {_group(worst)}',
+        worst.normalised,
+    )
+    passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual
+    note = (
+        '' if passed else 'the sigma is wrong there: check the PSF, the lens model or its images'
+    )
+    yield dataclasses.replace(check, passed=passed, note=note)
+
+
+def _significant(
+    options: GateOptions,
+    option: str,
+    name: str,
+    found: float,
+    unit: str,
+    p_value: float,
+    remedy: str,
+    least_p_value: float,
+) -> GateCheck:
+    """A check that fails if the value exceeds its limit and is significant."""
+    check = limit_check(options, option, name, found, unit)
+    likely = not p_value < least_p_value
+    note = f'p-value {p_value_text(p_value)}'
+    if not check.passed and not likely:
+        note += f'; {remedy}'
+    return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)

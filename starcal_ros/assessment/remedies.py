@@ -24,7 +24,6 @@ REMEDIES: Mapping[str, str] = {
     'glare': 'keep Sun, Moon and Earth out of the field',
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
     # Checks of the gate, by option, with the section of the report.
-    'max_residual_rms_px': 'look for smeared images and a wrong lens model (Residuals)',
     'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'
     ' attitudes and stamps of misfit images (Alignment)',
     'min_images': 'take more images',
@@ -33,11 +32,10 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'the velocity or the clock is wrong, or air bends the light: check the '
-    'velocity topic, the stamps and the site',
+    'assumed velocity': 'check the velocity topic, the stamps and the site',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
-    'assumed mounting': 'check more_alignments, or widen star_tracker_mounting_sigma_arcsec',
+    'assumed mounting': 'check more_alignments',
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
     # Causes of the sigma of a line of sight (`SigmaPart.cause`).
     'stars': 'take more images',
@@ -47,13 +45,12 @@ REMEDIES: Mapping[str, str] = {
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'estimate with temperature, or calibrate each state separately',
+    'change from image to image': 'estimate with temperature, or calibrate each state alone',
     'star places': 'take more images of other star fields',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',
     'star tracker noise': 'take more images',
-    'star tracker slow error': 'take images in more attitudes of the star tracker, or state the '
-    'size of this error (star_tracker_slow_arcsec)',
+    'star tracker slow error': 'take images in more attitudes of the star tracker',
     'held parameters': 'estimate the held parameters (estimate)',
 }
 """Name -> remedy; a check of the gate that has none states it in its note."""

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment import observability
-from starcal_ros.assessment.budget import sigma_budget
+from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.residuals import Residuals, residuals_of
@@ -194,6 +194,8 @@ def _not_judged(
         result.information, result.information_names
     )
     stamps_ns = [image.time_ns for image in ensemble.images]
+    is_aligned = bool(setup.frames.star_tracker_frame)
+    budget = sigma_budget(result, setup.calibration, has_alignment=is_aligned)
     return Calibration(
         time_ns=max(stamps_ns),
         first_image_ns=min(stamps_ns),
@@ -236,9 +238,8 @@ def _not_judged(
         ),
         model_checks=model_checks(result),
         field=factored_field(field, result.map_covariance) if field else None,
-        sigma_budget=sigma_budget(
-            result, setup.calibration, has_alignment=bool(setup.frames.star_tracker_frame)
-        ),
+        sigma_budget=budget,
+        statements=statements(budget, result, setup.calibration),
     )
 
 

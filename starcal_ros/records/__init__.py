@@ -31,6 +31,7 @@ from starcal_ros.records.calibration_parts import (
     ResidualField,
     SigmaPart,
     StarTrackerAlignment,
+    Statement,
     TOTAL,
 )
 from starcal_ros.records.observations import (

@@ -21,6 +21,7 @@ from starcal_ros.records.calibration_parts import (
     ResidualField,
     SigmaPart,
     StarTrackerAlignment,
+    Statement,
 )
 from starcal_ros.text import significant
 
@@ -240,6 +241,8 @@ class Calibration:
         The checks of the gate; empty where not recorded.
     sigma_budget : tuple of SigmaPart
         The total, then the causes; empty where not recorded.
+    statements : tuple of Statement
+        What to state to lower a sigma, the largest fall first.
     """
 
     time_ns: Stamp
@@ -281,6 +284,7 @@ class Calibration:
     field: ResidualField | None = None
     gate: tuple[GateCheck, ...] = ()
     sigma_budget: tuple[SigmaPart, ...] = ()
+    statements: tuple[Statement, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the size of the covariance."""

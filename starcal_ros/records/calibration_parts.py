@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.record_fields import Count, Finite, Quaternion, Shape, Within
+from starcal_ros.text import significant
 
 TOTAL = 'total'
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
@@ -183,6 +184,28 @@ class SigmaPart:
     pointing_arcsec: float
     assumption: str
     map_over_detector_arcsec: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Statement:
+    """
+    A value of a data sheet that no option states, with the 1-sigma before and after stating it.
+
+    ``scope`` is ``pointing``, lines of sight in the star tracker frame, or ``camera``, those of
+    the camera alone, RMS over the detector; ``value`` is what the option would be set to.
+    """
+
+    option: str
+    value: str
+    scope: str
+    before_arcsec: float
+    after_arcsec: float
+
+    def __str__(self) -> str:
+        """Sentence for a user."""
+        before, after = (significant(s, 2) for s in (self.before_arcsec, self.after_arcsec))
+        text = f'state {self.option}: {self.scope} {before}″ becomes {after}″'
+        return f'{text} if it is {self.value}'
 
 
 def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:

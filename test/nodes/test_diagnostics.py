@@ -167,13 +167,13 @@ def test_a_stored_calibration_that_the_gate_refuses_is_not_active(
     with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
         archive.keep(Ensemble(), (Activation(1, 0, stored),))
     ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', f'state_dir:={tmp_path}/state')
-    first = start_node('calibrator', ros=(*ros, '-p', 'max_residual_rms_px:=0.001'))
+    first = start_node('calibrator', ros=(*ros, '-p', 'max_change_px:=1e-6'))
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     client.until(lambda: 'images' in newest(diagnostics, 'calibrator')[2])
     level, text, values = newest(diagnostics, 'calibrator')
     assert level == b'\x01'
-    assert text.startswith('calibration 1 is not active, the gate refuses it now: residual')
-    assert 'max_residual_rms_px' in text and text in first.said()
+    assert text.startswith('calibration 1 is not active, the gate refuses it now: largest change')
+    assert 'max_change_px' in text and text in first.said()
     assert values['active'] == 'none' and values['last_gate'] == f'refused: {text}'
     assert values['state_refused_calibrations'] == '1'
     first.stop()

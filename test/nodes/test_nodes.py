@@ -253,7 +253,7 @@ def test_gate_refusal_and_force(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
 ) -> None:
     """A refused candidate is only in the response, unless it is forced."""
-    calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_residual_rms_px:=0.001'))
+    calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_change_px:=1e-6'))
     send_observations(client, tiny_products)
     status = client.latched(EnsembleStatus, 'ensemble_status')
     client.until(lambda: status and status[-1].images >= 10)

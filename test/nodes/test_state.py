@@ -156,7 +156,7 @@ def test_the_time_of_an_activation_is_read_when_it_is_made(
 def test_what_is_forced_says_so(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
-    gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    gate = dataclasses.replace(setup.gate, max_change_px=1e-6)
     state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
     refused = state.solve()
     assert not refused.success and refused.calibration is not None
@@ -307,12 +307,13 @@ def test_the_gate_of_today_judges_what_was_stored(
     kept = sorted((tmp_path / 'calibrations').iterdir())
     camera = setup.prior.camera.replace(fx=2400.0, fy=2400.0)
     turned = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    tighter = dataclasses.replace(setup.gate, max_change_px=1e-6)
     for changed, option in (
-        (dataclasses.replace(setup, prior=CameraGeometry(camera, turned)), 'max_change_px'),
+        (dataclasses.replace(setup, prior=dataclasses.replace(setup.prior, camera=camera)),
+         'max_change_px'),
         (dataclasses.replace(setup, prior=CameraGeometry(setup.prior.camera, turned)),
          'max_rotation_deg'),
-        (dataclasses.replace(setup, gate=tighter), 'max_residual_rms_px'),
+        (dataclasses.replace(setup, gate=tighter), 'max_change_px'),
     ):  # fmt: skip
         state = started(changed, tmp_path)
         assert state.active is None
@@ -333,7 +334,7 @@ def test_the_gate_judges_what_is_in_memory_alone(
     state = filled(setup, shown)
     assert state.solve().success
     state.close()
-    tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    tighter = dataclasses.replace(setup.gate, max_change_px=1e-6)
     state.open(dataclasses.replace(setup, gate=tighter), CalibratorOptions())
     assert state.active is None and len(state.withheld) == 1
     state.open(setup, CalibratorOptions())
@@ -360,7 +361,7 @@ def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(
 def test_what_was_forced_stays_for_its_own_reasons_only(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
-    gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    gate = dataclasses.replace(setup.gate, max_change_px=1e-6)
     state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
     assert state.solve(force=True).success
     state.close()
@@ -370,7 +371,7 @@ def test_what_was_forced_stays_for_its_own_reasons_only(
     tighter = dataclasses.replace(gate, max_map_sigma_px=1e-6)
     state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
     assert state.active is None and 'max_map_sigma_px' in state.withheld[0]
-    assert 'max_residual_rms_px' not in state.withheld[0]
+    assert 'max_change_px' not in state.withheld[0]
     state.close()
 
 

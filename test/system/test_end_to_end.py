@@ -149,16 +149,16 @@ def test_observations_are_not_calibrated_in_place(tiny_products: Path, tmp_path:
 def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
     content = yaml.safe_load((TINY / 'params.yaml').read_text())
     values = content['/**']['ros__parameters']
-    values |= {'camera_info_url': str(TINY / 'camera.yaml'), 'max_residual_rms_px': 1e-3}
+    values |= {'camera_info_url': str(TINY / 'camera.yaml'), 'max_change_px': 1e-6}
     params = tmp_path / 'params.yaml'
     params.write_text(yaml.safe_dump(content))
     done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
     assert done.returncode == 3
     assert done.stderr == ''
-    assert 'max_residual_rms_px' in done.stdout
+    assert 'max_change_px' in done.stdout
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert not calibration.accepted
-    assert 'max_residual_rms_px' in calibration.reasons[0]
+    assert 'max_change_px' in calibration.reasons[0]
     assert (tmp_path / 'out' / 'camera_info.yaml').is_file()
 
 

@@ -245,6 +245,8 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
         print_verdict(True, 'verdict         accepted')
     else:
         print_verdict(False, f'verdict         refused: {"; ".join(calibration.reasons)}')
+    for statement in calibration.statements[:1]:
+        print_text(f'lower sigma     {statement}')
 
 
 def _print_budget(calibration: Calibration) -> None:

@@ -42,8 +42,8 @@ from starcal_ros.records import (
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # of a measured star, smallest and largest
 _LONGEST_DETAIL = 500  # characters
-# No software on board reads it: it is in calibration.json alone.
-_NOT_SENT = 'model_checks'
+# No software on board reads them: they are in calibration.json alone.
+_NOT_SENT = ('model_checks', 'statements')
 
 
 def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
@@ -114,9 +114,8 @@ class Alignment:
 
 
 def calibration_to_message(calibration: Calibration, make: Make) -> Message:
-    """Return a starcal/Calibration: the record without ``model_checks``."""
-    values = plain_record(calibration)
-    del values[_NOT_SENT]
+    """Return a starcal/Calibration: the record without the parts that nobody on board reads."""
+    values = {k: v for k, v in plain_record(calibration).items() if k not in _NOT_SENT}
     geometry = values.pop('geometry')
     frames = values.pop('parent_frame'), values.pop('child_frame')
     camera = calibration.geometry.camera

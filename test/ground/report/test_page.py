@@ -158,11 +158,11 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
 
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
-    assert len(calibration.gate) > 15
+    assert len(calibration.gate) >= 15  # nine limits, and each unknown with a prior
     checks = {check.option: check for check in calibration.gate}
-    failed = dataclasses.replace(checks['max_residual_rms_px'], found=8.125, passed=False)
+    failed = dataclasses.replace(checks['max_rejected_fraction'], found=8.125, passed=False)
     not_checked = dataclasses.replace(
-        checks['max_change_px'], found=math.nan, passed=None, note='nothing to compare with'
+        checks['max_rotation_deg'], found=math.nan, passed=None, note='nothing to compare with'
     )
     shown = dataclasses.replace(calibration, gate=(failed, not_checked))
     write_calibration(shown, tmp_path / CALIBRATION_FILE)
@@ -175,7 +175,7 @@ def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: P
         f'{check.name} <code>{check.option.replace("_", "_<wbr>")}</code>' for check in shown.gate
     ]
     assert rows == [
-        [names[0], 'failed', '8.125 px', 'at most 1 px', ''],
+        [names[0], 'failed', '8.125', 'at most 0.25', ''],
         [names[1], 'not checked', '', limit, not_checked.note],
     ]
 

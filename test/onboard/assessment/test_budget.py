@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.assessment import budget
-from starcal_ros.assessment.budget import sigma_budget
+from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
@@ -134,6 +134,34 @@ def test_a_slow_error_is_the_fall_of_an_estimate_that_has_none() -> None:
     _, of_pointing = fall(parts(World())['total'], stated['total'])
     assert part.pointing_arcsec == pytest.approx(of_pointing, rel=0.05)
     assert part.assumption.startswith('not given: as the noise assumed; estimated: ')
+
+
+@pytest.mark.parametrize(
+    ('world', 'option', 'scope', 'stated'),
+    [
+        (World(), 'star_tracker_slow_arcsec', 'pointing', {'star_tracker_slow_arcsec': 10.0}),
+        (World(6), 'star_tracker_slow_arcsec', 'pointing', {'star_tracker_slow_arcsec': 10.0}),
+        (RAM, 'observer_velocity_m_s', 'camera', {'velocity_sigma_m_s': 10.0}),
+    ],
+)
+def test_a_statement_gives_the_sigma_of_an_estimate_that_has_it(
+    world: World, option: str, scope: str, stated: dict[str, float]
+) -> None:
+    rows = statements(sigma_budget(*estimate(world)), *estimate(world))
+    assert rows == tuple(sorted(rows, key=lambda row: row.after_arcsec / row.before_arcsec))
+    row = next(row for row in rows if row.option.startswith(option))
+    of = {'camera': 'map_arcsec', 'pointing': 'pointing_arcsec'}[scope]
+    assert row.scope == scope and row.before_arcsec == getattr(parts(world)['total'], of)
+    assert row.after_arcsec < 0.6 * row.before_arcsec
+    after = getattr(parts(world, **stated)['total'], of)
+    assert row.after_arcsec == pytest.approx(after, rel=0.1)
+    assert f'state {row.option}: {scope} ' in str(row) and f'if it is {row.value}' in str(row)
+
+
+def test_what_is_stated_is_not_asked_for() -> None:
+    stated = {'star_tracker_slow_arcsec': 5.0, 'velocity_sigma_m_s': 10.0}
+    found = estimate(RAM, **stated)
+    assert statements(sigma_budget(*found), *found) == ()
 
 
 @pytest.mark.parametrize('names', [['velocity'], ['field'], ['velocity', 'field']])

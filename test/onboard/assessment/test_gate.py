@@ -122,13 +122,6 @@ def test_a_good_calibration_passes() -> None:
     ('changes', 'limit', 'at_limit', 'beyond', 'reason'),
     [
         (
-            {'residual_rms_px': 0.8},
-            'max_residual_rms_px',
-            0.8,
-            0.79,
-            'residual per axis is 0.8 px, over the limit of 0.79 px (max_residual_rms_px)',
-        ),
-        (
             {'stars_used': 90, 'stars_rejected': 10},
             'max_rejected_fraction',
             0.1,
@@ -175,7 +168,7 @@ def test_a_good_calibration_passes() -> None:
             2.9,
             (
                 'distance of cx from its assumed value is 3 sigma, over the limit of 2.9 sigma '
-                '(max_held_term_sigma); the stars put cx at 323, assumed is 320; estimate cx, or '
+                '(max_held_term_sigma); 323 by the stars, 320 assumed; estimate it, or '
                 'widen its prior (estimate, prior_sigma)'
             ),
         ),
@@ -197,8 +190,7 @@ def test_a_good_calibration_passes() -> None:
             7.4,
             (
                 'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
-                'of 7.4 sigma (max_held_term_sigma); the stars put velocity_x_m_s at -60000, '
-                'assumed is 0; the velocity or the clock is wrong, or air bends the light: check '
+                'of 7.4 sigma (max_held_term_sigma); -60000 by the stars, 0 assumed; check '
                 'the velocity topic, the stamps and the site'
             ),
         ),
@@ -209,9 +201,8 @@ def test_a_good_calibration_passes() -> None:
             159.0,
             (
                 'distance of mounting of head_2 x_deg from its assumed value is 160 sigma, over '
-                'the limit of 159 sigma (max_held_term_sigma); the stars put mounting of head_2 '
-                'x_deg at 20, assumed is 0; check more_alignments, or widen '
-                'star_tracker_mounting_sigma_arcsec'
+                'the limit of 159 sigma (max_held_term_sigma); 20 by the stars, 0 assumed; '
+                'check more_alignments'
             ),
         ),
         (
@@ -221,8 +212,8 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); focal length or lens changes between images: '
-                'estimate with temperature, or calibrate each state separately'
+                'of 0.2 px (max_image_variation_px); focal length or lens changes: '
+                'estimate with temperature, or calibrate each state alone'
             ),
         ),
         (
@@ -233,7 +224,7 @@ def test_a_good_calibration_passes() -> None:
             (
                 'residual over predicted sigma at star 5 to 9 is 1.5, over the limit of 1.25 '
                 '(max_cross_validated_residual); the sigma is wrong there: check the PSF, the '
-                'lens model or those images'
+                'lens model or its images'
             ),
         ),
     ],
@@ -245,6 +236,7 @@ def test_each_limit_trips_alone(
     found = dataclasses.replace(GOOD, **changes)
     assert reasons(found, GateOptions(**{limit: at_limit})) == ()
     assert reasons(found, GateOptions(**{limit: beyond})) == (reason,)
+    assert len(reason) <= 200
 
 
 def test_images_are_numbered_from_one_as_on_the_report() -> None:
@@ -256,11 +248,17 @@ def test_images_are_numbered_from_one_as_on_the_report() -> None:
 
 LONGER = turned(0.0, fx=1818.0, fy=1819.01)
 TURNED = turned(0.2)
+TURNED_FAR = turned(6.0)
+# Beyond multiples of the limits: the angle of 3 % of the longer side, degrees.
+OF_THE_PRIOR = {
+    'max_change_px': (0.0, 5.0),
+    'max_rotation_deg': (np.degrees(0.03 * 640 / 1800), 13.0),
+}
 CHANGES = [
     # 1 px of each focal length at the corner, 0.227 focal lengths off the axis.
     ('max_map_sigma_px', {'covariance': with_sigma(fx=1.0, fy=1.0)}, None, 0.227),
     ('max_change_px', {'geometry': LONGER}, None, 3.916),
-    ('max_rotation_deg', {'geometry': TURNED}, None, 0.2),
+    ('max_rotation_deg', {'geometry': TURNED_FAR}, None, 6.0),
     ('max_change_px', {'geometry': LONGER}, GOOD, 3.916),
     ('max_rotation_deg', {'geometry': TURNED}, GOOD, 0.2),
 ]
@@ -275,8 +273,9 @@ def test_each_limit_of_a_change_trips_alone(
     check = checks(found, GateOptions(), active)[limit]
     # The curvature of the field takes 4 % off the first; the others agree to 1e-3.
     assert check.found == pytest.approx(expected, rel=0.05)
-    # A change from the prior may be five times as large.
-    value = check.found / (5 if active is None and limit != 'max_map_sigma_px' else 1)
+    # A change from the prior may be larger, as far as it is documented.
+    more, factor = OF_THE_PRIOR.get(limit, (0.0, 1.0)) if active is None else (0.0, 1.0)
+    value = (check.found - more) / factor
     at_limit = GateOptions(**{limit: value * (1 + 1e-12)})
     beyond = GateOptions(**{limit: 0.99 * value})
     assert reasons(found, at_limit, active) == ()
@@ -319,16 +318,38 @@ def test_a_calibration_without_maps_cannot_be_judged() -> None:
         judged(dataclasses.replace(GOOD, maps=None), GateOptions())
 
 
+PAIRS = (
+    ('max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'),
+    ('max_change_px', 'max_rotation_deg'),
+)
+
+
 def test_every_limit_has_its_check() -> None:
     """With the limit as the option has it."""
     tracker = dataclasses.replace(GOOD.star_trackers[0], drift_arcsec=1.0, drift_p_value=0.5)
     found = checks(dataclasses.replace(GOOD, star_trackers=(tracker,)), GateOptions())
     assert all(check.passed for check in found.values())
+    assert len(found) <= 12
     limited = {name for name in found if found[name].option}
+    for first, second in PAIRS:  # of which the one with the larger share of its limit is a row
+        assert len(limited & {first, second}) == 1
+        limited |= {first, second}
     assert limited == names_of(GateOptions) | {'min_images'}
-    for name in names_of(GateOptions):
+    for name in names_of(GateOptions) & found.keys():
         assert found[name].limit == getattr(GateOptions(), name)
     assert 'p-value 0.7' in found['max_detector_step_px'].note
+
+
+@pytest.mark.parametrize('lens', [20.0, 50.0, 80.0, 100.0])
+def test_what_a_prior_may_be_off_by_is_no_reason_to_refuse(lens: float) -> None:
+    """1.5 degrees and 5 degrees in roll (`prior_alignment`), and 3 % in the principal point."""
+    f = 320 / np.tan(np.radians(lens / 2))
+    centre = dataclasses.replace(CAMERA, parameters=np.r_[f, 0, f, 320, 255, np.zeros(5)])
+    prior = CameraGeometry(centre, MOUNTING.as_quat())
+    off = MOUNTING * Rotation.from_euler('xz', [1.5, 5.0], degrees=True)
+    camera = centre.replace(cy=255 + 0.03 * 640)
+    found = dataclasses.replace(GOOD, geometry=CameraGeometry(camera, off.as_quat()))
+    assert reasons_of(judge(found, prior, None, GateOptions(), ASSUMED)) == ()
 
 
 def test_a_step_that_noise_explains_passes() -> None:
@@ -351,8 +372,7 @@ def test_a_part_fails_for_more_than_the_noise_of_its_few_stars(
     found = dataclasses.replace(GOOD, **with_model(predictions=parts))
     assert (reasons(found, GateOptions()) == ()) is passes
     check = checks(found, GateOptions())['max_cross_validated_residual']
-    named = check.note if check.passed else check.name
-    assert ('cell 300 to 700' in named) is (sigma < 0.1)
+    assert ('cell 300 to 700' in check.name) is (sigma < 0.1)
 
 
 @pytest.mark.parametrize(
@@ -371,7 +391,7 @@ def test_a_star_tracker_that_drifts_is_named(
     assert (said == ()) is passes
     if not passes:
         assert said[0].startswith('drift of the attitude of head_2 against the stars is 80 arcsec')
-        assert 'leave it out of more_star_trackers' in said[0]
+        assert 'leave it out of more_star_trackers' in said[0] and len(said[0]) <= 200
 
 
 def test_a_calibration_of_a_message_has_no_checks_of_the_model() -> None:
@@ -403,8 +423,8 @@ def test_every_reason_is_given() -> None:
     )
     options = limits_in(reasons(found, GateOptions()))
     assert options == [
-        'no_descent', 'max_residual_rms_px', 'max_rejected_fraction', 'min_coverage',
-        'max_map_sigma_px', 'max_change_px', 'max_rotation_deg',
+        'no_descent', 'max_rejected_fraction', 'min_coverage', 'max_map_sigma_px',
+        'max_rotation_deg',
     ]  # fmt: skip
 
 
@@ -422,7 +442,7 @@ def test_the_cause_comes_before_the_statistics() -> None:
         ),
     )
     given = reasons(found, GateOptions())
-    assert 'focal length or lens changes between images' in given[0]
+    assert 'focal length or lens changes: ' in given[0]
     assert limits_in(given)[-1] == 'max_cross_validated_residual'
     # One part of the data and what to do, not a list of eighteen.
     assert len(given[-1]) < 200
@@ -501,4 +521,4 @@ def test_a_camera_that_folds_over_is_refused() -> None:
     assert np.isinf(rotation_rad) and np.isinf(left_px).all()
     folded = dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0))
     options = limits_in(reasons(folded, GateOptions(), None))
-    assert options == ['max_map_sigma_px', 'max_change_px', 'max_rotation_deg']
+    assert options == ['max_map_sigma_px', 'max_change_px']

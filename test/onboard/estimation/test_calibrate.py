@@ -37,6 +37,7 @@ TRACKER_ARCSEC = (10.0, 10.0, 40.0)
 EIGHT = CalibrationOptions(
     estimate=('fx', 'skew', 'fy', 'distortion'),
     principal_point_prior=0.0,
+    lens_prior=0.0,
     velocity_sigma_m_s=10.0,
     star_tracker_slow_arcsec=0.1,
 )
@@ -419,7 +420,7 @@ def test_too_few_are_counted_for_a_person() -> None:
 def test_one_star_many_times_determines_nothing(method: str) -> None:
     first = clean().images[0]
     star = first.select(np.arange(len(first)) == 0)
-    with pytest.raises(TooFewObservations, match='do not determine all of fx, skew, fy, k1'):
+    with pytest.raises(TooFewObservations, match='do not determine fx, skew, fy, ' + '.{,166}$'):
         estimate_calibration(Ensemble((star,) * 70), PRIOR, options(method))
 
 

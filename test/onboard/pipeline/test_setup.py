@@ -37,7 +37,7 @@ def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
             estimate=['fx', 'fy'],
             max_attitude_gap_s=7,
             magnitude_limit=6.0,
-            max_residual_rms_px=0.3,
+            max_change_px=0.3,
             camera_frame='left_eye',
             use_sim_time=True,
         )
@@ -46,7 +46,7 @@ def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
     assert made.calibration.method == 'single'
     assert made.calibration.estimate == ('fx', 'fy')
     assert made.attitude.max_attitude_gap_s == 7.0
-    assert made.gate.max_residual_rms_px == 0.3
+    assert made.gate.max_change_px == 0.3
     assert made.frames.camera_frame == 'left_eye'
     assert made.catalog.magnitude.max() <= 6.0
     assert made.dark is None
