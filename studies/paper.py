@@ -137,7 +137,7 @@ def setup_of(seed: int) -> Setup:
         'stamp_sigma_s': 0.0,
     }
     setup = load_setup(values, prior=night.prior)
-    options = dataclasses.replace(setup.calibration, principal_point_prior=0.0)
+    options = dataclasses.replace(setup.calibration, principal_point_prior=0.0, lens_prior=0.0)
     return dataclasses.replace(setup, calibration=options)
 
 

@@ -227,6 +227,7 @@ def calibration_options(method: str, tracker_arcsec: float, **other: object) -> 
         method=method,
         estimate=PAPER_ESTIMATE,
         principal_point_prior=0.0,
+        lens_prior=0.0,
         star_tracker_sigma_arcsec=(assumed, assumed, assumed),
         velocity_sigma_m_s=0.0,
         shutter='global',

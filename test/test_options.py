@@ -142,7 +142,7 @@ def test_options_are_few_and_about_ten_are_basic() -> None:
 
 
 def test_a_constant_that_studies_vary_is_not_a_parameter() -> None:
-    constants = {'outlier_sigma', 'principal_point_prior', 'variance_components'}
+    constants = {'lens_prior', 'outlier_sigma', 'principal_point_prior', 'variance_components'}
     assert constants <= {field.name for field in dataclasses.fields(CalibrationOptions)}
     assert not constants & names_of(CalibrationOptions)
     given = from_mapping(CalibrationOptions, {'outlier_sigma': 3.0, 'min_images': 5})

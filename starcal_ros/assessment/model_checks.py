@@ -115,6 +115,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     for entry in layout.shared:
         at = layout.of([entry.name])
         tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
+        tested &= entry.widest > entry.sigma  # of any lens: nobody states it
         if entry.name not in _STATED or not tested.any():
             continue
         means, variances = without_prior(estimate.sums, estimate.linear, entry.name)

@@ -24,6 +24,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from starcal_ros.arrays import Floats
+from starcal_ros.errors import TooFewObservations
 
 StateT = TypeVar('StateT')
 
@@ -76,7 +77,7 @@ class Solution(Generic[StateT, NormalT]):
         return self.termination == 'converged'
 
 
-class NotObservable(ArithmeticError):
+class NotObservable(TooFewObservations):
     """The normal matrix is singular: the data do not determine all unknowns."""
 
 

@@ -24,7 +24,7 @@ class CalibrationOptions:
     """
     Unknowns of the calibration and their prior uncertainties.
 
-    The last four fields are constants in flight: no data sheet states them.
+    The last five fields are constants in flight: no data sheet states them.
     """
 
     method: str = option(
@@ -59,8 +59,9 @@ class CalibrationOptions:
     prior_sigma: tuple[float, ...] = option(
         (0.0,),
         '1-sigma uncertainty of the prior fx, skew, fy, cx, cy (px) and lens coefficients, or one'
-        ' number for all; 0: no prior if estimated (cx and cy: 3 % of the longer image side),'
-        ' exact if held',
+        ' number for all; 0: exact if held; if estimated cx and cy within 3 % of the longer image'
+        ' side, coefficients within a tenth of the half diagonal in the corners, no prior of fx,'
+        ' skew, fy',
         low=0.0,
     )
     star_tracker_mounting_sigma_arcsec: float = option(
@@ -122,6 +123,8 @@ class CalibrationOptions:
     outlier_sigma: float = 4.5
     # 1-sigma of cx and cy, as a fraction of the longer side: how far mounts decentre detectors.
     principal_point_prior: float = 0.03
+    # 1-sigma of each lens coefficient: displacement of the corners, of the half diagonal.
+    lens_prior: float = 0.1
     variance_components: bool = True  # sigmas of centroids and star tracker from the residuals
 
 

@@ -68,6 +68,8 @@ class Problem:
         Camera parameters that are estimated, ascending.
     prior_parameters, prior_sigma : (p,)
         Gaussian prior of the camera parameters; infinite sigma: none.
+    is_weak : (p,) bool, or False
+        True where the prior is that of any lens: no data sheet states it.
     star_tracker_from_icrf : Rotation (m,)
         As measured.
     star_tracker_sigma_rad : (m, 3)
@@ -93,6 +95,7 @@ class Problem:
     star_tracker: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     first_from_star_tracker: Rotation | None = None
     mounting_sigma_rad: float = np.inf
+    is_weak: Mask | bool = False
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera.lens import coefficient_jacobian, COEFFICIENTS
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.equations import arrow, stars_alone
@@ -141,13 +142,11 @@ def equations_in_state(
 
 def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
     """Problem of a search over an ensemble."""
-    model, names = prior.camera.model, prior.camera.parameter_names
+    camera, model, names = prior.camera, prior.camera.model, prior.camera.parameter_names
     prior_sigma = np.array(np.broadcast_to(options.prior_sigma, len(names)))
-    weak_px = options.principal_point_prior * max(prior.camera.width, prior.camera.height)
     free = {names.index(name) for name in estimated_parameters(options, model)}
-    for k in free & {names.index('cx'), names.index('cy')}:
-        if prior_sigma[k] == 0:
-            prior_sigma[k] = weak_px
+    is_default = (prior_sigma == 0) & np.isin(np.arange(len(names)), list(free))
+    prior_sigma = np.where(is_default, _default_sigma(prior.camera, options), prior_sigma)
     attitudes = Rotation.from_quat(
         np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
     )
@@ -166,7 +165,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
         method=options.method,
         model=model,
         free=np.array(sorted(free), np.int64),
-        prior_parameters=prior.camera.parameters,
+        prior_parameters=camera.parameters,
         prior_sigma=np.where(prior_sigma > 0, prior_sigma, np.inf),
         star_tracker_from_icrf=attitudes.inv(),
         star_tracker_sigma_rad=np.tile(
@@ -177,7 +176,23 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
         star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
         first_from_star_tracker=mountings,
         mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
+        is_weak=is_default & np.isin(camera.parameter_names, COEFFICIENTS[model]),
     )
+
+
+def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
+    """
+    Return the 1-sigma (p,) of camera parameters that no option states; 0: no prior.
+
+    Lens coefficients by their displacement of a corner: without a prior, those of a numerator and
+    a denominator run into a pole on the detector.
+    """
+    corner = 0.5 * np.array([camera.width, camera.height]) / camera.parameters[0]
+    none = np.zeros(len(COEFFICIENTS[camera.model]))
+    effect = np.linalg.norm(coefficient_jacobian(camera.model, corner, none), axis=0)
+    centre_px = options.principal_point_prior * max(camera.width, camera.height)
+    of_lens = options.lens_prior * np.linalg.norm(corner) / effect
+    return np.concatenate([[0.0, 0.0, 0.0, centre_px, centre_px], of_lens])
 
 
 def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: bool) -> State:

@@ -98,7 +98,7 @@ class Unknown:
         A likely combination of the functions, 1 px, with an amplitude of its own besides.
     tracker : (m, 3, q) or None
         Rotation of the camera, as the star tracker of each image predicts it.
-    widest : float
+    widest : float or (q,)
         Largest 1-sigma that is possible at all, whatever a data sheet says.
     """
 
@@ -113,7 +113,7 @@ class Unknown:
     octave: Indices | None = None
     term: Floats | None = None
     tracker: Floats | None = None
-    widest: float = np.inf
+    widest: Floats | float = np.inf
 
     def __len__(self) -> int:
         """Return the number of unknowns of the entry."""
@@ -217,9 +217,17 @@ def unknowns_in_state(problem: Problem, state: State) -> Layout:
     sigma = np.zeros(p)  # of parameters that are held
     sigma[problem.free] = problem.prior_sigma[problem.free]
     offset = state.parameters - problem.prior_parameters
+    widest = np.where(problem.is_weak, sigma, np.inf)
     focal = tuple(f'focal_temperature_{i}' for i in range(1, q + 1))
     entries = [
-        Unknown('camera', problem.parameter_names, sigma, offset, camera=chain[:, :, :p]),
+        Unknown(
+            'camera',
+            problem.parameter_names,
+            sigma,
+            offset,
+            camera=chain[:, :, :p],
+            widest=widest,
+        ),
         Unknown('focal', focal, np.full(q, np.inf), state.focal, camera=chain[:, :, p:]),
         *_turns_of_camera(problem, state),
     ]

@@ -37,7 +37,7 @@ DEFAULT = CalibrationOptions(
     velocity_sigma_m_s=10.0,
 )
 # Eight parameters without a prior, those of the Cramer-Rao bound.
-OPTIONS = dataclasses.replace(DEFAULT, estimate=('fx', 'skew', 'fy', 'distortion'))
+OPTIONS = dataclasses.replace(DEFAULT, estimate=('fx', 'skew', 'fy', 'distortion'), lens_prior=0.0)
 NAMES = estimated_parameters(OPTIONS, 'plumb_bob')
 FREE = [k for k, name in enumerate(PARAMETER_NAMES) if name in NAMES]
 

@@ -33,6 +33,7 @@ TRACKER_ARCSEC = (10.0, 10.0, 40.0)
 EIGHT = CalibrationOptions(
     estimate=('fx', 'skew', 'fy', 'distortion'),
     principal_point_prior=0.0,
+    lens_prior=0.0,
     velocity_sigma_m_s=10.0,
     star_tracker_slow_arcsec=0.1,
 )

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
-from starcal_ros.assessment.observability import map_error_px
+from starcal_ros.assessment.observability import map_error_px, map_sigma_px
 from starcal_ros.camera import CameraModel, pixel_grid, project_jacobians
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import OptionError, TooFewObservations
@@ -93,6 +93,19 @@ def test_without_noise_the_truth_comes_back(model: str) -> None:
     )
     before, after = found.linear.problem.prior_parameters, found.geometry.camera.parameters
     np.testing.assert_array_equal(after[held], before[held])
+
+
+@pytest.mark.parametrize('model', ['rational_polynomial', 'thin_prism', 'tilted'])
+def test_all_coefficients_of_a_large_model_are_estimated(model: str) -> None:
+    """Those of numerator and denominator trade with each other within their weak prior."""
+    made = wide(model, seed=4)
+    found = estimate_calibration(
+        true_observations(made), prior_of(made, model), CalibrationOptions()
+    )
+    assert found.termination == 'converged'
+    camera = found.geometry.camera
+    sigma_px = map_sigma_px(camera, found.map_covariance)
+    assert map_error_px(camera, made.truth.camera) < 2.0 * np.sqrt(np.mean(sigma_px**2)) < 0.03
 
 
 @pytest.mark.slow

@@ -43,6 +43,7 @@ TRACKER_ARCSEC = (10.0, 10.0, 40.0)  # its axes are told apart
 EIGHT = CalibrationOptions(
     estimate=('fx', 'skew', 'fy', 'distortion'),
     principal_point_prior=0.0,
+    lens_prior=0.0,
     star_tracker_sigma_arcsec=TRACKER_ARCSEC,
 )
 FREE = [
