@@ -135,12 +135,15 @@ def from_stars(
         )
     half_px = 0.5 * math.hypot(*size)
     usual = (_usual(size, half_px, model, math.radians(deg)) for model, deg in _HALF_FIELDS_DEG)
-    tried = [*([prior] if prior is not None else []), *usual]
-    matched = _first_match(rich, tried, catalog)
+    matched = None if prior is None else _first_match(rich, [prior], catalog)
+    matched = matched or _first_match(rich, list(usual), catalog)
     if matched is None:
+        given = f'{float(prior.parameters[0]):.0f} px or ' if prior is not None else ''
         raise NotFromStars(
-            f'the stars of {len(seen)} images match no part of the sky, with fields of 5 to 120'
-            f' degrees: {ADVICE}; a tripod or a still spacecraft, no clouds, no lights'
+            f'the stars of {len(seen)} images match no part of the sky of the catalog, with'
+            f' {given}fields of 5 to 120 degrees: {ADVICE}; a tripod or a still spacecraft, no'
+            ' clouds, no lights; fields under 3 degrees need their focal length and a catalog of'
+            ' their region (starcal catalog)'
         )
     first, compact_first = matched
     found, other_focal_px = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
@@ -320,6 +323,8 @@ def _of_one_lens(
 
     A few others are false, of another lens, or pictures of a screen that shows the sky.
     """
+    if not found:
+        return {}, ()
     focal_px = np.array([_focal_px(sky.camera, sky.camera.model) for sky in found.values()])
     low, high = np.percentile(focal_px, [10, 90])
     if high > (1 + _SAME_CAMERA) * low:
@@ -390,6 +395,7 @@ def options_of(values: Mapping[str, object]) -> dict[str, object]:
         **{name: value for name, value in values.items() if name not in others},
         'method': 'per_image',
         'star_tracker_sigma_arcsec': (_SIGMA_ARCSEC,) * 3,
+        'prior_alignment_sigma_deg': _SIGMA_ARCSEC / 3600.0,
         'star_tracker_frame': '',
         'attitude_direction': 'st_to_inertial',
         'attitude_message': 'quaternion',

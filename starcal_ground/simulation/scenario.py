@@ -27,7 +27,7 @@ from starcal_ros.camera.lens import fold_radius2, ideal_points
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
-from starcal_ros.sky.catalog import cone, load_catalog
+from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
 # Random streams (seed, purpose, image): an image does not depend on the previous ones.
 TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
@@ -110,6 +110,7 @@ class Scenario:
     image_count: int
     magnitude_limit: float = 9.0
     stars_per_image: int | None = None  # the brightest on the detector; None: all
+    sky: StarCatalog | None = None  # sorted by magnitude; None: the bundled catalog
 
     def time_ns(self, index: int) -> int:
         """Middle of the exposure of an image."""
@@ -279,12 +280,15 @@ def stamp_half_px(psf_sigma_px: float) -> int:
 
 
 def scene(scenario: Scenario, index: int, attitude_noise: bool = True) -> Scene:
-    """Stars of an image, of the bundled catalog down to the magnitude limit."""
-    catalog = load_catalog(None, scenario.magnitude_limit)
+    """Stars of an image, of the sky of the scenario down to the magnitude limit."""
+    catalog = scenario.sky
+    if catalog is None:
+        catalog = load_catalog(None, scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
     R = camera_from_icrf(scenario, index)
     margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
-    stars = catalog.select(cone(catalog, R[2], field_radius_rad(camera, margin_px)))
+    radius_rad = field_radius_rad(camera, margin_px)
+    stars = catalog.select(cone(catalog, R[2], radius_rad, scenario.magnitude_limit))
     directions = apparent_directions(stars, time_ns)
     in_camera = directions @ R.T
     # Beyond the fold of the distortion the model has a second image, which no lens has.

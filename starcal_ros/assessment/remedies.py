@@ -22,6 +22,9 @@ REMEDIES: Mapping[str, str] = {
     'frozen': 'check that the camera is read out',
     'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
     'glare': 'keep Sun, Moon and Earth out of the field',
+    'not_in_catalog': (
+        'raise magnitude_limit, or give a catalog that covers these fields (starcal catalog)'
+    ),
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
     # Checks of the gate, by option, with the section of the report.
     'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'

@@ -91,8 +91,6 @@ _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the 
 _ROBUST_GAIN = 1e-3  # a step of 0.04 sigma: the posterior goes on from there
 _ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
-_USUAL = 3  # rounds after which steps shrink
-_SHRUNK = 0.8  # of the step before: a step that is longer is halved
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
 _FIRST_SHAPE_PX = 1e-4
 _SPACE_VELOCITY_M_S = 8000.0  # an orbit about the Earth
@@ -258,7 +256,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     shape_px: Floats | float = _FIRST_SHAPE_PX
     near: Posterior | None = None
     termination = 'iteration_limit'
-    share, before_sigma = 1.0, math.inf
+    share, before_sigma = 1.0, np.empty(0)
     for k in range(_ROUNDS):
         last = _round(data, problem, state, judged, residual_px, shape_px, near, share)
         after = judge(
@@ -269,14 +267,16 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         shape_px = np.maximum(last.posterior.shape_sigma_px, _FIRST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.linear.layout, last.posterior)
-        if step_sigma < _STEP_SIGMA and agree(judged, after, table):
+        if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
             state, judged = last.after, after
-        # Where stars hardly show an unknown, whole steps overshoot to and fro.
-        if k > _USUAL and step_sigma > _SHRUNK * before_sigma:
-            share = max(0.5 * share, _LEAST_SHARE)
+        # Where stars hardly show an unknown, whole steps overshoot to and fro: the part of the
+        # step before that is left shows the share that ends in the minimum.
+        if k:
+            left = (step_sigma @ before_sigma) / (before_sigma @ before_sigma)
+            share = min(max(share / max(1.0 - left, share), _LEAST_SHARE), 1.0)
         before_sigma = step_sigma
     weights = Weights(
         judged.covariance_px2(table)[:, [0, 2]].mean(axis=1),
@@ -355,12 +355,11 @@ def _refraction(ensemble: Ensemble) -> Refraction | None:
     return Refraction(stamps, zenith, float(size), float(sigma))
 
 
-def _step_sigma(layout: Layout, found: Posterior) -> float:
-    """Return the largest step of a shared unknown of the state, in its sigma."""
+def _step_sigma(layout: Layout, found: Posterior) -> Floats:
+    """Return the steps of the shared unknowns of the state, in their sigmas."""
     in_state = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
-    free = sigma > 0
-    return float(np.abs(found.mean[in_state][free] / sigma[free]).max(initial=0.0))
+    return np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
 
 
 def _check_not_mirrored(state: State) -> None:

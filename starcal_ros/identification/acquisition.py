@@ -15,9 +15,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
 
 from starcal_ros.arrays import Floats, Indices, Mask
-from starcal_ros.camera import line_of_sight, project, rotation_jacobian
+from starcal_ros.camera import CameraModel, line_of_sight, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.prediction import fit_warp, in_image, Prediction, warp_powers
+from starcal_ros.identification.prediction import (
+    fit_warp,
+    in_image,
+    Prediction,
+    warp_powers,
+    window_area,
+)
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
 from starcal_ros.stars.detection import Sources
@@ -30,11 +36,13 @@ _PAIRS_OF_CUBIC = 8  # fewest pairs with which a cubic radial distortion is fitt
 _MOST_CUBIC = 0.15  # its largest displacement in the corner of the image, half diagonals
 _SOUND_SHARE = 0.75  # share of the brightest sources whose match needs no other attempt
 _MET_PX = 2.0  # largest distance between a source and its star
-_FEWEST_SOURCES = 6  # fewer cannot pass the test against chance
+_FEWEST_SOURCES = 5  # fewer cannot pass the test against chance
+_SCALE_RANGE, _MOST_SCALE = 0.75, 1.3  # of the focal length over the prior
 _SIDE = 3  # parts of the image along each side, in which a match must hold
 PARTS = _SIDE**2
 _FEWEST_IN_PART = 4  # points in a part for a significant share
 _PART_MAX_P_VALUE = 1e-3  # p-value of the misses in a part, given a right match
+_LOOKS = 10.0  # number of independent tests among depths, which share most stars
 _MAX_P_VALUE = 1e-9  # p-value of the matched stars, given a wrong match
 
 
@@ -54,13 +62,14 @@ def acquire(
     chance.
     """
     best_px, most, refused = None, -1, None
-    for depth in (len(sources.snr), *_DEPTHS):
-        if depth < _FEWEST_SOURCES or (depth in _DEPTHS and depth >= len(sources.snr)):
+    count = len(sources.snr)
+    for depth in (count, *(depth for depth in _DEPTHS if depth < count)):
+        if depth < _FEWEST_SOURCES:
             continue
         brightest = sources.brightest(depth)
         try:
             turn = _vote(prediction, brightest, geometry, reach_px, roll_rad)
-            found_px = _match(prediction, brightest, geometry, turn)
+            found_px = _match(prediction, brightest, geometry, turn, (reach_px, roll_rad))
         except ImageRefused as error:
             # The first attempt uses every source: its numbers describe the image.
             refused = refused or error
@@ -110,11 +119,15 @@ def _vote(
     rolls_rad = [k * roll_step for k in sorted(range(-roll_steps, roll_steps + 1), key=abs)]
 
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    # Predictions fill the image and a margin about it: twice as many of them take part.
-    stars = prediction.xy_px[: min(_VOTERS, 2 * len(sources.snr))] - centre
+    # Predictions fill the image and a margin about it: as many take part as put about twice the
+    # number of the sources into an image of a window up to twice its area, and once in a larger.
+    window = window_area(camera, reach_px)
+    count = min(_VOTERS, 2 * len(sources.snr)) * max(1.0, window / 2.0)
+    in_window = in_image(prediction.xy_px, camera.width, camera.height, reach_px)
+    stars = prediction.xy_px[in_window][: int(count)] - centre
     seen = sources.xy_px[:_VOTERS] - centre
     votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
-    expected = len(stars) * len(seen) * (2 * cell_px) ** 2 / sources.searched_px2
+    expected = len(stars) * len(seen) * (2 * cell_px) ** 2 / sources.searched_px2 / window
     trials = len(rolls_rad) * (2 * half_cells + 1) ** 2
     if votes < 4 or pdtrc(votes - 1, expected) * trials > 1e-2:
         raise ImageRefused(
@@ -220,24 +233,32 @@ def _refine_rotation(
             rcond=1e-10,
         )[0]
         rotation = Rotation.from_rotvec(-step[:3]) * rotation
-        scale = float(np.clip(scale + step[3], 0.75, 1.3))
+        scale = float(np.clip(scale + step[3], _SCALE_RANGE, _MOST_SCALE))
         if free == 5:
             cubic = float(np.clip(cubic + step[4], -_MOST_CUBIC, _MOST_CUBIC))
     return placed()[0], pairs
 
 
 def _match(
-    prediction: Prediction, sources: Sources, geometry: CameraGeometry, rotation: Rotation
+    prediction: Prediction,
+    sources: Sources,
+    geometry: CameraGeometry,
+    rotation: Rotation,
+    reach: tuple[float, float],
 ) -> Floats:
     """
-    Predicted pixels (n, 2) refined to match the sources.
+    Predicted pixels (n, 2) refined to match the sources; ``reach`` of the search, px and rad.
 
     Raises ImageRefused ``no_match`` if the number of matched predictions is consistent with
     chance.
     """
     camera = geometry.camera
     # Equal numbers of predictions and sources: the fainter surplus has no counterpart.
-    bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
+    margin_px = 0.02 * np.hypot(camera.width, camera.height)
+    turned_px = project(camera, rotation.apply(prediction.direction_camera))
+    with np.errstate(invalid='ignore'):
+        bright = np.flatnonzero(in_image(turned_px, camera.width, camera.height, margin_px))
+    bright = bright[: min(4 * len(sources.snr), 400)]
     seen = sources.brightest(4 * len(bright))
     xy, pairs = _refine_rotation(prediction, seen, geometry, rotation, bright)
     half_px = 0.5 * max(camera.width, camera.height)
@@ -252,17 +273,39 @@ def _match(
         xy = xy + correction
     # Rotation, scale, cubic and warp were fitted: two parameters can make one false pair match.
     false_pairs = 3 + len(warp_powers(len(pairs)))
-    _check_beyond_chance(xy[bright], seen, false_pairs, camera.width, camera.height)
+    places = _places(camera, len(pairs), *reach)
+    _check_beyond_chance(xy[bright], seen, false_pairs, places, camera.width, camera.height)
     return xy
 
 
+def _places(camera: CameraModel, pairs: int, reach_px: float, roll_rad: float) -> float:
+    """
+    Number of fits within the reach of a search that differ by the radius of a match.
+
+    Infinite for fits with a warp, whose freedom is the number of false pairs that it can make.
+    """
+    if len(warp_powers(pairs)) > 1:
+        return np.inf
+    half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height) / _MET_PX
+    scales = (_MOST_SCALE - _SCALE_RANGE) * half_diagonal_px
+    cubics = 2 * _MOST_CUBIC * half_diagonal_px if pairs >= _PAIRS_OF_CUBIC else 1.0
+    shifts = (2.0 * reach_px / _MET_PX) ** 2
+    return float(shifts * max(1.0, 2.0 * roll_rad * half_diagonal_px) * scales * cubics)
+
+
 def _check_beyond_chance(
-    predicted_px: Floats, sources: Sources, false_pairs: int, width: int, height: int
+    predicted_px: Floats,
+    sources: Sources,
+    false_pairs: int,
+    places: float,
+    width: int,
+    height: int,
 ) -> None:
     """
     Refuse the match if the number of predictions (n, 2) on a source is consistent with chance.
 
-    ``false_pairs`` is the number of false pairs that the fit itself can make.
+    ``false_pairs`` is the number of false pairs that the fit itself can make, ``places`` the
+    number of different fits.  Each gives a bound of the probability of a false match.
 
     Raises ImageRefused ``no_match``.
     """
@@ -273,8 +316,13 @@ def _check_beyond_chance(
     density = len(sources.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
-    few = max(6, 1 + false_pairs)
-    if matched < few or pdtrc(matched - 1 - false_pairs, expected) > _MAX_P_VALUE:
+    p_value = pdtrc(matched - 1 - false_pairs, expected) if matched > false_pairs else 1.0
+    if np.isfinite(places) and matched >= _FEWEST_SOURCES:
+        # The matched ones may be the brightest of all that are predicted: any depth counts.
+        depth = np.sort(met[:, 0])[_FEWEST_SOURCES - 1 :] + 1
+        chance = pdtrc(np.arange(_FEWEST_SOURCES, matched + 1) - 1, depth / tried * expected)
+        p_value = min(p_value, _LOOKS * places * float(chance.min()))
+    if matched < _FEWEST_SOURCES or p_value > _MAX_P_VALUE:
         raise ImageRefused(
             'no_match',
             f'{matched} of {tried} predicted stars match a source, {expected:.0f} expected by'

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices, Mask
-from starcal_ros.camera import field_radius_rad, line_of_sight, project
+from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
 from starcal_ros.sky.astrometry import (
@@ -109,6 +109,11 @@ def in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> 
     """Mask (n,) of the pixels (n, 2) inside the image widened by a margin."""
     u, v, m = xy_px[:, 0], xy_px[:, 1], margin_px
     return (u > -m) & (u < width - 1 + m) & (v > -m) & (v < height - 1 + m)
+
+
+def window_area(camera: CameraModel, margin_px: float) -> float:
+    """Area of the image widened by a margin, in areas of the image."""
+    return (1.0 + 2.0 * margin_px / camera.width) * (1.0 + 2.0 * margin_px / camera.height)
 
 
 def within_image(prediction: Prediction, width: int, height: int) -> Prediction:

@@ -29,6 +29,7 @@ from starcal_ros.identification.prediction import (
     predict,
     Prediction,
     SPACE,
+    window_area,
     within_image,
 )
 from starcal_ros.options import option
@@ -49,12 +50,10 @@ from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_ima
 from starcal_ros.stars.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.stars.psf_fit import stamp_radius_px
 
-# Errors of a mounting and of a launch.  docs/performance.md has the fraction of fields that such a
-# search finds, and of false matches; a larger error needs the search without an alignment.
-ACQUISITION_RADIUS_RAD = math.radians(1.5)
-ACQUISITION_ROLL_RAD = math.radians(5.0)
+_SEARCH_SIGMAS = 3.0
+_ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
-_MIN_STARS = 8  # in an image; fewer stars cannot confirm its attitude
+_MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
 _NEAREST = 200  # brightest predictions, searched in windows first
 _NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis
 
@@ -73,17 +72,46 @@ class IdentificationOptions:
         low=0.3,
         high=100.0,
     )
+    prior_alignment_sigma_deg: float = option(
+        0.5,
+        '1-sigma uncertainty of prior_alignment in pointing, degrees, and 3.3 times as much in'
+        ' roll; images are searched to 3 sigma; state it for fields under 3 degrees',
+        low=1e-4,
+        high=10.0,
+    )
 
 
 @dataclass(frozen=True)
 class StarSearch:
-    """Catalog and options with which the stars of an image are found and measured."""
+    """
+    Catalog and options with which the stars of an image are found and measured.
+
+    ``tracker_sigma_rad`` is the assumed 1-sigma of an attitude about its worst axis.
+    """
 
     catalog: StarCatalog
     centroid: CentroidOptions = dataclasses.field(default_factory=CentroidOptions)
     identification: IdentificationOptions = dataclasses.field(
         default_factory=IdentificationOptions
     )
+    tracker_sigma_rad: float = 0.0
+
+    @property
+    def reach_rad(self) -> float:
+        """
+        Largest error of the pointing of a prediction.
+
+        That of the mounting with the star tracker's in this image, or, once aligned to an image,
+        the star tracker's in both.
+        """
+        mounting_rad = math.radians(self.identification.prior_alignment_sigma_deg)
+        tracker_rad = self.tracker_sigma_rad
+        return _SEARCH_SIGMAS * math.hypot(mounting_rad, tracker_rad, tracker_rad)
+
+    @property
+    def roll_reach_rad(self) -> float:
+        """Largest error of the roll of a prediction."""
+        return _ROLL_FACTOR * self.reach_rad
 
 
 @dataclass(frozen=True)
@@ -112,7 +140,7 @@ def observe_stars(
     With too few measured stars the observations have the refusal ``too_few_stars`` and still list
     the refusal reason of each star.
 
-    Raises ImageRefused ``no_stars``, ``no_match`` or ``incomplete``.
+    Raises ImageRefused ``no_stars``, ``no_match``, ``not_in_catalog`` or ``incomplete``.
     """
     image, options = exposure.image, search.identification
     background = measure_background(image.pixels)
@@ -122,15 +150,12 @@ def observe_stars(
         image.time_ns,
         search.catalog,
         options.magnitude_limit,
-        ACQUISITION_RADIUS_RAD,
+        search.reach_rad,
         exposure.velocity.m_s,
         exposure.site,
     )
-    if len(prediction.catalog_index) < 4:
-        raise ImageRefused(
-            'no_match', f'{len(prediction.catalog_index)} catalog stars in the field'
-        )
-    predicted_px, sources = _find(image.pixels, background, prediction, geometry)
+    _check_catalog(prediction, exposure, geometry, search)
+    predicted_px, sources = _find(image.pixels, background, prediction, geometry, search)
     model = model_image(image.pixels, background, sources, search.centroid)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
@@ -268,8 +293,35 @@ def realigned(geometry: CameraGeometry, observations: StarObservations) -> Camer
     return CameraGeometry(geometry.camera, star_tracker_from_camera.as_quat())
 
 
+def _check_catalog(
+    prediction: Prediction, exposure: Exposure, geometry: CameraGeometry, search: StarSearch
+) -> None:
+    """
+    Refuse an image where the catalog has too few stars for it.
+
+    Raises ImageRefused ``not_in_catalog``, whose detail is the sky that the catalog must cover.
+    """
+    camera, count = geometry.camera, len(prediction.catalog_index)
+    in_field = count / window_area(camera, search.reach_rad * float(camera.parameters[0]))
+    if in_field >= _MIN_STARS or count > _NEAREST:
+        return
+    attitude = geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
+    x, y, z = attitude.apply([0.0, 0.0, 1.0])
+    ra_deg, dec_deg = math.degrees(math.atan2(y, x)) % 360.0, math.degrees(math.asin(z))
+    limit = search.identification.magnitude_limit
+    raise ImageRefused(
+        'not_in_catalog',
+        f'{in_field:.1f} catalog stars to V = {limit:g} in a field at RA {ra_deg:.2f}, Dec'
+        f' {dec_deg:+.2f} deg',
+    )
+
+
 def _find(
-    pixels: Pixels, background: Background, prediction: Prediction, geometry: CameraGeometry
+    pixels: Pixels,
+    background: Background,
+    prediction: Prediction,
+    geometry: CameraGeometry,
+    search: StarSearch,
 ) -> tuple[Floats, Sources]:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
@@ -288,10 +340,12 @@ def _find(
     except ImageRefused:
         pass
     sources = detect(pixels, background)
-    if len(sources.snr) < 4:
-        raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
-    reach_px = ACQUISITION_RADIUS_RAD * float(camera.parameters[0])
-    return acquire(prediction, sources, geometry, reach_px, ACQUISITION_ROLL_RAD), sources
+    if len(sources.snr) < _MIN_STARS:
+        raise ImageRefused(
+            'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
+        )
+    reach_px = search.reach_rad * float(camera.parameters[0])
+    return acquire(prediction, sources, geometry, reach_px, search.roll_reach_rad), sources
 
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:

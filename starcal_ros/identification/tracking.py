@@ -249,6 +249,8 @@ def _corrected_camera(
     before = camera.parameters
     coefficients = [_COEFFICIENT_SIGMA.get(k, _SMALL_SIGMA) for k in camera.parameter_names[5:]]
     sigma = np.r_[before[0] * _INTRINSIC_SIGMA, coefficients]
+    # The principal point of a narrow field is no farther from the middle than of another one.
+    sigma[3:5] = np.minimum(sigma[3:5], _INTRINSIC_SIGMA[3:5] * camera.width)
     held = np.r_[np.ones(len(before)), np.zeros(3)]
     for _ in range(3):
         pixels, J_parameters, J_rotation = project_jacobians(camera, rotation.apply(directions))

@@ -277,11 +277,9 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
             observations, tracked_camera = track_stars(
                 exposure, track.tracked_camera, setup.star_search
             )
-            # Accurate to a few pixels with the camera of the search, whose window is wider.
-            geometry = dataclasses.replace(
-                track.geometry,
-                star_tracker_from_camera_xyzw=tracked_camera.geometry.star_tracker_from_camera_xyzw,
-            )
+            # In a narrow field the tracked camera may have another principal point, and so another
+            # alignment.
+            geometry = realigned(track.geometry, observations)
             after = dataclasses.replace(track, geometry=geometry, tracked_camera=tracked_camera)
             return observations, _after_image(after, exposure, observations, setup)
     observations, instrument = observe_stars(exposure, track.geometry, setup.star_search)

@@ -30,7 +30,11 @@ from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.options import CalibrationOptions, check_options
+from starcal_ros.estimation.options import (
+    assumed_tracker_sigma_rad,
+    CalibrationOptions,
+    check_options,
+)
 from starcal_ros.formats.messages.sensor_messages import CHANNELS
 from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
@@ -59,6 +63,7 @@ _LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 # No star tracker is as good as 0.01 arcsec: 0.001 rad are 206 arcsec, 0.01 degrees 36 arcsec.
 _RADIANS_BELOW, _DEGREES_BELOW = 1e-3, 1e-2
 _FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as many
+_FAINTEST = 100  # stars of the catalog about which its stars are counted
 
 
 def check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
@@ -85,15 +90,25 @@ def check_site(site: SiteOptions) -> None:
         )
 
 
-def check_field_of_stars(stars: int, magnitude_limit: float, camera: CameraModel) -> None:
-    """Raise `OptionError` for a magnitude limit that leaves a camera without stars."""
+def check_field_of_stars(
+    catalog: StarCatalog, magnitude_limit: float, camera: CameraModel
+) -> None:
+    """
+    Raise `OptionError` for a magnitude limit that leaves a camera without stars.
+
+    The field is one about a faint star of the catalog: a deep catalog covers a part of the sky.
+    """
     fx, _, fy = (float(value) for value in camera.intrinsics[:3])
     field_sr = min(camera.width * camera.height / (fx * fy), 4.0 * math.pi)
-    in_field = stars * field_sr / (4.0 * math.pi)
+    direction = catalog.direction_icrs
+    inside = direction[-_FAINTEST:] @ direction.T > 1.0 - field_sr / (2.0 * math.pi)
+    others = np.count_nonzero(inside, axis=1) - 1
+    in_field = float(others.mean()) if len(others) else 0.0
     if in_field < _FEWEST_STARS:
         raise OptionError(
-            f'magnitude_limit: {magnitude_limit:g} leaves {stars} stars in the sky, {in_field:.2g}'
-            ' in a mean field of the camera; raise it'
+            f'magnitude_limit: {magnitude_limit:g} leaves {len(catalog)} stars in the catalog,'
+            f' {in_field:.2g} in a mean field of the camera where it is deepest; raise it, or'
+            ' give a deeper catalog (starcal catalog)'
         )
 
 
@@ -145,7 +160,7 @@ class SetupOptions:
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 0.0),
         'prior orientation of the camera in the star tracker frame, a quaternion (x, y, z, w);'
-        ' its error may be 1.5 degrees, and 5 degrees in roll; zeros: found from the first images',
+        ' zeros: found from the first images',
         length=4,
         basic=True,
     )
@@ -209,7 +224,8 @@ class Setup:
     @property
     def star_search(self) -> StarSearch:
         """Catalog and options for the identification of the stars of an image."""
-        return StarSearch(self.catalog, self.centroid, self.identification)
+        tracker_sigma_rad = float(assumed_tracker_sigma_rad(self.calibration).max())
+        return StarSearch(self.catalog, self.centroid, self.identification, tracker_sigma_rad)
 
     def options(self) -> dict[str, OptionValue]:
         """Every option of every stage, by name."""
@@ -385,7 +401,7 @@ def load_setup(
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
-    check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
+    check_field_of_stars(catalog, magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
     dark = detector_frames.read_dark(frames.dark_frame, *size)
     flat = detector_frames.read_flat(frames.flat_field, *size)

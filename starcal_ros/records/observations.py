@@ -45,6 +45,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'glare': 'the background varies too strongly over most of the image to be subtracted',
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
+    'not_in_catalog': 'the catalog has too few stars where the image points',
     'too_few_stars': 'too few stars were measured well',
     'bad_stamp': 'the stamp, with stamp_offset_s, is negative or beyond the range of ROS stamps',
     'bad_observations': (

@@ -34,6 +34,7 @@ _KEPT = 32  # number of best candidates of a look-up
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
 _TESTED = 16  # brightest predictions used to test a candidate
 _TABLED = 5000  # most points whose stars are kept in memory: for discs of 9 degrees and more
+_NARROW_RAD = math.radians(1.0)  # smaller discs are searched about each candidate itself
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
@@ -210,6 +211,12 @@ def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
 
 
 @functools.lru_cache(maxsize=8)
+def _all_stars(catalog: StarCatalog) -> cKDTree:
+    """Search tree of all stars of a catalog."""
+    return cKDTree(catalog.direction_icrs)
+
+
+@functools.lru_cache(maxsize=8)
 def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
     """Search trees of points all over the sky and of the stars that discs of a radius need."""
     radius_rad = math.radians(radius_deg)
@@ -221,6 +228,8 @@ def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTr
 
 def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
+    if radius_rad < _NARROW_RAD:  # few candidates: their patterns hold the sizes of others
+        return brightest_within(_all_stars(catalog), axes, radius_rad, count)
     points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
     point = points.query(axes)[1]
     if points.n <= _TABLED:

@@ -22,12 +22,13 @@ from scipy.spatial import cKDTree
 from starcal_ros.arrays import Floats, Indices, Singles
 from starcal_ros.sky.catalog import StarCatalog
 
-_SMALLEST_DEG = 1.6
 _STEP = math.sqrt(2.0)
-_SCALES = 10  # discs of 1.6 to 36 degrees of radius
+_STANDARD_DEG = 1.6  # radius of the discs of scale 0
+_SMALLEST, _LARGEST = -10, 9  # scales: discs of 0.05 to 36 degrees of radius
 # Distance of disc centres in disc radii: adjacent discs share two thirds of their area.
 _SPACING = 0.7
-_STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)  # stars per disc: at most about a million patterns
+# Stars per disc from scale 0 on, 7 below: at most about a million patterns.
+_STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)
 _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
 # Orders of A, B, C, D in which noise may show a canonical pattern.
 _ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
@@ -39,7 +40,7 @@ _CELL = 0.04  # about twice the tolerance: two cells along each place, and a tab
 @dataclass(frozen=True)
 class PatternIndex:
     """
-    Patterns within discs of one size all over the sky.
+    Patterns within discs of one size wherever the catalog has stars enough.
 
     ``quads`` (q, 4) rows of the catalog in the order A, B, C, D, sorted as ``grid`` has their
     shapes (`shapes`); ``radius_rad`` radius of the discs.
@@ -52,35 +53,53 @@ class PatternIndex:
 
 def scales_for(half_diagonal_rad: float) -> list[int]:
     """Numbers of the scales whose discs are half to a whole field wide, smallest first."""
-    fitting = [
-        k
-        for k in range(_SCALES)
-        if 0.48 <= math.radians(_SMALLEST_DEG * _STEP**k) / half_diagonal_rad < 0.97
-    ]
-    return fitting or [0 if half_diagonal_rad < math.radians(_SMALLEST_DEG) else _SCALES - 1]
+    scales = range(_SMALLEST, _LARGEST + 1)
+    fitting = [k for k in scales if 0.48 <= _radius_rad(k) / half_diagonal_rad < 0.97]
+    return fitting or [_SMALLEST if half_diagonal_rad < _radius_rad(0) else _LARGEST]
 
 
-@functools.lru_cache(maxsize=_SCALES)
+def _radius_rad(scale: int) -> float:
+    """Radius of the discs of a scale."""
+    return math.radians(_STANDARD_DEG * _STEP**scale)
+
+
+@functools.lru_cache(maxsize=10)
 def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     """
     Index of the patterns of the brightest stars of each disc of a scale.
 
     It takes about a second and is kept in memory.  The catalog is sorted by magnitude.
     """
-    radius_rad = math.radians(_SMALLEST_DEG * _STEP**scale)
-    of_disc = _STARS[scale]
+    radius_rad = _radius_rad(scale)
+    of_disc = _STARS[max(scale, 0)]
     sky_by_disc = 2.0 / (1.0 - math.cos(radius_rad))
     stars = catalog.direction_icrs[: int(_DEPTH * of_disc * sky_by_disc)]
-    centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
+    if scale >= 0:
+        centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
+    else:
+        centres = _occupied(stars, _SPACING * radius_rad)
     members = brightest_within(cKDTree(stars), centres, radius_rad, of_disc)
     chosen = np.array(list(itertools.combinations(range(of_disc), 4)))
     quads = np.sort(members[:, chosen].reshape(-1, 4), axis=1)
     quads = quads[quads[:, 0] >= 0]  # -1 fills up a disc with fewer stars
-    key = np.unique(((quads[:, 0] << 16 | quads[:, 1]) << 16 | quads[:, 2]) << 16 | quads[:, 3])
-    quads = np.stack([key >> 48, key >> 32 & 0xFFFF, key >> 16 & 0xFFFF, key & 0xFFFF], axis=-1)
+    first, second = quads[:, 0] << 32 | quads[:, 1], quads[:, 2] << 32 | quads[:, 3]
+    by_pattern = np.lexsort([second, first])
+    first, second = first[by_pattern], second[by_pattern]
+    differs = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
+    quads = quads[by_pattern[differs]]
     order, shape = shapes(stars[quads])
     rows, grid = shape_grid(shape)
     return PatternIndex(radius_rad, np.take_along_axis(quads, order, axis=1)[rows], grid)
+
+
+def _occupied(stars: Floats, side_rad: float) -> Floats:
+    """Middles (p, 3) of the cells of about this side that hold some of the stars (n, 3)."""
+    dec = (np.floor(np.arcsin(np.clip(stars[:, 2], -1.0, 1.0)) / side_rad) + 0.5) * side_rad
+    around = np.maximum(np.floor(2 * math.pi * np.cos(dec) / side_rad), 1.0)
+    turn = np.arctan2(stars[:, 1], stars[:, 0]) / (2 * math.pi) % 1.0
+    ra = (np.floor(turn * around) + 0.5) / around * (2 * math.pi)
+    dec, ra = np.unique(np.stack([dec, ra]), axis=1)
+    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 
 
 def shapes(directions: Floats) -> tuple[Indices, Floats]:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.identification.star_finder import ACQUISITION_RADIUS_RAD, ACQUISITION_ROLL_RAD
+from starcal_ros.identification.star_finder import StarSearch
 from starcal_ros.pipeline.diagnosis.identified import Solved
 from starcal_ros.pipeline.setup import Setup
 
@@ -31,6 +31,7 @@ _CLOCK_LEAST_RAD = math.radians(0.02)  # a clock error causes more scatter than 
 _CLOCK_IMAGES = 3  # fewest: estimating the shift absorbs part of the information of two images
 _ALIKE_RAD = math.radians(0.003)  # a smaller scatter is due to the stars
 _WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance agreement is this close in one case of 200
+_TURNED_RAD = math.radians(5.0)  # roll of a mounting that is right but for quarter turns
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 _ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in range(4)]
 _NORM_TOLERANCE = 1e-3
@@ -73,10 +74,10 @@ class Reading:
         tilt_rad = math.acos(min(max(float(axes[2, 2]), -1.0), 1.0))
         return tilt_rad, math.atan2(float(axes[1, 0]), float(axes[0, 0]))
 
-    def is_off(self, prior: Rotation) -> bool:
-        """True if a prior alignment is off by more than the search radius."""
+    def is_off(self, prior: Rotation, search: StarSearch) -> bool:
+        """True if a prior alignment is off by more than images are searched to."""
         tilt_rad, roll_rad = self.off_by(prior)
-        return tilt_rad > ACQUISITION_RADIUS_RAD or abs(roll_rad) > ACQUISITION_ROLL_RAD
+        return tilt_rad > search.reach_rad or abs(roll_rad) > search.roll_reach_rad
 
     def quarter_turns(self, prior: Rotation) -> int:
         """
@@ -84,8 +85,9 @@ class Reading:
 
         Counted from the camera's +x towards its +y.
         """
-        fitting = (turns for turns in range(4) if not self.is_off(prior * _ROLLS[turns]))
-        return next(fitting, 0)
+        off = (self.off_by(prior * roll) for roll in _ROLLS)
+        near = [max(3.0 * tilt_rad, abs(roll_rad)) < _TURNED_RAD for tilt_rad, roll_rad in off]
+        return near.index(True) if any(near) else 0
 
 
 def prior_alignment(setup: Setup) -> Rotation | None:
@@ -152,7 +154,8 @@ class Case:
         if prior is None:
             is_given = (fit[0].order, fit[0].direction) == _ways(self.setup)[0]
             return fit[0] if is_given else None
-        near = [reading for reading in fit if not reading.is_off(prior)]
+        search = self.setup.star_search
+        near = [reading for reading in fit if not reading.is_off(prior, search)]
         if near:
             return near[0]
         likely = [

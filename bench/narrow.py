@@ -1,0 +1,258 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Narrow cameras of 0.3 to 5 degrees, rendered and calibrated with attitudes and from images alone.
+
+The sky is that of the bundled catalog to V = 9, and below a draw with the mean density of stars
+(Allen 2000, Astrophysical Quantities, section 19.2) in one region 10 degrees wide, in which all
+images lie; the catalog file covers that region.  The mounting is off by 5 arcsec to 0.3 degrees,
+stated as its sigma.  From images alone the focal length is given to 10 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import dataclasses
+import math
+from pathlib import Path
+import tempfile
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bench.frames import load_set_up, observed, render_frame
+from bench.night_sky import off_arcsec
+from bench.table import Table
+from bench.trials import in_processes, rms
+from starcal_ground.mission.ingest.gaia_catalog import catalog_file, integer_columns
+from starcal_ground.simulation.rendering import images
+from starcal_ground.simulation.scenario import Inertial, Scenario
+from starcal_ground.simulation.scenario import scenario as synthetic
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import StarcalError
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.products.camera_yaml import write_camera_info
+from starcal_ros.pipeline import night_sky, solve
+from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import Calibration, CameraGeometry, Ensemble, MapCovariance
+from starcal_ros.simulation import centroids
+from starcal_ros.sky.catalog import load_catalog, MotionSource, StarCatalog
+from studies.trials import map_bound_px
+
+SIZE, IMAGES, SEEDS = (800, 640), 14, 10
+FIELDS_DEG = (0.3, 0.5, 1.0, 2.5, 5.0)  # of the width
+_STARS = 20  # in a mean image
+_REGION_RAD = math.radians(5.0)
+_BUNDLED_MAG = 9.0
+_BELOW_LIMIT_MAG = 1.0  # rendered and in the catalog, too faint to be measured
+_MOST_MAG = 14.0
+
+
+def run(quick: bool) -> Iterator[Table]:
+    """One line for each field, with attitudes and without; an hour, or a minute."""
+    fields, seeds = (FIELDS_DEG[:1], 2) if quick else (FIELDS_DEG, SEEDS)
+    columns = (
+        'field deg, attitudes, accepted, of, error / bound, error / sigma, worst, error arcsec, '
+        'wrong stars, images, s an image, first reason'
+    )
+    table = Table(f'Narrow cameras, {IMAGES} images, {_STARS} stars each', columns.split(', '))
+    for field_deg in fields:
+        for blind in (False, True):
+            trials = in_processes(trial, [field_deg] * seeds, range(seeds), [blind] * seeds)
+            good = np.array([one.numbers for one in trials if not one.reason])
+            reason = next((one.reason for one in trials if one.reason), '')
+            figures = good.reshape(-1, 6).T
+            table.add(
+                *(field_deg, 'none' if blind else 'given', len(good), seeds),
+                *(rms(figures[0]), rms(figures[1]), float(figures[1].max(initial=0.0))),
+                *(rms(figures[2]), int(figures[3].sum()), float(figures[4].sum())),
+                *(float(figures[5].mean()) if len(good) else math.nan, reason[:60]),
+            )
+            print(*table.rows[-1], flush=True)
+    yield table
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """Error over bound and sigma, error, stars wrong, images used, s an image; or a reason."""
+
+    numbers: tuple[float, ...]
+    reason: str = ''
+
+
+def trial(field_deg: float, seed: int, blind: bool) -> Trial:
+    """The calibration of a camera against its truth."""
+    given = scenario_of(field_deg, seed)
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        folder = Path(name)
+        start_s = time.process_time()
+        try:
+            found, ensemble = (_from_images if blind else _with_attitudes)(given, folder)
+        except StarcalError as error:
+            return Trial((), f'{type(error).__name__}: {error}')
+    took_s = (time.process_time() - start_s) / IMAGES
+    true = given.truth.camera
+    error_arcsec, sigma_arcsec = off_arcsec(found, true)
+    numbers = (
+        error_arcsec / (bound_px(given) / float(true.parameters[0]) / ARCSECOND_RAD),
+        *(error_arcsec / sigma_arcsec, error_arcsec, float(wrong_stars(given, ensemble))),
+        *(float(len(ensemble.images)), took_s),
+    )
+    return Trial(numbers, '' if found.accepted else found.reasons[0])
+
+
+def scenario_of(field_deg: float, seed: int) -> Scenario:
+    """A campaign of a camera of this width, whose mounting is off by what is stated."""
+    rng = np.random.default_rng([seed, round(100 * field_deg)])
+    fx = SIZE[0] / 2 / math.tan(math.radians(field_deg / 2))
+    reach = 0.5 * math.hypot(*SIZE) / fx
+    middle = (np.array(SIZE) - 1) / 2
+    nominal = CameraModel(*SIZE, np.array([fx, 0.0, fx, *middle, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    focal_px = fx * (1.0 + rng.normal(0.0, 3e-3))
+    true = nominal.replace(
+        fx=focal_px,
+        fy=focal_px * (1.0 + rng.normal(0.0, 3e-4)),
+        cx=middle[0] + rng.normal(0.0, 5.0),
+        cy=middle[1] + rng.normal(0.0, 5.0),
+        k1=rng.normal(0.0, 3e-3) / reach**2,
+    )
+    per_deg2 = _STARS / (field_deg**2 * SIZE[1] / SIZE[0])
+    depth = np.linspace(7.0, _MOST_MAG, 200)
+    limit = float(np.interp(math.log10(per_deg2), _log10_density(depth), depth))
+    axis, sky = rng.normal(size=3), None
+    axis /= np.linalg.norm(axis)
+    if limit + _BELOW_LIMIT_MAG > _BUNDLED_MAG and field_deg < 2.0:
+        sky = deep_sky(axis, limit + _BELOW_LIMIT_MAG, rng)
+    limit = limit if sky else _BUNDLED_MAG - 0.1
+    apart = _disc(axis, IMAGES, 0.9 * _REGION_RAD if sky else math.pi, rng)
+    ra_deg, dec_deg = (
+        np.degrees(np.arctan2(apart[:, 1], apart[:, 0])),
+        np.degrees(np.arcsin(apart[:, 2])),
+    )
+    attitudes = np.stack([ra_deg, dec_deg, rng.uniform(0.0, 360.0, IMAGES)], axis=-1)
+    base = synthetic.scenario('small', seed)
+    detector = dataclasses.replace(
+        base.detector, zero_point_electrons=200.0 * 10 ** (0.4 * limit), bits=14
+    )
+    off_rad = mounting_sigma_rad(seed) * rng.normal(size=3)
+    mounting = base.prior.star_tracker_from_camera
+    return dataclasses.replace(
+        base,
+        truth=CameraGeometry(true, (mounting * Rotation.from_rotvec(off_rad)).as_quat()),
+        prior=CameraGeometry(nominal, mounting.as_quat()),
+        detector=detector,
+        star_tracker_sigma_arcsec=(5.0, 5.0, 20.0),
+        pointing=Inertial(tuple((a, b, c) for a, b, c in attitudes.tolist())),
+        image_count=IMAGES,
+        magnitude_limit=limit + _BELOW_LIMIT_MAG if sky else _BUNDLED_MAG,
+        sky=sky,
+    )
+
+
+def mounting_sigma_rad(seed: int) -> float:
+    """1-sigma of the mounting of a seed: 5 arcsec to 0.3 degrees."""
+    return float(np.geomspace(5.0, 1080.0, SEEDS)[seed % SEEDS]) * ARCSECOND_RAD
+
+
+def _log10_density(magnitude: NDArray[np.floating]) -> Floats:
+    """Mean number of stars to a V magnitude per square degree, as Allen has it, to 10 %."""
+    fainter = magnitude - 9.0
+    return 0.48 + 0.45 * fainter - 0.007 * fainter**2
+
+
+def deep_sky(axis: Floats, faintest: float, rng: np.random.Generator) -> StarCatalog:
+    """The bundled catalog, and stars below it about an axis (3,)."""
+    depth = np.linspace(_BUNDLED_MAG, faintest, 500)
+    area_deg2 = 2 * math.pi * (1.0 - math.cos(_REGION_RAD)) * math.degrees(1.0) ** 2
+    # The densest tenth of the sky has three times the mean, the emptiest a third.
+    number = area_deg2 * 10 ** _log10_density(depth) * math.exp(rng.normal(0.0, 0.3))
+    count = rng.poisson(number[-1] - number[0])
+    magnitude = np.interp(rng.uniform(number[0], number[-1], count), number, depth)
+    direction = _disc(axis, count, _REGION_RAD, rng)
+    motion = rng.normal(0.0, 8e-3 * ARCSECOND_RAD, (count, 2))
+    bundled, ra_rad = load_catalog(), np.arctan2(direction[:, 1], direction[:, 0])
+    drawn = {
+        'id': np.arange(count) + 1,
+        'ra_rad': ra_rad % (2 * math.pi),
+        'dec_rad': np.arcsin(direction[:, 2]),
+        'pm_ra_cosdec_rad_per_year': motion[:, 0],
+        'pm_dec_rad_per_year': motion[:, 1],
+        'parallax_rad': np.zeros(count),
+        'magnitude': magnitude,
+        'colour_bp_rp': rng.normal(1.0, 0.3, count),
+        'motion_source': np.full(count, MotionSource.GAIA, np.uint8),
+        'close_pair': np.zeros(count, np.bool_),
+    }
+    columns = {name: np.concatenate([getattr(bundled, name), drawn[name]]) for name in drawn}
+    sky = dataclasses.replace(bundled, **columns)
+    return sky.select(np.argsort(sky.magnitude, kind='stable'))
+
+
+def _disc(axis: Floats, count: int, radius_rad: float, rng: np.random.Generator) -> Floats:
+    """Directions (count, 3), even over the disc about an axis."""
+    z = rng.uniform(math.cos(radius_rad), 1.0, count)
+    angle, r = rng.uniform(0.0, 2 * math.pi, count), np.sqrt(1.0 - z * z)
+    local = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
+    turn, _ = Rotation.align_vectors(axis[None], [[0.0, 0.0, 1.0]])
+    return np.asarray(turn.apply(local))
+
+
+def _write_catalog(given: Scenario, folder: Path) -> dict[str, object]:
+    """Options of the sky of a scenario, whose catalog is written to a folder."""
+    values: dict[str, object] = {'magnitude_limit': given.magnitude_limit}
+    if given.sky is not None:
+        path = folder / 'catalog.npz'
+        path.write_bytes(catalog_file(integer_columns(vars(given.sky))))
+        values['catalog'] = str(path)
+    return values
+
+
+def _with_attitudes(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:
+    """Calibration by the attitudes of the star tracker, and its ensemble."""
+    sigma_deg = math.degrees(mounting_sigma_rad(given.seed))
+    values = _write_catalog(given, folder)
+    setup = load_set_up(given, prior_alignment_sigma_deg=sigma_deg, **values)
+    frames = (render_frame(given, index) for index in range(IMAGES))
+    ensemble = observed(frames, setup)
+    return solve.solve(ensemble, setup), ensemble
+
+
+def _from_images(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:
+    """Calibration from a bag of the images alone, the focal length given to 10 %."""
+    rng = np.random.default_rng(given.seed)
+    fx = float(given.prior.camera.parameters[0]) * (1.0 + rng.uniform(-0.1, 0.1))
+    camera = folder / 'camera.yaml'
+    write_camera_info(given.prior.camera.replace(fx=fx, fy=fx), camera)
+    values = {**_write_catalog(given, folder), 'camera_info_url': f'file://{camera}'}
+    bag = folder / 'images.mcap'
+    with BagWriter(bag) as writer:
+        for image in images(given):
+            writer.write_image('/camera/image_raw', image, 'camera')
+    found = night_sky.from_bags([bag], Topics(), values, folder)
+    campaign = calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)
+    return campaign.calibration, campaign.ensemble
+
+
+def bound_px(given: Scenario) -> float:
+    """Cramer-Rao bound of the RMS error of the lines of sight, px."""
+    names = given.truth.camera.parameter_names
+    columns = [names.index(name) for name in centroids.bound_names(given.truth.camera)]
+    bound = np.zeros((len(names) + 3, len(names) + 3))
+    bound[np.ix_(columns, columns)] = centroids.cramer_rao_covariance(given)
+    return map_bound_px(given.truth.camera, MapCovariance(bound))
+
+
+def wrong_stars(given: Scenario, ensemble: Ensemble) -> int:
+    """Number of stars measured more than 3 px from where they are."""
+    index = {given.time_ns(k): k for k in range(given.image_count)}
+    wrong = 0
+    for image in ensemble.images:
+        shown = synthetic.scene(given, index[image.time_ns])
+        place = dict(zip(shown.catalog_id.tolist(), shown.pixel_px, strict=True))
+        for star, xy_px in zip(image.catalog_id.tolist(), image.measured_px, strict=True):
+            wrong += star not in place or bool(np.hypot(*(xy_px - place[star])) > 3.0)
+    return wrong

@@ -1,0 +1,158 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Stars of narrow fields, from 5 an image, with the uncertainty of the attitude that is stated."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bench.narrow import scenario_of
+from starcal_ground.simulation.scenario import Scenario, Scene, scene
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification.blind.bright_sources import bright_sources
+from starcal_ros.identification.blind.pattern_index import pattern_index
+from starcal_ros.identification.blind.search import find_sky, NotFound, SkyMatch
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    StarSearch,
+)
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.simulation.rendering import render
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
+
+
+@functools.cache
+def given(field_deg: float) -> Scenario:
+    return scenario_of(field_deg, 3)
+
+
+@functools.cache
+def shown(field_deg: float, index: int, stars: int | None = None) -> tuple[Scene, Image]:
+    """An image of a narrow camera, of its brightest stars."""
+    scenario = dataclasses.replace(given(field_deg), stars_per_image=stars)
+    one = scene(scenario, index)
+    return one, render(scenario, one, index)
+
+
+def sky_of(field_deg: float) -> StarCatalog:
+    sky = given(field_deg).sky
+    return load_catalog() if sky is None else sky
+
+
+def observed(
+    field_deg: float, index: int, off_deg: float, sigma_deg: float, stars: int | None = None
+) -> StarObservations:
+    """Observations with a mounting off by an angle and stated with a sigma."""
+    one, image = shown(field_deg, index, stars)
+    turn = Rotation.from_rotvec(math.radians(off_deg) * np.array([0.6, -0.8, 0.5]))
+    truth, prior = given(field_deg).truth, given(field_deg).prior
+    mounting = (truth.star_tracker_from_camera * turn).as_quat()
+    options = IdentificationOptions(
+        magnitude_limit=given(field_deg).magnitude_limit, prior_alignment_sigma_deg=sigma_deg
+    )
+    search = StarSearch(
+        sky_of(field_deg), identification=options, tracker_sigma_rad=20.0 * ARCSECOND_RAD
+    )
+    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    return observe_stars(exposure, CameraGeometry(prior.camera, mounting), search)[0]
+
+
+def wrong(found: StarObservations, one: Scene) -> int:
+    """Number of stars that are not at the pixel of their catalog number."""
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    true_px = np.array([place.get(star, [np.nan] * 2) for star in found.catalog_id.tolist()])
+    return int((~(np.hypot(*(found.measured_px - true_px).T) < 1.0)).sum())
+
+
+@pytest.mark.parametrize(
+    ('field_deg', 'off_deg', 'sigma_deg'),
+    [
+        (0.3, 5 / 3600, 5 / 3600),
+        (0.3, 0.3, 0.3),
+        (0.3, 1.0, 0.5),
+        (1.0, 120 / 3600, 0.5),
+        (1.0, 1.0, 0.5),
+        (2.5, 1.0, 0.5),
+    ],
+)
+def test_the_window_follows_the_stated_sigma(
+    field_deg: float, off_deg: float, sigma_deg: float
+) -> None:
+    for index in (1, 4):
+        found = observed(field_deg, index, off_deg, sigma_deg)
+        assert found.refusal == '' and len(found) >= 8
+        assert wrong(found, shown(field_deg, index)[0]) == 0
+
+
+def test_a_stated_sigma_that_is_too_small_gives_no_match() -> None:
+    with pytest.raises(ImageRefused, match='no_match'):
+        observed(0.3, 1, 0.3, 0.005)
+
+
+@pytest.mark.parametrize(('stars', 'least'), [(5, 2), (7, 4), (15, 4)])
+def test_five_stars_are_enough(stars: int, least: int) -> None:
+    right = 0
+    for index in range(4):
+        found = observed(0.3, index, 0.01, 0.01, stars)
+        if found.refusal == '':
+            right += 1
+            assert wrong(found, shown(0.3, index, stars)[0]) == 0
+    assert right >= least  # of five, each has to be measured well
+
+
+def test_fewer_than_five_stars_are_refused_with_the_reason() -> None:
+    with pytest.raises(ImageRefused, match='no_stars: [34] star-like sources, 5 needed'):
+        observed(0.3, 1, 0.01, 0.01, 3)
+
+
+def test_a_catalog_of_another_region_is_said_to_be() -> None:
+    one, image = shown(0.3, 1)
+    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    options = IdentificationOptions(magnitude_limit=14.0, prior_alignment_sigma_deg=0.1)
+    where = (
+        r'not_in_catalog: 0\.\d catalog stars to V = 14 in a field at RA \d.*, Dec [+-]\d.* deg'
+    )
+    with pytest.raises(ImageRefused, match=where):
+        observe_stars(
+            exposure, given(0.3).truth, StarSearch(load_catalog(), identification=options)
+        )
+
+
+@pytest.mark.parametrize('field_deg', [0.3, 1.0, 2.5])
+def test_stars_are_found_without_attitude_in_the_region_of_the_catalog(field_deg: float) -> None:
+    camera, catalog = given(field_deg).prior.camera, sky_of(field_deg)
+    fx = 0.9 * float(camera.parameters[0])
+    for index in (1, 2):
+        one, image = shown(field_deg, index)
+        sources = bright_sources(image.pixels)
+        sky = find_sky(sources.xy_px, camera.replace(fx=fx, fy=fx), catalog, try_mirrored=True)
+        assert isinstance(sky, SkyMatch) and not sky.mirrored
+        place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+        numbers = catalog.id[sky.catalog_index].tolist()
+        off_px = sky.xy_px - np.array([place.get(star, [np.nan] * 2) for star in numbers])
+        assert (np.hypot(*off_px.T) < 3.0).all()
+
+
+def test_random_points_are_no_stars_of_a_deep_catalog() -> None:
+    camera, rng = given(0.3).prior.camera, np.random.default_rng(5)
+    for _ in range(2):
+        points = rng.uniform([0, 0], [camera.width, camera.height], (18, 2))
+        assert isinstance(find_sky(points, camera, sky_of(0.3), try_mirrored=True), NotFound)
+
+
+@pytest.mark.parametrize('scale', [0, -8])
+def test_a_pattern_lies_within_its_disc(scale: int) -> None:
+    catalog = sky_of(0.3)
+    index = pattern_index(catalog, scale)
+    assert len(index.quads) > 100_000
+    places = catalog.direction_icrs[index.quads]
+    apart = np.linalg.norm(places[:, :1] - places[:, 1:], axis=2)
+    assert apart.max() <= 2 * 2 * math.sin(index.radius_rad / 2)
