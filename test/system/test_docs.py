@@ -173,7 +173,9 @@ def test_every_parameter_is_in_the_interface_document_and_none_else() -> None:
     assert sorted(rows) == sorted(names_of(*OPTIONS))
 
 
-FILE_ENDINGS = ('html', 'json', 'mcap', 'md', 'npz', 'py', 'tf', 'ti', 'yaml')
+FILE_ENDINGS = (
+    *('html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'py', 'sqlite', 'tf', 'ti', 'yaml'),
+)
 
 
 @pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

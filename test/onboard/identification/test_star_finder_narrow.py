@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.narrow import scenario_of
+from starcal_ground.simulation.rendering import render
 from starcal_ground.simulation.scenario import Scenario, Scene, scene
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
@@ -25,7 +26,6 @@ from starcal_ros.identification.star_finder import (
     StarSearch,
 )
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.simulation.rendering import render
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
