@@ -256,7 +256,8 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     shape_px: Floats | float = _FIRST_SHAPE_PX
     near: Posterior | None = None
     termination = 'iteration_limit'
-    share, before_sigma = 1.0, np.empty(0)
+    share = 1.0
+    before_sigma: Floats = np.empty(0)
     for k in range(_ROUNDS):
         last = _round(data, problem, state, judged, residual_px, shape_px, near, share)
         after = judge(
@@ -275,8 +276,8 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         # Where stars hardly show an unknown, whole steps overshoot to and fro: the part of the
         # step before that is left shows the share that ends in the minimum.
         if k:
-            left = (step_sigma @ before_sigma) / (before_sigma @ before_sigma)
-            share = min(max(share / max(1.0 - left, share), _LEAST_SHARE), 1.0)
+            rest = float(step_sigma @ before_sigma) / float(before_sigma @ before_sigma)
+            share = min(max(share / max(1.0 - rest, share), _LEAST_SHARE), 1.0)
         before_sigma = step_sigma
     weights = Weights(
         judged.covariance_px2(table)[:, [0, 2]].mean(axis=1),
@@ -359,7 +360,8 @@ def _step_sigma(layout: Layout, found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
     in_state = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
-    return np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
+    steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
+    return np.asarray(steps)
 
 
 def _check_not_mirrored(state: State) -> None:
