@@ -286,6 +286,13 @@ def calibrate_images(
     ------
     StarcalError
         One line that names the cause, and the images to take.
+
+    Examples
+    --------
+    >>> import starcal_ground
+    >>> calibration = starcal_ground.calibrate_images('bags/tiny')  # its attitudes are not used
+    >>> calibration.has_alignment, calibration.images_used
+    (False, 10)
     """
     paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:

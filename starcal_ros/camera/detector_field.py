@@ -74,6 +74,13 @@ class DetectorField:
 
     ``coefficients`` is (2, t): px, of the functions of `basis` to ``octaves``, for u and for v.
     The field is a function of the measured pixel.
+
+    >>> import numpy as np
+    >>> octaves, shift = 1, np.zeros((2, term_count(1024, 768, 1)))
+    >>> shift[0, 0] = 0.1  # px, half a wave along u
+    >>> field = DetectorField(1024, 768, octaves, shift)
+    >>> field.displacement_px([[0, 0], [1023, 0]]).round(2).tolist()
+    [[0.14, 0.0], [-0.14, 0.0]]
     """
 
     width: int

@@ -70,6 +70,13 @@ class CameraModel:
     `lens.COEFFICIENTS`; ``field`` a displacement that the lens model does not describe.  Raises
     ValueError for an unknown model, for parameters that are not p finite numbers, and for a focal
     length that is not positive.
+
+    >>> import starcal_ros
+    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> camera.parameter_names
+    ('fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'p1', 'p2')
+    >>> camera.replace(k1=-0.1).distortion.tolist()
+    [-0.1, 0.0, 0.0, 0.0, 0.0]
     """
 
     width: int
@@ -226,6 +233,11 @@ def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none.
 
     The field is a function of the resulting pixel, so the projection is iterated.
+
+    >>> import starcal_ros
+    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> starcal_ros.project(camera, [[0, 0, 1], [0.1, 0, 1], [0, 0, -1]]).tolist()
+    [[511.5, 383.5], [711.5, 383.5], [nan, nan]]
     """
     directions = np.asarray(directions_camera, np.float64)
     ideal = project_parameters(camera.model, camera.parameters, directions)
