@@ -360,8 +360,8 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
-    found = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
-    xy[~found | (determinant <= 0) | (r2 > fold2)] = np.nan
+    converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
+    xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
     return directions_of(model, xy)
 
 
@@ -467,7 +467,7 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     directions = line_of_sight(camera, target)
     exists = np.isfinite(directions[:, 0])
     target, directions = target[exists], directions[exists]
-    seen = np.isfinite(project(start, directions)).all(axis=1)
+    visible = np.isfinite(project(start, directions)).all(axis=1)
 
     def moved(x: Floats) -> CameraModel:
         parameters = start.parameters.copy()
@@ -481,17 +481,17 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         held_px = held_px[:0]
 
     def residual(x: Floats) -> Floats:
-        off = project(moved(x), directions[seen]) - target[seen]
+        off = project(moved(x), directions[visible]) - target[visible]
         return np.concatenate([off.ravel(), held_px @ (x - start.parameters[free])])
 
     def jacobian(x: Floats) -> Floats:
-        J = project_jacobians(moved(x), directions[seen])[1]
+        J = project_jacobians(moved(x), directions[visible])[1]
         return np.concatenate([J[..., free].reshape(-1, len(free)), held_px])
 
     # MINPACK scales the parameters by their columns and bounds the step.
     from scipy.optimize import least_squares  # a third of the start of a short command
 
-    found = least_squares(
+    solution = least_squares(
         residual,
         start.parameters[free],
         jacobian,
@@ -502,6 +502,6 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         gtol=1e-15,
         max_nfev=200,
     )
-    fitted = moved(found.x)
+    fitted = moved(solution.x)
     error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
     return fitted, float(np.where(np.isnan(error), np.inf, error).max(initial=0.0))

@@ -29,7 +29,7 @@ from starcal_ros.untrusted import regular_file
 
 _RGB, _GREY = 3, 2
 MOST_VALUES = 2**27  # per image, all colours; the nodes have the same limit
-MOST_BYTES = 2**29  # of a file that is decoded as a whole
+MOST_BYTES = 2**29  # a larger file is not decoded
 
 
 class Card(NamedTuple):
@@ -116,14 +116,14 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
 
 def _cards(header: Any) -> dict[str, Card]:
     """Cards of a header of astropy; the first of duplicate keywords counts."""
-    found: dict[str, Card] = {}
+    cards: dict[str, Card] = {}
     for card in header.cards:
         try:
             value = Card(card.value, card.comment)
         except Exception:  # astropy cannot parse it: keep the text, fail only where it is used
             value = Card(str(card.image)[10:].strip())
-        found.setdefault(card.keyword, value)
-    return found
+        cards.setdefault(card.keyword, value)
+    return cards
 
 
 @contextlib.contextmanager

@@ -324,8 +324,8 @@ class Calibration:
         """Check the size of the covariance."""
         p = len(self.parameter_names)
         if self.covariance.shape != (p, p):
-            found = ' x '.join(map(str, self.covariance.shape))
-            raise ValueError(f'covariance: {found} numbers, not {p} x {p}')
+            sides = ' x '.join(map(str, self.covariance.shape))
+            raise ValueError(f'covariance: {sides} numbers, not {p} x {p}')
         if self.field is not None and self.geometry.camera.field is None:
             # Files and messages hold the field beside the camera, with its covariance.
             camera = self.geometry.camera
@@ -361,7 +361,7 @@ class Calibration:
 
 
 _MOST = 1e15  # largest camera parameter: its cube must be finite
-_UNIT_TOLERANCE = 1e-6  # of the norm of a quaternion: rounded decimals change it by less
+_UNIT_TOLERANCE = 1e-6  # rounded decimals change the norm of a quaternion by less
 
 
 def check_calibration(calibration: Calibration) -> None:

@@ -225,10 +225,10 @@ def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:
     return [total, *sorted(causes, key=share, reverse=True)]
 
 
-_DIGITS = 9  # of the factor: parameters and field cancel to a thousandth and less
+_DIGITS = 9  # parameters and field cancel to a thousandth and less in the factor
 # Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 3e-4.
 _STEPS = 1000
-_NO_VARIANCE = 1e-12  # of the largest, scaled: rounding
+_NO_VARIANCE = 1e-12  # times the largest eigenvalue: smaller ones are rounding
 
 
 @dataclass(frozen=True)
@@ -322,10 +322,10 @@ class ResidualField:
 
     def on(self, width: int, height: int) -> DetectorField:
         """Return the field on a detector; raises ValueError for a wrong number of terms."""
-        found = self.coefficients.shape[1]
+        given = self.coefficients.shape[1]
         expected = term_count(width, height, self.octaves)
-        if found != expected:
-            raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
+        if given != expected:
+            raise ValueError(f'field.coefficients: {given} for an axis, not {expected}')
         return DetectorField(width, height, self.octaves, self.coefficients)
 
 
@@ -348,10 +348,10 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
         [known[:, None] * vectors * root, matrix[p:, :p] / scale @ vectors / root]
     )
     factor = _to_digits(factor, _DIGITS)
-    left = matrix[p:, p:] - factor[p:] @ factor[p:].T
-    unit_px = _to_digits(np.sqrt(np.diag(left).clip(0.0)) / _STEPS, 4)
+    remaining = matrix[p:, p:] - factor[p:] @ factor[p:].T
+    unit_px = _to_digits(np.sqrt(np.diag(remaining).clip(0.0)) / _STEPS, 4)
     steps = np.where(unit_px > 0, unit_px, np.inf)
-    values, vectors = np.linalg.eigh(left / np.outer(steps, steps))
+    values, vectors = np.linalg.eigh(remaining / np.outer(steps, steps))
     # The triangle of the QR decomposition of a root exists for deficient rank too.
     _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
     return ResidualField(

@@ -44,8 +44,8 @@ def refracted(direction_icrf: Floats, zenith_icrf: Floats, refraction_arcsec: fl
     cosine = np.maximum(direction_icrf @ zenith_icrf, LEAST_COSINE)[:, None]
     towards = zenith_icrf / cosine - direction_icrf
     tangent2 = 1.0 / cosine**2 - 1.0
-    seen = direction_icrf + refraction_arcsec * ARCSECOND_RAD * (1 + _CUBIC * tangent2) * towards
-    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+    bent = direction_icrf + refraction_arcsec * ARCSECOND_RAD * (1 + _CUBIC * tangent2) * towards
+    return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
 def zenith_of(latitude_rad: float, right_ascension_rad: Floats) -> Floats:
@@ -102,8 +102,8 @@ class SiteOptions:
         high=1e6,
         length=3,
     )
-    # Of the air at the site, constants in flight: ten degrees change a refraction of 60 arcsec by
-    # 2 arcsec, nearly the same for all stars of an image.  Zero is the pressure at the height.
+    # The air at the site, constant in flight: ten degrees change a refraction of 60 arcsec by
+    # 2 arcsec, nearly the same for all stars of an image.  Zero means the pressure at the height.
     air_pressure_hpa: float = 0.0
     air_temperature_degc: float = 10.0
 

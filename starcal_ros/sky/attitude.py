@@ -373,10 +373,10 @@ def attitudes_at(
     """
     from scipy.spatial.transform import Rotation  # half of the start of a short command
 
-    found: list[Attitude] = []
+    usable: list[Attitude] = []
     refusal: ImageRefused | None = None
     try:
-        found.append(Attitude(*first.at(time_ns, max_gap_s), first.rate_at(time_ns, max_gap_s)))
+        usable.append(Attitude(*first.at(time_ns, max_gap_s), first.rate_at(time_ns, max_gap_s)))
     except ImageRefused as refused:
         refusal = refused
     for history, mounting in zip(others, mountings, strict=True):
@@ -387,7 +387,7 @@ def attitudes_at(
         mounted = Rotation.from_quat(mounting.first_from_star_tracker_xyzw)
         first_xyzw = (Rotation.from_quat(quaternion) * mounted.inv()).as_quat()
         rate_rad_s = mounted.apply(history.rate_at(time_ns, max_gap_s))
-        found.append(
+        usable.append(
             Attitude(
                 first_xyzw,
                 gap_s,
@@ -396,6 +396,6 @@ def attitudes_at(
                 mounting.first_from_star_tracker_xyzw,
             )
         )
-    if refusal is not None and not found:
+    if refusal is not None and not usable:
         raise refusal
-    return sorted(found, key=lambda one: taken.get(one.star_tracker, 0))
+    return sorted(usable, key=lambda attitude: taken.get(attitude.star_tracker, 0))

@@ -34,7 +34,7 @@ from starcal_ros.formats.messages.message_codec import (
 )
 from starcal_ros.records import Image, refused_image, StarObservations
 
-_MOST_PIXELS = 2**27  # of a camera that is not known: 256 MB of 16 bit
+_MOST_PIXELS = 2**27  # 256 MB of 16 bit, for a camera that is not known
 _JPEG = b'\xff\xd8'  # how its files begin
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 CHANNELS = ('red', 'green', 'blue')
@@ -123,15 +123,15 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
     if header is None:
         kind = 'a JPEG' if bytes(data[:2]) == _JPEG else 'not a PNG'
         raise ImageRefused('bad_encoding', f'the compressed image is {kind}; PNG is read')
-    found = (header.width, header.height)
+    claimed = (header.width, header.height)
     if header.channels != 1:
         raise ImageRefused('bad_encoding', f'the PNG has {header.channels} channels, not one')
-    if size is not None and found != size:
+    if size is not None and claimed != size:
         raise ImageRefused(
-            'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*found, *size)
+            'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*claimed, *size)
         )
-    if min(found) < 1 or max(found) > MAX_SIDE_PX or math.prod(found) > _MOST_PIXELS:
-        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*found))
+    if min(claimed) < 1 or max(claimed) > MAX_SIDE_PX or math.prod(claimed) > _MOST_PIXELS:
+        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*claimed))
     if has_surplus(bytes(data), header):
         raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
     import cv2  # slow to import, and few bags have compressed images
@@ -142,7 +142,7 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
         pixels = None
     if pixels is None:
         raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
-    if pixels.shape != found[::-1] or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels.shape != claimed[::-1] or pixels.dtype not in (np.uint8, np.uint16):
         raise ImageRefused(
             'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
         )

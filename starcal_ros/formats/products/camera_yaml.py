@@ -124,7 +124,7 @@ def _camera_info_values(text: str) -> Mapping[str, Any]:
     These are a file of ``cv2.FileStorage``, a camchain of kalibr with one camera, and a printed
     ``CameraInfo`` message.
     """
-    if text.startswith('%YAML:1.0'):  # of OpenCV: neither this line nor the tag is YAML
+    if text.startswith('%YAML:1.0'):  # neither OpenCV's first line nor its tag is YAML
         text = text.partition('\n')[2].replace('!!opencv-matrix', '')
     content = yaml_value(text)
     if not isinstance(content, dict):
