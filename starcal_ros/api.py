@@ -24,7 +24,7 @@ from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.product_folder import calibration_file
+from starcal_ros.formats.products.product_files import calibration_file
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ground.cli.commands import mission
+from starcal_ground.products import check_outputs, make_folder, REPORT_FILE
 from starcal_ros.errors import missing_package, OptionError, StarcalError
-from starcal_ros.formats.products.product_files import check_outputs, make_folder, REPORT_FILE
 from starcal_ros.text import significant
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
@@ -178,8 +178,7 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ground import comparison
     from starcal_ground.cli import output
     from starcal_ground.cli.commands.demo import is_truth
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     files = [calibration_file(path) for path in (args.a, args.b)]
     if files[1].suffix == '.json' and is_truth(files[1]):
@@ -202,8 +201,7 @@ def _compare(args: argparse.Namespace) -> int:
 def _compare_with_truth(args: argparse.Namespace) -> int:
     """Compare a calibration with the truth of a simulated bag."""
     from starcal_ground.cli.commands import demo
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     if args.output:
         raise OptionError('--output: a plot needs two calibrations')
@@ -221,8 +219,7 @@ def _lookup(args: argparse.Namespace) -> int:
     from starcal_ground.mission.export.lookup_table import write_lookup_table
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     file = calibration_file(args.calibration)
     check_file(args.output, [file])
@@ -318,8 +315,8 @@ def _demo(args: argparse.Namespace) -> int:
     from starcal_ground.cli.commands import demo
     from starcal_ground.cli.commands.calibrate import calibrate_into, Drawings
     from starcal_ground.cli.output import check_folder
+    from starcal_ground.products import write_products
     from starcal_ground.report import page
-    from starcal_ros.formats.products.product_folder import write_products
     from starcal_ros.pipeline.campaign import source_of
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict
+from starcal_ground.products import check_outputs, NOT_CALIBRATED_FILE, PRODUCT_FILES
 from starcal_ground.report.thumbnails import THUMBNAILS_FOLDER, thumbnails_in
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import INTRINSIC_NAMES
@@ -22,8 +23,6 @@ from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.product_files import check_outputs
-from starcal_ros.formats.products.product_folder import NOT_CALIBRATED_FILE, PRODUCT_FILES
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 

@@ -18,6 +18,14 @@ from starcal_ground.cli import output
 from starcal_ground.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt, Time
 from starcal_ground.cli.output import check_folder
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.products import (
+    make_folder,
+    NotCalibrated,
+    REPORT_FILE,
+    write_not_calibrated,
+    write_observations,
+    write_products,
+)
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import (
@@ -29,13 +37,7 @@ from starcal_ros.errors import (
 )
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.product_files import make_folder, REPORT_FILE, write_atomically
-from starcal_ros.formats.products.product_folder import (
-    NotCalibrated,
-    write_not_calibrated,
-    write_observations,
-    write_products,
-)
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline import campaign
 from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.setup import files_of, read_setup, read_values

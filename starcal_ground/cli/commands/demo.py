@@ -22,6 +22,7 @@ import numpy as np
 import yaml
 
 from starcal_ground.cli.terminal import table_lines
+from starcal_ground.products import prior_of
 from starcal_ground.simulation import scenario, simulated_bag
 from starcal_ground.simulation.simulated_bag import true_geometry
 from starcal_ros.assessment.agreement import alignment_difference_rad
@@ -30,7 +31,6 @@ from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.files import mark
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import (
-    prior_of,
     read_calibration,
     read_text,
     write_atomically,

@@ -20,12 +20,12 @@ from starcal_ground.cli.terminal import print_text
 from starcal_ground.images import night_sky
 from starcal_ground.images.from_stars import FromStars
 from starcal_ground.images.photographs import image_paths, Photograph
+from starcal_ground.products import check_outputs, make_folder, write_camera_info
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPES, VELOCITY_TYPE
-from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.formats.products.product_files import check_outputs, make_folder, write_atomically
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.setup import load_setup

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.products import check_outputs, make_folder
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import check_outputs, make_folder
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ def _export(args: argparse.Namespace) -> int:
     """Write a calibration in the format of another tool."""
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
+    from starcal_ground.products import OBSERVATIONS_TOPIC
     from starcal_ros.formats.bag.reader import read_observations
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file, OBSERVATIONS_TOPIC
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     calibration = read_calibration(calibration_file(args.calibration))
     names = None
@@ -66,8 +66,8 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _observations_of(calibration: Path) -> Path:
-    from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ground.products import OBSERVATIONS_FILE
+    from starcal_ros.formats.products.product_files import calibration_file
 
     path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)
     if not path.exists():

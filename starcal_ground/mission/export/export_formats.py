@@ -15,10 +15,11 @@ from starcal_ground.mission.export.ck import ck_of_images
 from starcal_ground.mission.export.lookup_table import write_lookup_table
 from starcal_ground.mission.export.losses import Content, Loss, temperature_losses
 from starcal_ground.mission.export.spice import check_names, spice_kernels, SpiceNames
+from starcal_ground.products import check_outputs
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import check_outputs, write_atomically
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import Calibration, StarObservations
 

@@ -29,15 +29,17 @@ from typing import Any
 
 import numpy as np
 
+from starcal_ground import products
 from starcal_ground.mission.trend import places
 from starcal_ground.mission.trend.places import Entry
 from starcal_ground.mission.trend.rows import COMPUTED, failure, kept_name, RECORDED, Row, row_of
 from starcal_ground.mission.trend.trend_table import Table
+from starcal_ground.products import OBSERVATIONS_FILE
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, OBSERVATIONS_FILE
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
@@ -417,7 +419,7 @@ def _setup_beside(bag: Path) -> Setup:
     """The setup of the calibration beside a bag: its options and its prior."""
     path = bag.with_name(CALIBRATION_FILE)
     calibration = product_files.read_calibration(path)
-    prior = product_files.prior_of(calibration)
+    prior = products.prior_of(calibration)
     try:
         options = json_value(calibration.provenance['options'])
     except (KeyError, ValueError) as error:
@@ -478,7 +480,7 @@ class Done:
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / kept_name(row)
-            product_files.make_folder(folder)
+            products.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error

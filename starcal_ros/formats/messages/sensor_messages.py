@@ -7,7 +7,6 @@ import bisect
 from collections.abc import Sequence
 import math
 import operator
-import sys
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,7 +17,6 @@ from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.file_kinds import has_surplus, png_header, PNG_HEADER_BYTES
 from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
     IMAGE_TYPE,
     Make,
     make_header,
@@ -26,11 +24,7 @@ from starcal_ros.formats.messages.message_codec import (
     nearest_stamp_ns,
     offset_ns,
     quaternion_from_message,
-    quaternion_to_message,
     stamp_ns,
-    TEMPERATURE_TYPE,
-    vector_to_message,
-    VELOCITY_TYPE,
 )
 from starcal_ros.records import Image, refused_image, StarObservations
 
@@ -186,22 +180,6 @@ def refused_from_message(
     )
 
 
-def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
-    """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
-    pixels = np.ascontiguousarray(image.pixels)
-    height, width = pixels.shape
-    return make(
-        IMAGE_TYPE,
-        header=make_header(image.time_ns, frame_id, make),
-        height=height,
-        width=width,
-        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
-        is_bigendian=int(sys.byteorder == 'big'),
-        step=width * pixels.itemsize,
-        data=pixels.reshape(-1).view(np.uint8),
-    )
-
-
 def color_image_to_message(
     time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: Make
 ) -> Message:
@@ -262,17 +240,6 @@ def attitude_from_message(message: Message) -> tuple[int, Floats]:
     return stamp_ns(message.header.stamp), quaternion_from_message(quaternion)
 
 
-def attitude_to_message(
-    time_ns: int, quaternion_xyzw: Floats, frame_id: str, make: Make
-) -> Message:
-    """Return a geometry_msgs/QuaternionStamped; ``frame_id`` is the inertial frame."""
-    return make(
-        ATTITUDE_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        quaternion=quaternion_to_message(quaternion_xyzw, make),
-    )
-
-
 def velocity_from_message(message: Message) -> tuple[int, Floats]:
     """
     Stamp and (3,) m/s of a geometry_msgs/TwistStamped.
@@ -288,36 +255,11 @@ def velocity_from_message(message: Message) -> tuple[int, Floats]:
     return stamp_ns(message.header.stamp), velocity_m_s
 
 
-def velocity_to_message(time_ns: int, velocity_m_s: Floats, frame_id: str, make: Make) -> Message:
-    """Return a geometry_msgs/TwistStamped without rotation."""
-    return make(
-        VELOCITY_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        twist=make(
-            'geometry_msgs/msg/Twist',
-            linear=vector_to_message(velocity_m_s, make),
-            angular=vector_to_message(np.zeros(3), make),
-        ),
-    )
-
-
 def temperature_from_message(message: Message) -> tuple[int, float]:
     """Stamp and degrees Celsius of a sensor_msgs/Temperature; NaN where it is not finite."""
     temperature_degc = float(message.temperature)
     known = math.isfinite(temperature_degc)
     return stamp_ns(message.header.stamp), temperature_degc if known else math.nan
-
-
-def temperature_to_message(
-    time_ns: int, temperature_degc: float, frame_id: str, make: Make
-) -> Message:
-    """Return a sensor_msgs/Temperature; its variance is 0, which means unknown in ROS."""
-    return make(
-        TEMPERATURE_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        temperature=float(temperature_degc),
-        variance=0.0,
-    )
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
