@@ -16,14 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.file_kinds import (
-    FITS,
-    has_surplus,
-    is_cut_jpeg,
-    kind_of,
-    png_header,
-    tiff_header,
-)
+from starcal_ros.formats.file_kinds import FITS, has_surplus, kind_of, png_header, tiff_header
 from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import regular_file
 
@@ -156,9 +149,8 @@ def decoded(path: Path, content: bytes) -> NDArray[Any]:
     if header and png_header(content) and has_surplus(content, header):
         raise IngestError(f'{path}: inflates to far more than its pixels')
     values = None
-    if not is_cut_jpeg(content):
-        with contextlib.suppress(cv2.error):
-            values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    with contextlib.suppress(cv2.error):
+        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise IngestError(f'{path}: damaged, or in a format that OpenCV cannot read')
     return np.asarray(values)
