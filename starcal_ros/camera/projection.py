@@ -180,7 +180,7 @@ def check_plausible(camera: CameraModel) -> None:
 
 
 def _part_seen(camera: CameraModel) -> float:
-    """Part of a grid of pixels that have a line of sight, displaced by less than an image."""
+    """Fraction of pixels with a line of sight that distortion moves by less than an image."""
     grid = pixel_grid(camera, 9, 9)
     with np.errstate(all='ignore'):
         try:
@@ -194,7 +194,7 @@ def _part_seen(camera: CameraModel) -> float:
 
 def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
     """
-    Displacement (n, 2) by the distortion of points that an ideal lens images at pixels (n, 2).
+    Displacement (n, 2) of stars from pixels (n, 2), where a lens without distortion has them.
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
@@ -254,9 +254,9 @@ def project_jacobians(
     camera: CameraModel, directions_camera: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Pixels of the lens model, without the field, and their derivatives.
+    Pixels of the lens model and their derivatives by its parameters and by a small rotation.
 
-    By the camera parameters and by a small rotation.
+    The field is left out: it changes a derivative by less than a tenth.
 
     Parameters
     ----------
@@ -389,8 +389,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     """
     Largest angle between the optical axis and the edge of the detector plus a margin, rad.
 
-    The larger of the angles with and without distortion.  Without distortion every pixel has one,
-    and an estimated distortion may lie between the two.
+    It is the larger of the angles with and without distortion: a prior distortion may have no line
+    of sight at the edge, and the estimated one may lie between the two.
     """
     w, h, m = camera.width - 1, camera.height - 1, margin_px
     edge = np.concatenate(
@@ -409,8 +409,8 @@ def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     """
     Best camera without skew and field, for readers of ``camera_info``, and its worst error, px.
 
-    ROS consumers ignore K[0,1], but their OpenCV has every lens model here.  Skew is a shear; half
-    of it is a rotation that only the alignment could carry, so some error stays.
+    They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is a
+    rotation, which only the alignment could take up, so some error stays.
     """
     return nearest_camera(camera, camera.model, ('skew',))
 

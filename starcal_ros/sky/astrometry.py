@@ -9,8 +9,8 @@ proper motion and parallax (``pmpx``) -> bending of light by the Sun (``ldsun``)
 For a camera on the ground, diurnal aberration and refraction follow (``atioq``); the result is
 rotated back to the axes of the ICRS.
 
-Where site or clock are not known, refraction is taken by the direction of the zenith.  A star at
-the zenith distance z is raised by ``A tan z + B tan^3 z`` (Explanatory Supplement to the
+Where the site or the clock is not known, the zenith is found from the stars.  A star at the
+zenith distance z is raised by ``A tan z + B tan^3 z`` (Explanatory Supplement to the
 Astronomical Almanac, 3rd ed., section 7.2.2.5.2).  As vectors, with the zenith Z and the direction
 e: ``tan z`` towards the zenith is ``Z / (e . Z) - e``.
 """
@@ -127,7 +127,7 @@ class Velocity:
 
 EARTH = Velocity()
 """Velocity of the Earth, used where that of the observer is unknown."""
-# 1-sigma of telemetry: the change of an orbital velocity in a second, the age of the last sample.
+# The last sample of telemetry is up to a second old, in which an orbital velocity changes by this.
 GIVEN_SIGMA_M_S = 10.0
 
 

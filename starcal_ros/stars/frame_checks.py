@@ -304,6 +304,6 @@ def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
 
 
 def _middle_mean(ascending: NDArray[Any]) -> Singles:
-    """Means (down, across) of middle halves: dead rows, stuck columns and stars are outside."""
+    """Means (down, across) of the middle half of each cell, free of stars and dead columns."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])
