@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from bench.frames import Frame
-from starcal_ros.formats.messages.sensor_messages import attitude_to_message, image_to_message
+from starcal_ground.bag_writer import attitude_to_message, image_to_message
 from starcal_ros.ros.node import make_message
 
 START_S = 60.0  # a node starts in 2 s; much slower on a busy machine

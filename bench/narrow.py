@@ -25,8 +25,10 @@ from bench.frames import load_set_up, observed, render_frame
 from bench.night_sky import off_arcsec
 from bench.table import Table
 from bench.trials import in_processes, rms
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
 from starcal_ground.mission.ingest.gaia_catalog import catalog_file, integer_columns
+from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
@@ -35,8 +37,6 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.topics import Topics

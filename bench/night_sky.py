@@ -20,6 +20,7 @@ import numpy as np
 
 from bench.table import Table
 from bench.trials import rms, shape_error_arcsec
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
 from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
@@ -27,7 +28,6 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry

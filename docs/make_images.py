@@ -23,6 +23,7 @@ from PIL.PngImagePlugin import PngInfo
 import yaml
 
 from starcal_ground.cli import main as cli
+from starcal_ground.products import write_camera_info
 from starcal_ground.report.figures import (
     cell_counts,
     distortion_contours,
@@ -35,7 +36,6 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats, Picture
 from starcal_ros.assessment.observability import coverage
-from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe as observing

@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from docs.make_images import draw_page, FOLDER
 from starcal_ground.cli.main import main as starcal
+from starcal_ground.products import write_observations, write_products
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.formats.products.product_folder import write_observations, write_products
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble

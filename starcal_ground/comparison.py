@@ -70,6 +70,16 @@ class Comparison:
         Of all differences together; no degrees of freedom where nothing was estimated.
     notes : tuple of str
         Limitations of the sigmas.
+
+    Examples
+    --------
+    >>> import dataclasses, starcal_ground, starcal_ros
+    >>> a = starcal_ros.read_calibration('out')
+    >>> longer = a.geometry.camera.replace(fx=a.geometry.camera.matrix[0, 0] + 0.5)
+    >>> b = dataclasses.replace(a, geometry=dataclasses.replace(a.geometry, camera=longer))
+    >>> comparison = starcal_ground.compare(a, b)
+    >>> print(comparison.difference[0].round(3), comparison.after.length_px.shape)
+    0.5 (25, 25)
     """
 
     a: Calibration
@@ -93,6 +103,12 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     Difference of B from A.
 
     Raises ProductError when the cameras differ in size or model, or a pixel has no line of sight.
+
+    >>> import starcal_ground, starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> same = starcal_ground.compare(calibration, calibration)
+    >>> same.total.value, same.total.degrees_of_freedom
+    (0.0, 13)
     """
     camera_a, camera_b = a.geometry.camera, b.geometry.camera
     if (camera_a.width, camera_a.height) != (camera_b.width, camera_b.height):

@@ -24,11 +24,28 @@ _WITHOUT_KEY = ('mcap', 'rosbags')  # needed, but rosdep has no key for them
 
 
 class StarcalError(Exception):
-    """Base class of the exceptions that starcal raises for bad input."""
+    """
+    Base class of the exceptions that starcal raises for bad input.
+
+    >>> import starcal_ros
+    >>> try:
+    ...     starcal_ros.calibrate_bag('no.mcap', 'bags/tiny/params.yaml')
+    ... except starcal_ros.StarcalError as error:
+    ...     print(error)
+    no.mcap: no such bag
+    """
 
 
 class OptionError(StarcalError):
-    """An option is unknown, of the wrong type or out of its range; the text names it."""
+    """
+    An option is unknown, of the wrong type or out of its range; the text names it.
+
+    >>> import starcal_ros
+    >>> prior = starcal_ros.read_calibration('out').geometry
+    >>> starcal_ros.calibrate([], prior, methd='single')
+    Traceback (most recent call last):
+    starcal_ros.errors.OptionError: methd: no such parameter (did you mean method?)
+    """
 
 
 class CatalogError(StarcalError):
@@ -70,7 +87,15 @@ class ImageRefused(StarcalError):
 
 
 class TooFewObservations(StarcalError):
-    """The ensemble does not suffice for the requested calibration; the text names the shortage."""
+    """
+    The ensemble does not suffice for the requested calibration; the text names the shortage.
+
+    >>> import starcal_ros
+    >>> prior = starcal_ros.read_calibration('out').geometry
+    >>> starcal_ros.calibrate([], prior)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    starcal_ros.errors.TooFewObservations: too few observations: 3 more images are needed...
+    """
 
 
 def missing_package(error: ModuleNotFoundError, extra: str) -> str:

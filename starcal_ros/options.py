@@ -23,10 +23,10 @@ from starcal_ros.untrusted import PARAMETER_BYTES, read_text, shown, yaml_value
 
 OptionValue = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 OptionsT = TypeVar('OptionsT')
-_MOST_CHARACTERS = 4096  # of a text: the longest path of Linux
-_MOST_ITEMS = 100  # of a list; the longest in use has 22 numbers
+_MOST_CHARACTERS = 4096  # Linux has no longer path
+_MOST_ITEMS = 100  # the longest list in use has 22 numbers
 _LONGEST_NAME = 100
-_LONGEST_SECTION = 255  # of a topic or node with its namespace, by ROS
+_LONGEST_SECTION = 255  # ROS allows no longer name of a topic or node
 _ALMOST = 0.85  # similarity of names from which one is taken for the other, misspelt
 
 
@@ -83,10 +83,10 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
             are_different=bool(meta['choices']),
         )
     try:
-        found: OptionValue = read_value(kind, value, field.name, {})
+        checked: OptionValue = read_value(kind, value, field.name, {})
     except ValueError as error:
         raise OptionError(str(error)) from error
-    return with_home(field.name, str(found)) if meta['is_path'] else found
+    return with_home(field.name, str(checked)) if meta['is_path'] else checked
 
 
 def with_home(name: str, path: str) -> str:
@@ -195,7 +195,7 @@ def _flat(content: Mapping[str, object], namespace: str) -> dict[str, object]:
     for key, body in content.items():
         name = f'{namespace}/{key}' if namespace else key
         inside = body.values() if isinstance(body, dict) and 'ros__parameters' not in body else ()
-        if inside and all(isinstance(one, dict) for one in inside):
+        if inside and all(isinstance(section, dict) for section in inside):
             sections |= _flat(body, name)  # type: ignore[arg-type]
         else:
             sections[name] = body
@@ -209,7 +209,7 @@ def section_applies(section: str, node: str) -> bool:
 
 def _parts_match(pattern: list[str], parts: list[str]) -> bool:
     if not pattern or not parts:
-        return not parts and all(one == '**' for one in pattern)
+        return not parts and all(part == '**' for part in pattern)
     if pattern[0] == '**':
         return _parts_match(pattern[1:], parts) or _parts_match(pattern, parts[1:])
     return pattern[0] in ('*', parts[0]) and _parts_match(pattern[1:], parts[1:])

@@ -146,16 +146,16 @@ def fields_of(record_type: Any) -> dict[str, FieldType]:
     """Types of the fields of a record by name, in order."""
     hints = get_type_hints(record_type, include_extras=True)
     missing = dataclasses.MISSING
-    found = {}
+    kinds = {}
     for field in dataclasses.fields(record_type):
         kind = _field_type(hints[field.name])
         name = field.name.removesuffix('_ns') if kind.kind is int else field.name
-        found[field.name] = dataclasses.replace(
+        kinds[field.name] = dataclasses.replace(
             kind,
             has_default=field.default is not missing or field.default_factory is not missing,
             in_messages=kind.in_messages or {'time_ns': 'header.stamp'}.get(field.name, name),
         )
-    return found
+    return kinds
 
 
 def _field_type(hint: Any, marks: tuple[object, ...] = ()) -> FieldType:
@@ -183,13 +183,13 @@ T = TypeVar('T')
 
 _PLAIN = {bool, int, float, str, np.ndarray, type(None)}
 _INT64 = 2**63
-_KINDS = {'f': 'fiu', 'i': 'iu', 'u': 'iu', 'b': 'b'}  # of arrays that are converted
+_KINDS = {'f': 'fiu', 'i': 'iu', 'u': 'iu', 'b': 'b'}  # kinds of arrays that each is made of
 _COMPARED = 100  # characters: of a word of a million, each comparison takes seconds
 
 
 def plain_record(record: Any) -> dict[str, Any]:
     """Plain values of a record by field; arrays stay arrays, nested records are mappings."""
-    return {one.name: _plain(getattr(record, one.name)) for one in dataclasses.fields(record)}
+    return {f.name: _plain(getattr(record, f.name)) for f in dataclasses.fields(record)}
 
 
 def _plain(value: Any) -> Any:
@@ -210,8 +210,8 @@ def json_object(record: Any) -> dict[str, Any]:
 
     Arrays are lists, a number that is not finite is null.
     """
-    found: dict[str, Any] = _json_value(_plain(record))
-    return found
+    plain: dict[str, Any] = _json_value(_plain(record))
+    return plain
 
 
 def _json_value(value: Any) -> Any:
@@ -278,17 +278,17 @@ def read_value(kind: FieldType, value: object, path: str, sizes: dict[str, int])
 
 
 def check_shape(
-    found: tuple[int, ...], dimensions: tuple[int | str, ...], path: str, sizes: dict[str, int]
+    shape: tuple[int, ...], dimensions: tuple[int | str, ...], path: str, sizes: dict[str, int]
 ) -> None:
     """Check a shape; ``sizes`` of named dimensions grow.  Raises ValueError with the path."""
     expected = tuple(
-        one if isinstance(one, int) else sizes.setdefault(one, size) if one else size
-        for one, size in zip(dimensions, found, strict=False)
+        side if isinstance(side, int) else sizes.setdefault(side, size) if side else size
+        for side, size in zip(dimensions, shape, strict=False)
     )
-    if found != expected or len(found) != len(dimensions):
-        wanted = expected if len(found) == len(dimensions) else dimensions
-        sides = (' x '.join(map(str, shape)) or '1' for shape in (found, wanted))
-        raise ValueError('{}: {} numbers, not {}'.format(path, *sides))
+    if shape != expected or len(shape) != len(dimensions):
+        wanted = expected if len(shape) == len(dimensions) else dimensions
+        numbers, allowed = (' x '.join(map(str, sides)) or '1' for sides in (shape, wanted))
+        raise ValueError(f'{path}: {numbers} numbers, not {allowed}')
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -345,22 +345,22 @@ def _number(kind: FieldType, value: object, path: str) -> float:
 
 
 def _tuple(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> tuple[Any, ...]:
-    assert kind.item is not None  # of a tuple
-    items = value.tolist() if hasattr(value, 'tolist') else value  # of NumPy or array.array
+    assert kind.item is not None  # tuples have one
+    items = value.tolist() if hasattr(value, 'tolist') else value  # NumPy and array.array
     if not isinstance(items, (list, tuple)):
         raise _refused(path, value, 'a list')
     _check_count(kind, len(items), path)
     check_shape((len(items),), kind.dimensions, path, sizes)
     item = kind.item
-    found = tuple(read_value(item, one, f'{path}[{k}]', {}) for k, one in enumerate(items))
-    if kind.are_different and len(set(found)) < len(found):
-        twice = next(one for one in found if found.count(one) > 1)
+    values = tuple(read_value(item, items[k], f'{path}[{k}]', {}) for k in range(len(items)))
+    if kind.are_different and len(set(values)) < len(values):
+        twice = next(item for item in values if values.count(item) > 1)
         raise ValueError(f'{path}: {twice} is given twice')
-    return found
+    return values
 
 
 def _mapping(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> dict[str, Any]:
-    assert kind.item is not None  # of a mapping
+    assert kind.item is not None  # mappings have one
     if not isinstance(value, Mapping):
         raise _refused(path, value, 'an object')
     _check_count(kind, len(value), path)
@@ -376,7 +376,7 @@ def _check_count(kind: FieldType, count: int, path: str) -> None:
 
 
 def _array(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> NDArray[Any]:
-    assert kind.dtype is not None  # of an array
+    assert kind.dtype is not None  # arrays have one
     wanted, depth = kind.dtype, len(kind.dimensions)
     if isinstance(value, np.ndarray):
         array = value
@@ -412,7 +412,7 @@ def _rows(item: FieldType, value: object, path: str, depth: int) -> Any:
     kinds = set(map(type, value))
     if depth == 1 and (kinds <= {int} or (item.kind is float and kinds <= {int, float})):
         return value  # at once: grids have thousands
-    rows = [_rows(item, one, f'{path}[{k}]', depth - 1) for k, one in enumerate(value)]
+    rows = [_rows(item, row, f'{path}[{k}]', depth - 1) for k, row in enumerate(value)]
     if depth > 1 and len(set(map(len, rows))) > 1:
         raise ValueError(f'{path}: rows of different length')
     return rows
@@ -434,8 +434,8 @@ def _check_numbers(kind: FieldType, array: NDArray[Any], path: str) -> None:
             length = np.linalg.norm(array, axis=-1)
         wrong = np.abs(length - 1.0) > kind.unit_tolerance  # NaN where the marks allow it
         if wrong.any():
-            place, found = _first(wrong, length, path)
-            raise ValueError(f'{place}: length {found:.6g} is not 1')
+            place, norm = _first(wrong, length, path)
+            raise ValueError(f'{place}: length {norm:.6g} is not 1')
 
 
 def _first(where: Mask, array: NDArray[Any], path: str) -> tuple[str, Any]:

@@ -339,7 +339,7 @@ def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Camera file of the prior of `tiny_campaign`."""
     from tiny_campaign import SCENARIO  # type: ignore[import-not-found]
 
-    from starcal_ros.formats.products.camera_yaml import write_camera_info
+    from starcal_ground.products import write_camera_info
 
     path = tmp_path_factory.mktemp('prior') / 'camera.yaml'
     write_camera_info(SCENARIO.prior.camera, path)

@@ -12,8 +12,8 @@ from node_campaign import Campaign  # type: ignore[import-not-found]
 import numpy as np
 
 from bench import graph
+from starcal_ground.bag_writer import attitude_to_message, image_to_message
 from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
-from starcal_ros.formats.messages.sensor_messages import attitude_to_message, image_to_message
 
 _FIRST_NS = 1_778_829_600_000_000_000
 _STEP_NS = 1_000_000_000

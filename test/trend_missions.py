@@ -9,7 +9,7 @@ from pathlib import Path
 from export_calibrations import calibration  # type: ignore[import-not-found]
 
 from starcal_ground.cli.main import main
-from starcal_ros.formats.products.product_folder import write_products
+from starcal_ground.products import write_products
 
 DAY_NS = 86400 * 10**9
 

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any, NoReturn, TYPE_CHECKING
 
 from starcal_ground.cli.terminal import print_text
-from starcal_ros.formats.products.product_files import check_outputs
+from starcal_ground.products import check_outputs
 from starcal_ros.text import printable
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def print_notes(notes: Sequence[str]) -> None:
 
 def check_file(output: Path, inputs: Sequence[Path]) -> None:
     """`check_outputs` of one file, which is no product beside an input either."""
-    from starcal_ros.formats.products.product_folder import PRODUCT_FILES
+    from starcal_ground.products import PRODUCT_FILES
 
     beside = [file.with_name(name) for file in inputs for name in PRODUCT_FILES]
     check_outputs([output], [*inputs, *beside])

@@ -11,14 +11,15 @@ from pathlib import Path
 import threading
 from typing import TYPE_CHECKING
 
+from starcal_ground import products
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
+from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products import product_files, product_folder
-from starcal_ros.formats.products.product_folder import NotCalibrated
+from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import campaign
 from starcal_ros.pipeline.solve import inputs_of, software_version
 from starcal_ros.records import CameraGeometry, Image, StarObservations
@@ -36,12 +37,9 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
     bag_files = reader.files_of_bags(bags)
     if same_as_one_of(folder, [file.parent for file in bag_files]):
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
-    products = [
-        folder / name
-        for name in (*product_folder.PRODUCT_FILES, product_folder.NOT_CALIBRATED_FILE)
-    ]
+    outputs = [folder / name for name in (*products.PRODUCT_FILES, products.NOT_CALIBRATED_FILE)]
     pictures = thumbnails.thumbnails_in(folder / thumbnails.THUMBNAILS_FOLDER)
-    product_files.check_outputs((*products, *pictures), (*bag_files, *files))
+    products.check_outputs((*outputs, *pictures), (*bag_files, *files))
 
 
 @contextlib.contextmanager
@@ -52,7 +50,7 @@ def failure_recorded(
     try:
         yield
     except kind as error:
-        product_files.make_folder(folder)
+        products.make_folder(folder)
         _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
         raise
 
@@ -90,11 +88,9 @@ def calibrate_into(
         observed = campaign.observe(source, selection, show, advance)
     if selection is not None and not observed.observations:
         raise OptionError(selection.without_images())
-    product_files.make_folder(folder)
+    products.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    product_folder.write_observations(
-        observed.observations, folder, source.setup.frames.camera_frame
-    )
+    products.write_observations(observed.observations, folder, source.setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
         if with_report:
@@ -112,14 +108,12 @@ def calibrate_into(
         finally:
             written.result()
             if not page:  # one that is there is of the products that were replaced
-                (folder / product_files.REPORT_FILE).unlink(missing_ok=True)
+                (folder / products.REPORT_FILE).unlink(missing_ok=True)
     if page:
         from starcal_ground.report.page import with_digests
 
         # After the products that it is of.
-        product_files.write_atomically(
-            folder / product_files.REPORT_FILE, with_digests(page, folder)
-        )
+        product_files.write_atomically(folder / products.REPORT_FILE, with_digests(page, folder))
     return made, report
 
 
@@ -138,9 +132,7 @@ def _calibrated(
         raise TooFewObservations(failure.reason) from error
     arguments.print_notes(made.notes[len(observed.source.notes) :])
     if made.observations is not observed.observations:
-        product_folder.write_observations(
-            made.observations, folder, made.setup.frames.camera_frame
-        )
+        products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
     return made
 
 
@@ -156,7 +148,7 @@ def _write_all(
     made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
 ) -> None:
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    product_folder.write_products(made.calibration, folder, made.residuals)
+    products.write_products(made.calibration, folder, made.residuals)
 
 
 def _drawn(
@@ -169,7 +161,7 @@ def _drawn(
         return '', f'no report: {missing_package(error, "report")}'
     ordered = thumbnails.ordered(pictures)
     content = page.Found(made.calibration, made.residuals, made.observations, ordered)
-    return page.render(content, folder), f'look at {folder / product_files.REPORT_FILE}'
+    return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
 
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
@@ -200,7 +192,7 @@ def _write_failure(
 ) -> None:
     """Replace what a folder holds of an earlier calibration by the record of a failure."""
     software = f'starcal {software_version()}'
-    product_folder.write_not_calibrated(dataclasses.replace(failure, software=software), folder)
+    products.write_not_calibrated(dataclasses.replace(failure, software=software), folder)
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
     with Drawings().kind('report'):
         try:

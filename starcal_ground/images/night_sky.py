@@ -18,6 +18,7 @@ import tempfile
 
 import numpy as np
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images.from_stars import (
     count_of_stars,
     FEWEST_SOURCES,
@@ -41,7 +42,6 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.campaign import calibrate_bags
@@ -285,6 +285,13 @@ def calibrate_images(
     ------
     StarcalError
         One line that names the cause, and the images to take.
+
+    Examples
+    --------
+    >>> import starcal_ground
+    >>> calibration = starcal_ground.calibrate_images('bags/tiny')  # its attitudes are not used
+    >>> calibration.has_alignment, calibration.images_used
+    (False, 10)
     """
     paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:

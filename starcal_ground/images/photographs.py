@@ -222,6 +222,8 @@ def pixels_of_photograph(path: Path) -> Pixels:
     else:
         content = content_of(path)
         with _quiet():
+            if kind is JPEG:
+                _check_whole(path, content)
             values = decoded(path, content)  # the EXIF orientation is not applied
     if values.ndim == 3:
         is_rendered = values.dtype == np.uint8
@@ -234,6 +236,18 @@ def pixels_of_photograph(path: Path) -> Pixels:
         return values.astype(np.uint16)
     scaled = (np.nan_to_num(values, nan=low) - low) * (65000.0 / max(high - low, 1e-30))
     return np.rint(scaled).astype(np.uint16)
+
+
+def _check_whole(path: Path, content: bytes) -> None:
+    """Raise IngestError for a JPEG that ends early: OpenCV fills what is missing with grey."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            image.draft('L', (image.width // 8, image.height // 8))  # not the pixels themselves
+            image.load()
+    except Exception as error:  # a damaged file makes Pillow raise anything
+        raise IngestError(f'{path}: damaged') from error
 
 
 def _srgb_to_light() -> NDArray[np.uint16]:

@@ -22,6 +22,8 @@ import jinja2
 from markupsafe import Markup
 import numpy as np
 
+from starcal_ground import products
+from starcal_ground.products import CAMERA_INFO_FILE, OBSERVATIONS_FILE, REPORT_FILE
 from starcal_ground.report import figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
 from starcal_ground.report.thumbnails import star_of, Thumbnail
@@ -31,13 +33,8 @@ from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
-from starcal_ros.formats.products import product_files, product_folder
-from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE
-from starcal_ros.formats.products.product_files import (
-    OBSERVATIONS_FILE,
-    REPORT_FILE,
-    write_atomically,
-)
+from starcal_ros.formats.products import product_files
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import (
@@ -234,7 +231,7 @@ _DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are wri
 _PRODUCTS = (
     product_files.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
-    product_folder.RESIDUALS_FILE,
+    products.RESIDUALS_FILE,
     OBSERVATIONS_FILE,
 )
 PDF_FILE = 'report.pdf'
@@ -264,7 +261,7 @@ def write_report(folder: Path) -> Path:
     calibration into the folder failed, it is the page of that failure.  Raises ProductError,
     BagError when a file cannot be read or the report cannot be written.
     """
-    failure = product_folder.read_not_calibrated(folder)
+    failure = products.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / REPORT_FILE
@@ -273,9 +270,9 @@ def write_report(folder: Path) -> Path:
 
 
 def _read_folder(folder: Path) -> Found:
-    residuals = folder / product_folder.RESIDUALS_FILE
-    observations, ensemble = folder / OBSERVATIONS_FILE, folder / product_folder.STATE_ENSEMBLE
-    calibration = product_files.read_calibration(product_folder.calibration_file(folder))
+    residuals = folder / products.RESIDUALS_FILE
+    observations, ensemble = folder / OBSERVATIONS_FILE, folder / product_files.STATE_ENSEMBLE
+    calibration = product_files.read_calibration(product_files.calibration_file(folder))
     recorded = None
     if observations.is_file():
         recorded = tuple(_observations(observations))
@@ -284,7 +281,7 @@ def _read_folder(folder: Path) -> Found:
         recorded = tuple(image for image in _observations(ensemble) if image.time_ns in span_ns)
     return Found(
         calibration,
-        product_folder.read_residuals(residuals) if residuals.is_file() else None,
+        products.read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER),
         tuple(name for name in _PRODUCTS if (folder / name).is_file()),
@@ -321,7 +318,7 @@ def render(found: Found, folder: Path) -> str:
 def _context(found: Found) -> Mapping[str, object]:
     calibration, residuals, pictures = found.calibration, found.residuals, found.pictures
     observations = found.observations or ()
-    prior = product_files.prior_of(calibration)
+    prior = products.prior_of(calibration)
     refused = calibration.images_refused
     return {
         'calibration': calibration,
@@ -372,7 +369,7 @@ def _signed(calibration: Calibration) -> list[tuple[str, str]]:
     ]
 
 
-def write_failure_page(record: product_folder.NotCalibrated, folder: Path) -> Path:
+def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     """
     Write ``report.html`` of a failure and return its path.
 
@@ -397,7 +394,7 @@ def charts_of(
     calibration: Calibration, residuals: Residuals | None, observations: Sequence[StarObservations]
 ) -> Mapping[str, Chart]:
     """Charts by their name in the template; charts without data are left out."""
-    geometry, prior = calibration.geometry, product_files.prior_of(calibration)
+    geometry, prior = calibration.geometry, products.prior_of(calibration)
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, Chart | None] = {
         'vectors': figures.distortion_vectors(camera),

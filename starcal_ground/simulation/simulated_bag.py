@@ -19,15 +19,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 import yaml
 
+from starcal_ground.bag_writer import BagWriter
+from starcal_ground.products import check_outputs, write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenes
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
-from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.formats.products.product_files import check_outputs, write_atomically
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
 

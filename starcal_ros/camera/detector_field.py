@@ -30,17 +30,17 @@ COSINE_DOMAIN = 1.2
 def cosine_terms(width: int, height: int, octaves: int) -> tuple[NDArray[np.int64], Indices]:
     """Half waves (t, 2) of the cosines along u and v, and the octave (t,) of each, ascending."""
     most = math.ceil(COSINE_DOMAIN * 2.0**octaves * max(1.0, height / width)) + 1
-    i, j = (one.ravel() for one in np.meshgrid(np.arange(most), np.arange(most), indexing='ij'))
+    i, j = (axis.ravel() for axis in np.meshgrid(np.arange(most), np.arange(most), indexing='ij'))
     # Wave number over that of one wave along the width.
     number = 0.5 / COSINE_DOMAIN * np.hypot(i, j * width / height)
     octave = np.maximum(np.ceil(np.log2(np.maximum(number, 1e-9))), 0.0).astype(np.int64)
     used = np.flatnonzero((octave < octaves) & (i + j > 0))
     order = used[np.lexsort((number[used], octave[used]))]
     terms = np.stack([i[order], j[order]], axis=1)
-    found = octave[order]
+    octave_of_term = octave[order]
     terms.setflags(write=False)
-    found.setflags(write=False)
-    return terms, found
+    octave_of_term.setflags(write=False)
+    return terms, octave_of_term
 
 
 def basis(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
@@ -56,10 +56,10 @@ def basis(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
             waves[k] = 2.0 * waves[1] * waves[k - 1] - waves[k - 2]
         waves[1:] *= math.sqrt(2.0)
         along.append(waves)
-    found = np.empty((len(terms), len(pixels)))
-    for (i, j), row in zip(terms.tolist(), found, strict=True):
+    values = np.empty((len(terms), len(pixels)))
+    for (i, j), row in zip(terms.tolist(), values, strict=True):
         np.multiply(along[0][i], along[1][j], out=row)
-    return found.T
+    return values.T
 
 
 def term_count(width: int, height: int, octaves: int) -> int:
@@ -74,6 +74,13 @@ class DetectorField:
 
     ``coefficients`` is (2, t): px, of the functions of `basis` to ``octaves``, for u and for v.
     The field is a function of the measured pixel.
+
+    >>> import numpy as np
+    >>> octaves, shift = 1, np.zeros((2, term_count(1024, 768, 1)))
+    >>> shift[0, 0] = 0.1  # px, half a wave along u
+    >>> field = DetectorField(1024, 768, octaves, shift)
+    >>> field.displacement_px([[0, 0], [1023, 0]]).round(2).tolist()
+    [[0.14, 0.0], [-0.14, 0.0]]
     """
 
     width: int

@@ -59,7 +59,7 @@ _NO_ROOT = 1e-100  # reciprocal of a squared radius beyond any detector
 
 def ideal_points(model: str, directions_camera: Floats) -> Floats:
     """
-    Points (..., 2) of the ideal plane of directions (..., 3) in the camera frame, any length.
+    Points (..., 2) where camera-frame directions (..., 3) of any length meet the ideal plane.
 
     NaN where the model has none: Z <= 0 of a perspective model, the backward axis of
     ``equidistant``.
@@ -95,7 +95,7 @@ def ideal_by_rotation(model: str, ideal: Floats) -> Floats:
     """
     Derivatives (2, ..., 3) of ideal points (..., 2) by a passive small rotation, rad.
 
-    Of x, then of y, by the three angles (Eqs. 34, 35 for the perspective models).
+    The first axis is x, then y; the last the three angles (Eqs. 34, 35 if perspective).
     """
     x, y = ideal[..., 0], ideal[..., 1]
     theta = np.moveaxis(np.empty((2, 3, *x.shape)), 1, -1)
@@ -149,7 +149,7 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
 
 
 def _planes(x: Floats, y: Floats) -> Floats:
-    """Points (..., 2) of which x and y are contiguous: half the time of the arithmetic on them."""
+    """Points (..., 2) stored as all x, then all y: arithmetic on them takes half the time."""
     return np.moveaxis(np.stack([x, y]), 0, -1)
 
 
@@ -274,7 +274,7 @@ def fold_radius2(model: str, coefficients: Floats) -> float:
 
 def _least_positive_root(polynomial: object) -> float:
     """Least positive root of a polynomial with the constant 1, highest power first."""
-    # By the reciprocals of the roots: a first coefficient of 1e-313 would overflow as a divisor.
+    # The reciprocals of the roots are sought: a first coefficient of 1e-313 overflows as divisor.
     reciprocals = np.roots(np.asarray(polynomial, np.float64)[::-1])
     roots = 1.0 / reciprocals[np.abs(reciprocals) > _NO_ROOT]
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]

@@ -70,6 +70,13 @@ class CameraModel:
     `lens.COEFFICIENTS`; ``field`` a displacement that the lens model does not describe.  Raises
     ValueError for an unknown model, for parameters that are not p finite numbers, and for a focal
     length that is not positive.
+
+    >>> import starcal_ros
+    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> camera.parameter_names
+    ('fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'p1', 'p2')
+    >>> camera.replace(k1=-0.1).distortion.tolist()
+    [-0.1, 0.0, 0.0, 0.0, 0.0]
     """
 
     width: int
@@ -173,7 +180,7 @@ def check_plausible(camera: CameraModel) -> None:
 
 
 def _part_seen(camera: CameraModel) -> float:
-    """Part of a grid of pixels that have a line of sight, displaced by less than an image."""
+    """Fraction of pixels with a line of sight that distortion moves by less than an image."""
     grid = pixel_grid(camera, 9, 9)
     with np.errstate(all='ignore'):
         try:
@@ -187,7 +194,7 @@ def _part_seen(camera: CameraModel) -> float:
 
 def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
     """
-    Displacement (n, 2) by the distortion of points that an ideal lens images at pixels (n, 2).
+    Displacement (n, 2) of stars from pixels (n, 2), where a lens without distortion has them.
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
@@ -226,6 +233,11 @@ def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none.
 
     The field is a function of the resulting pixel, so the projection is iterated.
+
+    >>> import starcal_ros
+    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> starcal_ros.project(camera, [[0, 0, 1], [0.1, 0, 1], [0, 0, -1]]).tolist()
+    [[511.5, 383.5], [711.5, 383.5], [nan, nan]]
     """
     directions = np.asarray(directions_camera, np.float64)
     ideal = project_parameters(camera.model, camera.parameters, directions)
@@ -242,9 +254,9 @@ def project_jacobians(
     camera: CameraModel, directions_camera: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Pixels of the lens model, without the field, and their derivatives.
+    Pixels of the lens model and their derivatives by its parameters and by a small rotation.
 
-    By the camera parameters and by a small rotation.
+    The field is left out: it changes a derivative by less than a tenth.
 
     Parameters
     ----------
@@ -348,8 +360,8 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
-    found = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
-    xy[~found | (determinant <= 0) | (r2 > fold2)] = np.nan
+    converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
+    xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
     return directions_of(model, xy)
 
 
@@ -377,8 +389,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     """
     Largest angle between the optical axis and the edge of the detector plus a margin, rad.
 
-    The larger of the angles with and without distortion.  Without distortion every pixel has one,
-    and an estimated distortion may lie between the two.
+    It is the larger of the angles with and without distortion: a prior distortion may have no line
+    of sight at the edge, and the estimated one may lie between the two.
     """
     w, h, m = camera.width - 1, camera.height - 1, margin_px
     edge = np.concatenate(
@@ -397,8 +409,8 @@ def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     """
     Best camera without skew and field, for readers of ``camera_info``, and its worst error, px.
 
-    ROS consumers ignore K[0,1], but their OpenCV has every lens model here.  Skew is a shear; half
-    of it is a rotation that only the alignment could carry, so some error stays.
+    They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is a
+    rotation, which only the alignment could take up, so some error stays.
     """
     return nearest_camera(camera, camera.model, ('skew',))
 
@@ -455,7 +467,7 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     directions = line_of_sight(camera, target)
     exists = np.isfinite(directions[:, 0])
     target, directions = target[exists], directions[exists]
-    seen = np.isfinite(project(start, directions)).all(axis=1)
+    visible = np.isfinite(project(start, directions)).all(axis=1)
 
     def moved(x: Floats) -> CameraModel:
         parameters = start.parameters.copy()
@@ -469,17 +481,17 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         held_px = held_px[:0]
 
     def residual(x: Floats) -> Floats:
-        off = project(moved(x), directions[seen]) - target[seen]
+        off = project(moved(x), directions[visible]) - target[visible]
         return np.concatenate([off.ravel(), held_px @ (x - start.parameters[free])])
 
     def jacobian(x: Floats) -> Floats:
-        J = project_jacobians(moved(x), directions[seen])[1]
+        J = project_jacobians(moved(x), directions[visible])[1]
         return np.concatenate([J[..., free].reshape(-1, len(free)), held_px])
 
     # MINPACK scales the parameters by their columns and bounds the step.
     from scipy.optimize import least_squares  # a third of the start of a short command
 
-    found = least_squares(
+    solution = least_squares(
         residual,
         start.parameters[free],
         jacobian,
@@ -490,6 +502,6 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         gtol=1e-15,
         max_nfev=200,
     )
-    fitted = moved(found.x)
+    fitted = moved(solution.x)
     error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
     return fitted, float(np.where(np.isnan(error), np.inf, error).max(initial=0.0))

@@ -16,20 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.file_kinds import (
-    FITS,
-    has_surplus,
-    is_cut_jpeg,
-    kind_of,
-    png_header,
-    tiff_header,
-)
+from starcal_ros.formats.file_kinds import FITS, has_surplus, kind_of, png_header, tiff_header
 from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import regular_file
 
 _RGB, _GREY = 3, 2
 MOST_VALUES = 2**27  # per image, all colours; the nodes have the same limit
-MOST_BYTES = 2**29  # of a file that is decoded as a whole
+MOST_BYTES = 2**29  # a larger file is not decoded
 
 
 class Card(NamedTuple):
@@ -116,14 +109,14 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
 
 def _cards(header: Any) -> dict[str, Card]:
     """Cards of a header of astropy; the first of duplicate keywords counts."""
-    found: dict[str, Card] = {}
+    cards: dict[str, Card] = {}
     for card in header.cards:
         try:
             value = Card(card.value, card.comment)
         except Exception:  # astropy cannot parse it: keep the text, fail only where it is used
             value = Card(str(card.image)[10:].strip())
-        found.setdefault(card.keyword, value)
-    return found
+        cards.setdefault(card.keyword, value)
+    return cards
 
 
 @contextlib.contextmanager
@@ -156,9 +149,8 @@ def decoded(path: Path, content: bytes) -> NDArray[Any]:
     if header and png_header(content) and has_surplus(content, header):
         raise IngestError(f'{path}: inflates to far more than its pixels')
     values = None
-    if not is_cut_jpeg(content):
-        with contextlib.suppress(cv2.error):
-            values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    with contextlib.suppress(cv2.error):
+        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise IngestError(f'{path}: damaged, or in a format that OpenCV cannot read')
     return np.asarray(values)

@@ -38,6 +38,12 @@ class CameraGeometry:
 
     ``star_tracker_from_camera_xyzw`` is (4,): the orientation of the camera in the star tracker
     frame, as in messages.
+
+    >>> import starcal_ros
+    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> geometry = starcal_ros.CameraGeometry(camera, [0, 0, 0.6, 0.8])
+    >>> geometry.star_tracker_from_camera.apply([1, 0, 0]).round(2).tolist()
+    [0.28, 0.96, 0.0]
     """
 
     camera: CameraModel
@@ -73,6 +79,12 @@ class TemperatureTerms:
         Passive small rotation in the camera frame per degree, and its 1-sigma.
     note : str
         Requested terms that were left out, with the reason; may be empty.
+
+    Examples
+    --------
+    >>> terms = TemperatureTerms(20.0, focal_per_degc=(4e-5,), focal_per_degc_sigma=(1e-6,))
+    >>> round(2000.0 * terms.focal_per_degc[0] * 10.0, 3)  # px, of fx = 2000 px at 30 degC
+    0.8
     """
 
     reference_degc: Annotated[float, Finite()]
@@ -105,6 +117,13 @@ class DetectorMaps:
         together, at a regular grid of pixels from corner to corner.
     shape_sigma_arcsec : (map_rows, map_cols)
         1-sigma of the camera alone, after the rotation common to all those pixels is removed.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> maps = starcal_ros.read_calibration('out').maps
+    >>> maps.stars.shape, maps.shape_sigma_arcsec.shape  # rows, columns
+    ((8, 10), (16, 20))
     """
 
     stars: Annotated[NDArray[np.int64], Shape(('coverage_rows', 'coverage_cols'))]
@@ -118,6 +137,12 @@ class Correlation:
     Correlations (k, k) of the k named numbers that have an uncertainty.
 
     Camera parameters that were estimated or considered, focal terms, alignment angles and rate.
+
+    >>> import starcal_ros
+    >>> correlation = starcal_ros.read_calibration('out').correlation
+    >>> k1, k2 = map(correlation.names.index, ('k1', 'k2'))
+    >>> bool(correlation.matrix[k1, k2] < -0.5)
+    True
     """
 
     names: Annotated[tuple[str, ...], Shape(('k',))]
@@ -133,6 +158,10 @@ class GateCheck:
     ``min_``, else an upper limit.  ``found`` and ``limit`` are in ``unit``, empty for pure
     numbers.  A check without a number has an empty option and NaN for both.  ``passed`` is None
     and ``found`` NaN where it was not checked; ``note`` has the reason, or another for the result.
+
+    >>> check = GateCheck('residual', 'max_residual_rms_px', 0.1518, 0.5, 'px', passed=True)
+    >>> f'{check.name}: {check.found_text} of at most {check.limit_text}'
+    'residual: 0.1518 px of at most 0.5 px'
     """
 
     name: str
@@ -243,6 +272,15 @@ class Calibration:
         The total, then the causes; empty where not recorded.
     statements : tuple of Statement
         What to state to lower a sigma, the largest fall first.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> calibration.parameter_names[-3:], calibration.covariance.shape
+    (('alignment_x', 'alignment_y', 'alignment_z'), (13, 13))
+    >>> calibration.accepted, calibration.reasons, calibration.images_used
+    (True, (), 10)
     """
 
     time_ns: Stamp
@@ -290,8 +328,8 @@ class Calibration:
         """Check the size of the covariance."""
         p = len(self.parameter_names)
         if self.covariance.shape != (p, p):
-            found = ' x '.join(map(str, self.covariance.shape))
-            raise ValueError(f'covariance: {found} numbers, not {p} x {p}')
+            sides = ' x '.join(map(str, self.covariance.shape))
+            raise ValueError(f'covariance: {sides} numbers, not {p} x {p}')
         if self.field is not None and self.geometry.camera.field is None:
             # Files and messages hold the field beside the camera, with its covariance.
             camera = self.geometry.camera
@@ -327,7 +365,7 @@ class Calibration:
 
 
 _MOST = 1e15  # largest camera parameter: its cube must be finite
-_UNIT_TOLERANCE = 1e-6  # of the norm of a quaternion: rounded decimals change it by less
+_UNIT_TOLERANCE = 1e-6  # rounded decimals change the norm of a quaternion by less
 
 
 def check_calibration(calibration: Calibration) -> None:

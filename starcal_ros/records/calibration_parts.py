@@ -33,6 +33,9 @@ class HeldTerm:
 
     ``assumed`` is the held or prior value, ``estimated`` that from the stars; ``sigma`` is the
     1-sigma of their difference if the assumption is true.
+
+    >>> round(HeldTerm('cx', assumed=319.5, estimated=320.1, sigma=0.3).significance, 6)
+    2.0
     """
 
     name: str
@@ -107,6 +110,13 @@ class ModelChecks:
     field over the detector.  ``image_variation_px`` is the 1-sigma change of the camera between
     images at a corner, included in the covariance.  ``predictions`` are empty with fewer than four
     images, and in older calibrations.
+
+    >>> import starcal_ros
+    >>> checks = starcal_ros.read_calibration('out').model_checks
+    >>> sorted(term.name for term in checks.held if term.significance < 3.0)[:2]
+    ['cx', 'cy']
+    >>> checks.step.across in 'uv', checks.amplitudes[0].unit, checks.predictions[0].by
+    (True, 'px', 'radius')
     """
 
     field_rms_px: float
@@ -143,6 +153,15 @@ class StarTrackerAlignment:
     drift_arcsec, drift_p_value : float
         Length of the drift over the time span of its images, and p-value of the hypothesis of no
         drift; NaN for fewer than four images.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> zero, identity = np.zeros((3, 3)), np.array([0.0, 0.0, 0.0, 1.0])
+    >>> second = StarTrackerAlignment(
+    ...     'st_2', 12, identity, zero, identity, zero, (0.0, 0.0, 36.0), 18.0, 1e-4)
+    >>> second.drift_arcsec / second.drift_arcsec_per_hour[2]  # hours from first to last image
+    0.5
     """
 
     frame: str
@@ -177,6 +196,13 @@ class SigmaPart:
     map_over_detector_arcsec : tuple of 63 float
         Of the camera alone at a grid of 9 columns and 7 rows of pixels from corner to corner, row
         by row; empty where it was not computed.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> total, *parts = starcal_ros.read_calibration('out').sigma_budget
+    >>> total.cause, 'stars' in [part.cause for part in parts]
+    ('total', True)
     """
 
     cause: str
@@ -222,10 +248,10 @@ def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:
     return [total, *sorted(causes, key=share, reverse=True)]
 
 
-_DIGITS = 9  # of the factor: parameters and field cancel to a thousandth and less
+_DIGITS = 9  # parameters and field cancel to a thousandth and less in the factor
 # Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 3e-4.
 _STEPS = 1000
-_NO_VARIANCE = 1e-12  # of the largest, scaled: rounding
+_NO_VARIANCE = 1e-12  # times the largest eigenvalue: smaller ones are rounding
 
 
 @dataclass(frozen=True)
@@ -236,6 +262,12 @@ class MapCovariance:
     ``matrix`` is (k, k), of the numbers of `Derivatives.of_shape`; ``unresolved_px`` the
     1-sigma per axis of an independent displacement of each pixel, by structure of the detector
     finer than the field.
+
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> camera_and_alignment = calibration.map_covariance.matrix[:13, :13]
+    >>> bool(abs(camera_and_alignment / calibration.covariance - 1).max() < 1e-3)
+    True
     """
 
     matrix: Floats
@@ -267,6 +299,14 @@ class ResidualField:
     remainder_unit_px : (2 t,)
     remainder : (t (2 t + 1),) int16
         Rows of the triangle, one after the other: the coefficients, the parameters known.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> field = starcal_ros.read_calibration('out').field
+    >>> terms = field.coefficients.shape[1]
+    >>> field.covariance.shape == (13 + 2 * terms, 13 + 2 * terms)
+    True
     """
 
     octaves: Annotated[int, Within(1, 8)]
@@ -305,10 +345,10 @@ class ResidualField:
 
     def on(self, width: int, height: int) -> DetectorField:
         """Return the field on a detector; raises ValueError for a wrong number of terms."""
-        found = self.coefficients.shape[1]
+        given = self.coefficients.shape[1]
         expected = term_count(width, height, self.octaves)
-        if found != expected:
-            raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
+        if given != expected:
+            raise ValueError(f'field.coefficients: {given} for an axis, not {expected}')
         return DetectorField(width, height, self.octaves, self.coefficients)
 
 
@@ -331,10 +371,10 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
         [known[:, None] * vectors * root, matrix[p:, :p] / scale @ vectors / root]
     )
     factor = _to_digits(factor, _DIGITS)
-    left = matrix[p:, p:] - factor[p:] @ factor[p:].T
-    unit_px = _to_digits(np.sqrt(np.diag(left).clip(0.0)) / _STEPS, 4)
+    remaining = matrix[p:, p:] - factor[p:] @ factor[p:].T
+    unit_px = _to_digits(np.sqrt(np.diag(remaining).clip(0.0)) / _STEPS, 4)
     steps = np.where(unit_px > 0, unit_px, np.inf)
-    values, vectors = np.linalg.eigh(left / np.outer(steps, steps))
+    values, vectors = np.linalg.eigh(remaining / np.outer(steps, steps))
     # The triangle of the QR decomposition of a root exists for deficient rank too.
     _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
     return ResidualField(

@@ -194,6 +194,12 @@ class StarObservations:
         and for a known site.
     refraction_arcsec : (2,)
         Refraction at a zenith distance of 45 degrees for that zenith, and its 1-sigma; else zeros.
+
+    Examples
+    --------
+    >>> image = StarObservations.of_image(1_700_000_000_000_000_000, (1024, 768))
+    >>> len(image), image.measured_px.shape, image.temperature_degc
+    (0, (0, 2), nan)
     """
 
     time_ns: Stamp
@@ -307,7 +313,14 @@ def refused_image(
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The input of a calibration: usable images in order of arrival, and counts of the others."""
+    """
+    The input of a calibration: usable images in order of arrival, and counts of the others.
+
+    >>> image = StarObservations.of_image(1_700_000_000_000_000_000, (1024, 768))
+    >>> ensemble = Ensemble().add(image).add(image)  # the same stamp
+    >>> len(ensemble.images), ensemble.refused
+    (1, {'duplicate': 1})
+    """
 
     images: tuple[StarObservations, ...] = ()
     refused: Mapping[str, int] = dataclasses.field(default_factory=dict)

@@ -40,7 +40,7 @@ from starcal_ros.errors import ArchiveError, BagError, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.bag.writer import BagWriter, FileSpan, metadata_text, TopicSummary
+from starcal_ros.formats.bag.writer import FileSpan, metadata_text, observations_bag, TopicSummary
 from starcal_ros.formats.messages import record_messages
 from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
@@ -49,9 +49,9 @@ from starcal_ros.formats.messages.message_codec import (
     OBSERVATIONS_TYPE,
 )
 from starcal_ros.formats.products import product_files
+from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CALIBRATIONS
+from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.formats.products.product_folder import STATE_CALIBRATIONS as _CALIBRATIONS
-from starcal_ros.formats.products.product_folder import STATE_ENSEMBLE as _ENSEMBLE
 from starcal_ros.record_fields import Count, json_object, read_record
 from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
 from starcal_ros.ros.state import Activation
@@ -347,7 +347,7 @@ class Archive:
         number = self._next_image
         _check_number(number)
         try:
-            data = BagWriter.one_observation(TOPIC, image, self._frame_id)
+            data = observations_bag(TOPIC, image, self._frame_id)
         except BagError as error:
             raise ArchiveError(f'state_dir: image of {image.time_ns} ns: {error}') from error
         mark = self._seal.mark(number, data)

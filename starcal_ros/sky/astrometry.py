@@ -9,8 +9,8 @@ proper motion and parallax (``pmpx``) -> bending of light by the Sun (``ldsun``)
 For a camera on the ground, diurnal aberration and refraction follow (``atioq``); the result is
 rotated back to the axes of the ICRS.
 
-Where site or clock are not known, refraction is taken by the direction of the zenith.  A star at
-the zenith distance z is raised by ``A tan z + B tan^3 z`` (Explanatory Supplement to the
+Where the site or the clock is not known, the zenith is found from the stars.  A star at the
+zenith distance z is raised by ``A tan z + B tan^3 z`` (Explanatory Supplement to the
 Astronomical Almanac, 3rd ed., section 7.2.2.5.2).  As vectors, with the zenith Z and the direction
 e: ``tan z`` towards the zenith is ``Z / (e . Z) - e``.
 """
@@ -44,8 +44,8 @@ def refracted(direction_icrf: Floats, zenith_icrf: Floats, refraction_arcsec: fl
     cosine = np.maximum(direction_icrf @ zenith_icrf, LEAST_COSINE)[:, None]
     towards = zenith_icrf / cosine - direction_icrf
     tangent2 = 1.0 / cosine**2 - 1.0
-    seen = direction_icrf + refraction_arcsec * ARCSECOND_RAD * (1 + _CUBIC * tangent2) * towards
-    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+    bent = direction_icrf + refraction_arcsec * ARCSECOND_RAD * (1 + _CUBIC * tangent2) * towards
+    return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
 def zenith_of(latitude_rad: float, right_ascension_rad: Floats) -> Floats:
@@ -102,8 +102,8 @@ class SiteOptions:
         high=1e6,
         length=3,
     )
-    # Of the air at the site, constants in flight: ten degrees change a refraction of 60 arcsec by
-    # 2 arcsec, nearly the same for all stars of an image.  Zero is the pressure at the height.
+    # The air at the site, constant in flight: ten degrees change a refraction of 60 arcsec by
+    # 2 arcsec, nearly the same for all stars of an image.  Zero means the pressure at the height.
     air_pressure_hpa: float = 0.0
     air_temperature_degc: float = 10.0
 
@@ -127,7 +127,7 @@ class Velocity:
 
 EARTH = Velocity()
 """Velocity of the Earth, used where that of the observer is unknown."""
-# 1-sigma of telemetry: the change of an orbital velocity in a second, the age of the last sample.
+# The last sample of telemetry is up to a second old, in which an orbital velocity changes by this.
 GIVEN_SIGMA_M_S = 10.0
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Star-tracker attitudes: samples in time order, interpolated; each tracker by the first."""
+"""Star-tracker attitudes: samples in time order, interpolated, in the frame of the first one."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ class AttitudeHistory:
 
         Raises ImageRefused ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
         """
-        return self._found(lambda run: run.around(time_ns, max_gap_s))
+        return self._in_a_run(lambda run: run.around(time_ns, max_gap_s))
 
     def rate_at(self, time_ns: int, max_gap_s: float) -> Floats:
         """
@@ -182,11 +182,11 @@ class AttitudeHistory:
         previous one.
         """
         try:
-            return rate_between(*self._found(lambda run: run.step_to(time_ns, max_gap_s)))
+            return rate_between(*self._in_a_run(lambda run: run.step_to(time_ns, max_gap_s)))
         except ImageRefused:
             return np.full(3, math.nan)
 
-    def _found(
+    def _in_a_run(
         self, look_up: Callable[[_Run], tuple[AttitudeSample, AttitudeSample]]
     ) -> tuple[AttitudeSample, AttitudeSample]:
         """Samples of the most recently extended run that has them."""
@@ -313,7 +313,7 @@ def _between(before: AttitudeSample, after: AttitudeSample, time_ns: int) -> Flo
     from scipy.spatial.transform import Rotation, Slerp  # half of the start of a short command
 
     ends = np.array([before.icrf_from_star_tracker_xyzw, after.icrf_from_star_tracker_xyzw])
-    # Relative times: seconds since 1970 have a resolution of 0.1 us in double precision.
+    # Times are relative: a double holds seconds since 1970 to 0.1 us only.
     gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
     since_s = (time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
     return np.asarray(Slerp([0.0, gap_s], Rotation.from_quat(ends))(since_s).as_quat())
@@ -368,15 +368,15 @@ def attitudes_at(
     """
     Attitudes at a time, starting with the star tracker that has the fewest images ``taken``.
 
-    The order calibrates every star tracker, and lets each replace a silent one. Raises
+    In this order every star tracker is calibrated, and each can replace a silent one.  Raises
     ImageRefused if no star tracker has an attitude, with the reason of the first.
     """
     from scipy.spatial.transform import Rotation  # half of the start of a short command
 
-    found: list[Attitude] = []
+    usable: list[Attitude] = []
     refusal: ImageRefused | None = None
     try:
-        found.append(Attitude(*first.at(time_ns, max_gap_s), first.rate_at(time_ns, max_gap_s)))
+        usable.append(Attitude(*first.at(time_ns, max_gap_s), first.rate_at(time_ns, max_gap_s)))
     except ImageRefused as refused:
         refusal = refused
     for history, mounting in zip(others, mountings, strict=True):
@@ -387,7 +387,7 @@ def attitudes_at(
         mounted = Rotation.from_quat(mounting.first_from_star_tracker_xyzw)
         first_xyzw = (Rotation.from_quat(quaternion) * mounted.inv()).as_quat()
         rate_rad_s = mounted.apply(history.rate_at(time_ns, max_gap_s))
-        found.append(
+        usable.append(
             Attitude(
                 first_xyzw,
                 gap_s,
@@ -396,6 +396,6 @@ def attitudes_at(
                 mounting.first_from_star_tracker_xyzw,
             )
         )
-    if refusal is not None and not found:
+    if refusal is not None and not usable:
         raise refusal
-    return sorted(found, key=lambda one: taken.get(one.star_tracker, 0))
+    return sorted(usable, key=lambda attitude: taken.get(attitude.star_tracker, 0))

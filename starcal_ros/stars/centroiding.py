@@ -256,7 +256,7 @@ def _without_neighbours(
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
     light: Floats = np.zeros((len(star), stamps.width**2))
-    # Twice: the light of a neighbour is more accurate without that of its own neighbours.
+    # Two rounds: the light of a neighbour is known better without that of its own neighbours.
     for _ in range(2):
         before = light
         light = psf_fit.light_in_stamps(
@@ -265,7 +265,7 @@ def _without_neighbours(
         if not (np.abs(light - before).max(axis=1, initial=0.0) > little_dn).any():
             break
         lit = light.max(axis=1, initial=0.0) > little_dn
-        # Includes stars to which earlier subtracted light is returned.
+        # These include stars that get back light which was subtracted before.
         touched[star[lit]] = True
         again = np.flatnonzero(touched)
         neighbours = np.zeros((len(stamps), stamps.width**2))

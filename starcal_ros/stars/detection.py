@@ -28,7 +28,7 @@ _LEAST_CUT_OFF_DN = 0.5
 _STEEP_PART = 0.2  # a slope that adds more to the variance of a cell is corrected
 _MOSTLY_INVALID = 0.75  # a cell with more invalid pixels takes the level of its neighbour
 _SPARSE_PX = 256
-_MOST_SLOPE = 0.05  # in noise per pixel, of cells of 256 px: it pulls a star by 0.25 sigma at most
+_MOST_SLOPE = 0.05  # noise per pixel, over cells of 256 px: this slope pulls a star by 0.25 sigma
 _SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their pixels
 # Matched filter of detection; stars of 0.7 to 1.5 px lose under 10 % of S/N.
 _DETECTION_SIGMA_PX = 1.0

@@ -143,7 +143,7 @@ def fingerprint(image: Image, sample: RowSample) -> Fingerprint:
 
 def screen(
     sample: RowSample,
-    seen: Fingerprint,
+    fingerprint: Fingerprint,
     before: Fingerprint | None,
     saturation_dn: float,
     dark: Pixels | None,
@@ -163,8 +163,8 @@ def screen(
     if sample.constant.all() and np.ptp(sample.pixels) == 0:
         raise ImageRefused('blank', f'every pixel is {int(sample.pixels[0, 0])}')
     if before is not None:
-        _refuse_repeated(seen, before, options)
-    _refuse_incomplete(sample, seen, least_dn, options)
+        _refuse_repeated(fingerprint, before, options)
+    _refuse_incomplete(sample, fingerprint, least_dn, options)
     _refuse_glare(sample, least_dn, dark)
 
 
@@ -184,15 +184,15 @@ def _refuse_overexposed(sample: RowSample, least_dn: int) -> None:
         raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {least_dn}')
 
 
-def _refuse_repeated(seen: Fingerprint, before: Fingerprint, options: ScreeningOptions) -> None:
+def _refuse_repeated(current: Fingerprint, before: Fingerprint, options: ScreeningOptions) -> None:
     """Refuse a frame that repeats the previous frame, as a whole or in some rows."""
-    if len(before.rows) != len(seen.rows):
+    if len(before.rows) != len(current.rows):
         return
-    since_s = (seen.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
-    distinctive = seen.rows != 0
-    same = distinctive & (before.rows == seen.rows)
+    since_s = (current.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+    distinctive = current.rows != 0
+    same = distinctive & (before.rows == current.rows)
     everywhere = distinctive.any() and same.sum() == distinctive.sum()
-    if everywhere or (seen.whole and seen.whole == before.whole):
+    if everywhere or (current.whole and current.whole == before.whole):
         if since_s == 0.0:
             return  # the same frame delivered twice: the camera is not stuck
         raise ImageRefused('frozen', f'the pixels of the image {since_s:.3f} s before')
@@ -203,11 +203,11 @@ def _refuse_repeated(seen: Fingerprint, before: Fingerprint, options: ScreeningO
 
 
 def _refuse_incomplete(
-    sample: RowSample, seen: Fingerprint, least_dn: int, options: ScreeningOptions
+    sample: RowSample, fingerprint: Fingerprint, least_dn: int, options: ScreeningOptions
 ) -> None:
     """Refuse a frame with lost parts: repeated rows or constant segments."""
     distinctive = sample.distinctive
-    _, first = np.unique(seen.rows, return_index=True)
+    _, first = np.unique(fingerprint.rows, return_index=True)
     again = np.ones(len(distinctive), bool)
     again[first] = False
     again |= _repeats_below(sample)
@@ -287,10 +287,10 @@ def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> 
     cell_v_px = sample.pixels.shape[0] * sample.step / len(mesh)
     down = np.diff(mesh, 3, axis=0)[:, 1:-2] / cell_v_px
     across = np.diff(mesh, 3, axis=1)[1:-2] / _SEGMENT_PX
-    left = np.hypot(down, across)
-    left = left[np.isfinite(left)]
+    third = np.hypot(down, across)
+    third = third[np.isfinite(third)]
     everywhere = np.ones(sample.constant.shape, bool)
-    return _SLOPE_LEFT * median(left) / _noise_dn(sample, everywhere) if left.size else 0.0
+    return _SLOPE_LEFT * median(third) / _noise_dn(sample, everywhere) if third.size else 0.0
 
 
 def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
@@ -304,6 +304,6 @@ def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
 
 
 def _middle_mean(ascending: NDArray[Any]) -> Singles:
-    """Means (down, across) of middle halves: dead rows, stuck columns and stars are outside."""
+    """Means (down, across) of the middle half of each cell, free of stars and dead columns."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])

@@ -94,9 +94,9 @@ def learn_hot_pixels(
     if before is not None:
         again = np.intersect1d(before.lit, lit, assume_unique=True)
         index = np.union1d(index, again)[:_MOST]
-    seen = Strip(lit, icrf_from_camera)
+    strip = Strip(lit, icrf_from_camera)
     return HotPixels(
-        index, (*strips[: known.next_strip], seen, *strips[known.next_strip + 1 :]), following
+        index, (*strips[: known.next_strip], strip, *strips[known.next_strip + 1 :]), following
     )
 
 
@@ -125,9 +125,9 @@ def lit_alone(pixels: Pixels, v: Indices, u: Indices, background_dn: float | Flo
 def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> Mask:
     """Mask (n, 2 radius + 1, 2 radius + 1) of the hot pixels in windows about pixels (n, 2)."""
     side = 2 * radius + 1
-    found = np.zeros((len(centre), side, side), bool)
+    hot_pixel = np.zeros((len(centre), side, side), bool)
     if len(hot) == 0:
-        return found
+        return hot_pixel
     row = centre[:, 1, None] + np.arange(-radius, radius + 1)
     first = row * width + centre[:, 0, None] - radius
     low, high = np.searchsorted(hot, first), np.searchsorted(hot, first + side)
@@ -135,8 +135,8 @@ def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> Mas
     low, high, first = low[star, line], high[star, line], first[star, line]
     for k in range(int((high - low).max(initial=0))):
         more = low + k < high
-        found[star[more], line[more], hot[low[more] + k] - first[more]] = True
-    return found
+        hot_pixel[star[more], line[more], hot[low[more] + k] - first[more]] = True
+    return hot_pixel
 
 
 def refuse_on_hot_pixels(

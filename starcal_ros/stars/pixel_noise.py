@@ -72,7 +72,7 @@ class NoiseSums:
         would otherwise absorb a part of the photon noise.
         """
         per_signal = 1.0 / gain_e_per_dn if gain_e_per_dn else 0.0
-        found = np.array([1.0, per_signal, 0.0])
+        terms = np.array([1.0, per_signal, 0.0])
         right = self.right - self.normal[:, 1] * per_signal
         free = [0, 2] if gain_e_per_dn else [0, 1, 2]
         scale = 1.0 / np.sqrt(np.maximum(self.normal.diagonal(), 1e-300))
@@ -91,9 +91,9 @@ class NoiseSums:
             elif 1 in free and value[free.index(1)] < 0.0:
                 free.remove(1)
             else:
-                found[free] = value
+                terms[free] = value
                 break
-        background, per_signal, error2 = found
+        background, per_signal, error2 = terms
         return PixelNoise(
             1.0 / min(max(float(per_signal), 1e-4), 1e4),
             math.sqrt(min(max(float(error2), 0.0), 0.25)),

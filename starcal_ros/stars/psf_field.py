@@ -21,9 +21,9 @@ from starcal_ros.stars.psf_fit import noise_sums, PsfFit, select
 
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
 _BRIGHT_SNR = 15.0  # smallest signal-to-noise ratio of stars that determine the PSF
-_MOST = 60  # largest number of them, brightest first; fainter ones add almost nothing
+_MOST = 60  # the brightest stars that are used; fainter ones add almost nothing
 MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a smaller width cannot be measured
-_FEWEST = 5  # smallest number of them in an image that is used
+_FEWEST = 5  # an image with fewer such stars is not used
 _MAP_CHI2 = 30.0  # chance gives five terms a larger chi^2 once in 80,000 times
 
 

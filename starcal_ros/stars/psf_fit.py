@@ -167,7 +167,7 @@ def _nearer(
 
 def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFit:
     """
-    Fits to stamps from parameters (n, 4) near the minimum: last step, covariance and residuals.
+    Fits after a last step from parameters (n, 4) near the minimum, with covariance and residuals.
 
     Excludes a single pixel that does not fit, such as a cosmic ray on the flank of a bright star.
     """
@@ -194,7 +194,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
     misfit = residual
     if pixel_noise.psf_error > 0:
-        # Variance of a pixel from the PSF error over that in its weight.
+        # The variance that the PSF error adds to a pixel, over the variance in its weight.
         flux = np.maximum(parameters[:, 2, None], 0.0)
         excess = pixel_noise.psf_error**2 * flux * light * root_weight**2
         misfit = residual / np.sqrt(1.0 + excess)
@@ -383,7 +383,7 @@ def _whitened_rows(
     )
     rows = np.empty((n, count + 1, width * width))
     flux = flux[:, None]
-    # Spread over the stamp first: products of long rows take a third of the time of short ones.
+    # Columns are spread over the stamp first: products of long rows take a third of the time.
     px, py = _in_each_row(value[:n]), value[n:].repeat(width, axis=1)
     flux_px1 = _in_each_row(flux * first[:n])
     py1 = first[n:].repeat(width, axis=1)

@@ -21,8 +21,8 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from starcal.msg import StarObservations
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import (
     COMPRESSED_TYPE,
     make_header,
@@ -54,7 +54,7 @@ def bag(tmp_path: Path) -> Path:
         messages.append((image.time_ns, '/image/compressed', COMPRESSED_TYPE, message))
     with BagWriter(tmp_path / 'bag') as writer:
         for time_ns, topic, kind, message in sorted(messages, key=lambda one: one[0]):
-            writer._write(topic, kind, time_ns, message)
+            writer.write(topic, kind, time_ns, message)
     return tmp_path / 'bag'
 
 

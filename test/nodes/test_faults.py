@@ -21,8 +21,8 @@ pytest.importorskip('starcal.msg')
 from diagnostic_msgs.msg import DiagnosticArray
 
 from starcal.msg import EnsembleStatus
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import stamp_ns
 from starcal_ros.records import Image
 

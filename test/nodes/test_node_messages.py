@@ -16,6 +16,7 @@ pytest.importorskip('starcal.msg')
 from rclpy.serialization import deserialize_message, serialize_message
 from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
 
+from starcal_ground.bag_writer import image_to_message
 from starcal_ros.formats.bag import typestore as bag_types
 from starcal_ros.formats.messages.record_messages import (
     alignment_to_message,
@@ -26,7 +27,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_to_message,
     status_to_message,
 )
-from starcal_ros.formats.messages.sensor_messages import image_from_message, image_to_message
+from starcal_ros.formats.messages.sensor_messages import image_from_message
 from starcal_ros.records import Image
 from starcal_ros.ros.node import make_message, message_class
 

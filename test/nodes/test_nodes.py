@@ -40,10 +40,15 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
+from starcal_ground.bag_writer import (
+    attitude_to_message,
+    BagWriter,
+    image_to_message,
+    temperature_to_message,
+)
 from starcal_ground.cli.main import main
 from starcal_ros.assessment.lookup import COLUMNS
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages import message_codec
 from starcal_ros.formats.messages.message_codec import make_header
 from starcal_ros.formats.messages.record_messages import (
@@ -53,12 +58,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
-from starcal_ros.formats.messages.sensor_messages import (
-    attitude_to_message,
-    image_from_message,
-    image_to_message,
-    temperature_to_message,
-)
+from starcal_ros.formats.messages.sensor_messages import image_from_message
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
     read_calibration,

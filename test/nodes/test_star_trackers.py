@@ -23,10 +23,9 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal_ground.bag_writer import attitude_to_message, BagWriter, image_to_message
 from starcal_ros.constants import NANOSECONDS_PER_SECOND as SECOND_NS
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.record_messages import calibration_from_message
-from starcal_ros.formats.messages.sensor_messages import attitude_to_message, image_to_message
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from starcal_ground.products import write_camera_info
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import ArchiveError, OptionError
-from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, load_setup, Setup
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations

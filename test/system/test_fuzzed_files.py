@@ -19,8 +19,10 @@ import numpy as np
 import pytest
 
 from bench.frames import write_set_up
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
+from starcal_ground.products import prior_of
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.assessment.lookup import line_of_sight_table
@@ -28,11 +30,10 @@ from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, proj
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.bag.writer import observations_bag
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
-    prior_of,
     read_calibration,
     write_calibration,
 )
@@ -195,7 +196,7 @@ def test_observations() -> None:
     def mutate(message: Any) -> None:
         with read_or_refused():
             record = checked_observations(message)
-            BagWriter.one_observation('/observations', record, 'camera')
+            observations_bag('/observations', record, 'camera')
             ensemble = solve.add_to_ensemble(Ensemble(images[1:4]), record, setup)
             assert not np.isnan(solve.ensemble_status(ensemble, setup).predicted_sigma).any()
             answers['refused' if record.refusal else 'saved'] += 1

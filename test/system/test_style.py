@@ -14,8 +14,8 @@ FILES = sorted(
     path for folder in (*PACKAGES, 'bench', 'tools', 'docs', 'examples')
     for path in (ROOT / folder).rglob('*.py')
 )  # fmt: skip
-# No longer than the longest of today: a new one must earn more.
-LONGEST_FUNCTION_LINES = 95
+# Without its docstring; no longer than the longest of today: a new one must earn more.
+LONGEST_FUNCTION_LINES = 77
 SUBJECTS = {  # tests of several modules together
     *('activations', 'awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills'),
     *(
@@ -57,7 +57,8 @@ def test_docstrings_state_a_result_and_functions_are_short() -> None:
         texts += [ast.get_docstring(node) or '' for node in nodes if isinstance(node, documented)]
         for node in nodes:
             if isinstance(node, ast.FunctionDef):
-                lines = (node.end_lineno or 0) - node.lineno + 1
+                code = node.body[ast.get_docstring(node) is not None :] or node.body
+                lines = (node.end_lineno or 0) - code[0].lineno + 1
                 long += [f'{path}: {node.name}'] if lines > LONGEST_FUNCTION_LINES else []
     assert [text for text in texts if re.match(r'(What|Whether|Of)\b', text)] == []
     assert long == []

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text
-from starcal_ros.formats.products.product_files import check_outputs
+from starcal_ground.products import check_outputs
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

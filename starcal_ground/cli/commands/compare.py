@@ -45,8 +45,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import comparison
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     files = [calibration_file(path) for path in (args.a, args.b)]
     truth = _truth_of(files[1])
@@ -150,8 +149,8 @@ def _compared_with(calibration: Calibration, content: object, path: Path) -> Tru
 
     Raises ProductError when the truth is of another lens model or damaged.
     """
+    from starcal_ground.products import prior_of
     from starcal_ground.simulation.simulated_bag import true_geometry
-    from starcal_ros.formats.products.product_files import prior_of
 
     try:
         truth = true_geometry(content)  # type: ignore[arg-type]

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros.formats.products.product_files import check_outputs, make_folder
+from starcal_ground.products import check_outputs, make_folder
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli import node_processes
     from starcal_ground.cli.commands.compare import with_truth
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
+    from starcal_ground.products import write_products
     from starcal_ground.report import page
-    from starcal_ros.formats.products.product_folder import write_products
     from starcal_ros.pipeline.campaign import source_of
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics

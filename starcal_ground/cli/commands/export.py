@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text
+from starcal_ground.products import make_folder, OBSERVATIONS_FILE
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import make_folder, OBSERVATIONS_FILE
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -71,9 +71,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
+    from starcal_ground.products import OBSERVATIONS_TOPIC
     from starcal_ros.formats.bag.reader import read_observations
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file, OBSERVATIONS_TOPIC
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     calibration = read_calibration(calibration_file(args.calibration))
     names = None
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _observations_of(calibration: Path) -> Path:
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ros.formats.products.product_files import calibration_file
 
     path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)
     if not path.exists():

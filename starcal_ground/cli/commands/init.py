@@ -30,13 +30,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.images import first_setup, night_sky
     from starcal_ground.images.photographs import image_paths
+    from starcal_ground.products import check_outputs, make_folder, write_camera_info
     from starcal_ros.formats.bag import reader
-    from starcal_ros.formats.products.camera_yaml import write_camera_info
-    from starcal_ros.formats.products.product_files import (
-        check_outputs,
-        make_folder,
-        write_atomically,
-    )
+    from starcal_ros.formats.products.product_files import write_atomically
 
     params, camera = args.output / 'params.yaml', args.output / first_setup.CAMERA_FILE
     photographs, topics = image_paths(args.bags), arguments.topics(args)

@@ -39,8 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.export.export_formats import write_lookup_table
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
-    from starcal_ros.formats.products.product_files import read_calibration
-    from starcal_ros.formats.products.product_folder import calibration_file
+    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     file = calibration_file(args.calibration)
     arguments.check_file(args.output, [file])

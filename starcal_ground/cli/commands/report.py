@@ -16,7 +16,7 @@ import argparse
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text
-from starcal_ros.formats.products.product_files import check_outputs, REPORT_FILE
+from starcal_ground.products import check_outputs, REPORT_FILE
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

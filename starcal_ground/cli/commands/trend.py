@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.products import check_outputs, make_folder
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import check_outputs, make_folder
 
 if TYPE_CHECKING:
     from starcal_ground.mission.trend.fleet import Task

@@ -25,10 +25,10 @@ import yaml
 
 from starcal_ground.mission.export import exported
 from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
+from starcal_ground.products import CAMERA_INFO_FILE, write_camera_info
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
-from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
 from starcal_ros.records import Calibration
 
 # kalibr's word for a lens model, and the parameters that kalibr lacks.

@@ -22,11 +22,12 @@ from starcal_ground.mission.export.spice import (
     spice_kernels,
     SpiceNames,
 )
+from starcal_ground.products import check_outputs
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table, LineOfSightTable
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import needing, OptionError, ProductError
-from starcal_ros.formats.products.product_files import check_outputs, write_atomically
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import Calibration, StarObservations
 

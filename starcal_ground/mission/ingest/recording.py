@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 import yaml
 
+from starcal_ground import products
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import image_series
 from starcal_ground.images.from_stars import options_of
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.image_files import is_fits
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -108,7 +109,7 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     prior = [params] if camera else []
     if camera and not same_as_one_of(copied, [camera]):
         prior.append(copied)
-    product_files.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
+    products.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
 
 
 def _files_beside(bag: Path) -> tuple[Path, Path, Path]:

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from starcal_ground import products
 from starcal_ground.mission.trend import places
 from starcal_ground.mission.trend.places import Entry
 from starcal_ground.mission.trend.trend_table import (
@@ -40,12 +41,13 @@ from starcal_ground.mission.trend.trend_table import (
     row_of,
     Table,
 )
+from starcal_ground.products import OBSERVATIONS_FILE
 from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, OBSERVATIONS_FILE
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
 from starcal_ros.pipeline.solve import software_version
@@ -418,7 +420,7 @@ def _setup_beside(bag: Path) -> Setup:
     """The setup of the calibration beside a bag: its options and its prior."""
     path = bag.with_name(CALIBRATION_FILE)
     calibration = product_files.read_calibration(path)
-    prior = product_files.prior_of(calibration)
+    prior = products.prior_of(calibration)
     try:
         options = untrusted.json_value(calibration.provenance['options'])
     except (KeyError, ValueError) as error:
@@ -479,7 +481,7 @@ class Done:
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / kept_name(row)
-            product_files.make_folder(folder)
+            products.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error

@@ -43,7 +43,7 @@ from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
 
 _LATE_NS = NANOSECONDS_PER_SECOND  # a sample is recorded at most so long after later ones
-_WAITING_BYTES = 64 << 20  # of images that wait for telemetry; two may always wait
+_WAITING_BYTES = 64 << 20  # images that wait for telemetry; two may always wait
 _BATCH_BYTES = 8 << 20  # read ahead: an image, or the telemetry of an hour
 
 _stamp_ns = operator.itemgetter(0)
@@ -155,10 +155,10 @@ def read_telemetry(
     on_damage: Damage = log_damage,
 ) -> Telemetry:
     """All telemetry of bags; attitudes that are not unit quaternions count as invalid."""
-    found = Telemetry(topics, options or AttitudeOptions(), on_damage)
+    telemetry = Telemetry(topics, options or AttitudeOptions(), on_damage)
     for raw in read_raw(paths, topics.telemetry, on_damage):
-        found.add(raw)
-    return found
+        telemetry.add(raw)
+    return telemetry
 
 
 def read_frames(

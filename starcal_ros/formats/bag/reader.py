@@ -72,7 +72,7 @@ _OF_IMAGES = (
 _CONVERTED = frozenset(
     [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES.values(), VELOCITY_TYPE, TEMPERATURE_TYPE]
 )
-_LONGEST_NAME = 4096  # of a path on Linux
+_LONGEST_NAME = 4096  # Linux has no longer path
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def read_messages(
     known = summary or Summary()
     schemas: dict[int, Schema] = dict(known.schemas)
     channels: dict[int, Channel] = dict(known.channels)
-    found: Counter[int] = Counter()
+    read: Counter[int] = Counter()
     pieces = _Pieces(file, known, on_damage)
     for record in pieces:
         if isinstance(record, Schema):
@@ -128,7 +128,7 @@ def read_messages(
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, McapMessage):
-            found[record.channel_id] += 1
+            read[record.channel_id] += 1
             channel = channels.get(record.channel_id)
             schema = schemas.get(channel.schema_id) if channel else None
             if channel is None or schema is None or channel.message_encoding != 'cdr':
@@ -141,10 +141,10 @@ def read_messages(
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
     if known.statistics is not None:
         expected = Counter(known.statistics.channel_message_counts)
-        lost = expected - found
+        lost = expected - read
     else:
-        expected, lost = found + pieces.lost, pieces.lost
-    nameless = {number: n for number, n in found.items() if number not in channels}
+        expected, lost = read + pieces.lost, pieces.lost
+    nameless = {number: n for number, n in read.items() if number not in channels}
     if lost or nameless:
         pieces.report(_loss(lost, expected, channels, nameless))
 
@@ -377,8 +377,8 @@ def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[
     """Topics of a file, its damage, and the time of its first message."""
     summary = read_summary(file)
     damage: list[str] = []
-    if summary is not None and summary.statistics is not None and (found := _summary(summary)):
-        return found, damage, summary.statistics.message_start_time
+    if summary is not None and summary.statistics is not None and (listed := _summary(summary)):
+        return listed, damage, summary.statistics.message_start_time
     # Kept, as a file without summary is read for them.
     counts: Counter[tuple[str, str]] = Counter()
     first_ns = 0
@@ -390,30 +390,30 @@ def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[
 
 def _summary(summary: Summary) -> list[Topic]:
     """Topics in the summary of a file; none if it has no counts."""
-    found = []
+    listed = []
     counts = summary.statistics.channel_message_counts if summary.statistics else {}
     for number, count in counts.items():
         channel = summary.channels.get(number)
         schema = summary.schemas.get(channel.schema_id) if channel else None
         # Without a schema a message has no type: it is not of ROS 2.
         if count and channel and schema and channel.message_encoding == 'cdr':
-            found.append(Topic(channel.topic, schema.name, count))
-    return found
+            listed.append(Topic(channel.topic, schema.name, count))
+    return listed
 
 
-def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -> str:
+def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '') -> str:
     """The requested topic, or the only one of a type; raises BagError with those there are."""
     paths = list(paths)
     where = ', '.join(map(str, paths))
     there = topics(paths)
     fitting = [topic.name for topic in there if topic.type_name == type_name]
     listed = ', '.join(fitting) or 'none'
-    if asked:
+    if requested:
         # Bags hold resolved names; the leading slash may be omitted in the request.
         for name in fitting:
-            if name.lstrip('/') == asked.lstrip('/'):
+            if name.lstrip('/') == requested.lstrip('/'):
                 return name
-        raise BagError(f'{where}: no topic {asked} of type {type_name} (available: {listed})')
+        raise BagError(f'{where}: no topic {requested} of type {type_name} (available: {listed})')
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
@@ -501,12 +501,12 @@ def _files_of_folder(folder: Path) -> list[Path]:
             f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
             f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
         )
-    if compression:  # of files, which zstd leaves without the ending
+    if compression:  # zstd leaves the files without the ending
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
     listed = [folder / name for name in names if (folder / name).is_file()]
-    found = listed or [path for path in here if path.suffix == '.mcap' and path.is_file()]
-    if not found:
+    files = listed or [path for path in here if path.suffix == '.mcap' and path.is_file()]
+    if not files:
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside else ''
         raise BagError(f'{folder}: no .mcap files in the folder{_instead_of_any(here) or near}')
@@ -515,7 +515,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
         packed = (folder / f'{missing[0]}.zstd').is_file()
         remedy = f': zstd -d {shlex.quote(str(folder))}/*.zstd' if packed else ''
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing{remedy}')
-    return found
+    return files
 
 
 def _instead_of_any(files: Iterable[Path]) -> str:

@@ -88,12 +88,12 @@ def typestore_with(type_name: str, definition: str) -> Typestore:
     for count in _COUNT.findall(definition):
         if len(count) > 9 or int(count) > _MOST_ITEMS:
             raise ValueError(f'an array of more than {_MOST_ITEMS} items')
-    found = get_types_from_msg(definition, type_name)
-    _count_items(type_name, found, {})
-    for name, (_, fields) in found.items():
+    definitions = get_types_from_msg(definition, type_name)
+    _count_items(type_name, definitions, {})
+    for name, (_, fields) in definitions.items():
         _check_fields(name, dict(fields))
     store = get_typestore(Stores.EMPTY)
-    store.register(found)
+    store.register(definitions)
     return store
 
 

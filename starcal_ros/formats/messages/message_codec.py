@@ -63,7 +63,7 @@ ATTITUDE_TYPES = {
 
 Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
 T = TypeVar('T')
-NOT_KNOWN = 2  # of a bool or None
+NOT_KNOWN = 2  # stands for None in a field of bool or None
 _KNOWN = {0: False, 1: True, NOT_KNOWN: None}
 _ENTRIES = {int: ('ReasonCount', 'reason', 'count'), str: ('KeyValue', 'key', 'value')}
 
@@ -176,15 +176,15 @@ def _field(kind: FieldType, value: Any, make: Make) -> object:
         messages = [] if value is None else [_made(kind.kind, value, make)]
         return messages if kind.optional else messages[0]
     if kind.kind is np.ndarray:
-        assert kind.dtype is not None  # of an array
+        assert kind.dtype is not None  # arrays have one
         return flat_array(value, kind.dtype.type)
     if kind.kind is tuple:
-        assert kind.item is not None  # of a tuple
+        assert kind.item is not None  # tuples have one
         if kind.item.kind in (int, float):
             return flat_array(value, np.dtype(kind.item.kind).type)
         return [_field(kind.item, item, make) for item in value]
     if kind.kind is dict:
-        assert kind.item is not None  # of a mapping
+        assert kind.item is not None  # mappings have one
         name, key, of_value = _ENTRIES[kind.item.kind]
         return [make(f'starcal/msg/{name}', **{key: k, of_value: v}) for k, v in value.items()]
     if kind.kind is bool and kind.optional:
@@ -224,19 +224,19 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
     return values
 
 
-def _value(kind: FieldType, found: Any) -> Any:
+def _value(kind: FieldType, value: Any) -> Any:
     if kind.is_record:
-        if kind.optional and not len(found):
+        if kind.optional and not len(value):
             return None
-        return plain_message(kind.kind, found[0] if kind.optional else found)
+        return plain_message(kind.kind, value[0] if kind.optional else value)
     if kind.item is not None and kind.item.is_record:
-        return [plain_message(kind.item.kind, item) for item in found]
+        return [plain_message(kind.item.kind, item) for item in value]
     if kind.item is not None and kind.kind is dict:
         _, key, of_value = _ENTRIES[kind.item.kind]
-        return {getattr(entry, key): getattr(entry, of_value) for entry in found}
+        return {getattr(entry, key): getattr(entry, of_value) for entry in value}
     if kind.kind is bool and kind.optional:
-        return _KNOWN.get(found, found)
-    return found
+        return _KNOWN.get(value, value)
+    return value
 
 
 def _shaped(
@@ -247,7 +247,7 @@ def _shaped(
     if shape.count(-1) == 1:
         known = math.prod(size for size in shape if size >= 0)
         shape[shape.index(-1)] = flat.size // known if known else 0
-    elif -1 in shape:  # of the same name: a square
+    elif -1 in shape:  # both sides have the same name: a square
         shape = [math.isqrt(flat.size) if size == -1 else size for size in shape]
     if flat.size != math.prod(shape):
         raise ValueError(f'{field}: {flat.size} numbers, not {" x ".join(map(str, shape))}')

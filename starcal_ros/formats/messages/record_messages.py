@@ -40,7 +40,7 @@ from starcal_ros.records import (
     StarObservations,
 )
 
-_VARIANCE_PX2 = (1e-10, 1e6)  # of a measured star, smallest and largest
+_VARIANCE_PX2 = (1e-10, 1e6)  # smallest and largest that a measured star has
 _LONGEST_DETAIL = 500  # characters
 # No software on board reads them: they are in calibration.json alone.
 _NOT_SENT = ('model_checks', 'statements')
@@ -143,12 +143,12 @@ def calibration_from_message(message: Message) -> Calibration:
     fields do not fit each other.
     """
     camera = record_from_message(CameraModel, message.camera, 'camera')
-    for field, found, expected in (
+    for field, names, expected in (
         ('camera.parameter_names', message.camera.parameter_names, camera.parameter_names),
         ('parameter_names', message.parameter_names, camera.parameter_names + ALIGNMENT_NAMES),
     ):
-        if tuple(found) != expected:
-            raise ValueError(f'{field}: {", ".join(found) or "none"}, not {", ".join(expected)}')
+        if tuple(names) != expected:
+            raise ValueError(f'{field}: {", ".join(names) or "none"}, not {", ".join(expected)}')
     alignment = record_from_message(Alignment, message.alignment, 'alignment')
     nested = {
         'geometry': CameraGeometry(camera, alignment.star_tracker_from_camera_xyzw),
@@ -192,8 +192,8 @@ def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
 def mountings_to_messages(calibration: Calibration, make: Make) -> list[Message]:
     """geometry_msgs/TransformStamped of each further star tracker in the frame of the first."""
     return [
-        _in_star_tracker(calibration, one.frame, one.first_from_star_tracker_xyzw, make)
-        for one in calibration.star_trackers[1:]
+        _in_star_tracker(calibration, tracker.frame, tracker.first_from_star_tracker_xyzw, make)
+        for tracker in calibration.star_trackers[1:]
     ]
 
 

@@ -7,7 +7,6 @@ import bisect
 from collections.abc import Sequence
 import math
 import operator
-import sys
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,7 +17,6 @@ from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.file_kinds import has_surplus, png_header, PNG_HEADER_BYTES
 from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
     IMAGE_TYPE,
     Make,
     make_header,
@@ -26,15 +24,11 @@ from starcal_ros.formats.messages.message_codec import (
     nearest_stamp_ns,
     offset_ns,
     quaternion_from_message,
-    quaternion_to_message,
     stamp_ns,
-    TEMPERATURE_TYPE,
-    vector_to_message,
-    VELOCITY_TYPE,
 )
 from starcal_ros.records import Image, refused_image, StarObservations
 
-_MOST_PIXELS = 2**27  # of a camera that is not known: 256 MB of 16 bit
+_MOST_PIXELS = 2**27  # 256 MB of 16 bit, for a camera that is not known
 _JPEG = b'\xff\xd8'  # how its files begin
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 CHANNELS = ('red', 'green', 'blue')
@@ -123,15 +117,15 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
     if header is None:
         kind = 'a JPEG' if bytes(data[:2]) == _JPEG else 'not a PNG'
         raise ImageRefused('bad_encoding', f'the compressed image is {kind}; PNG is read')
-    found = (header.width, header.height)
+    claimed = (header.width, header.height)
     if header.channels != 1:
         raise ImageRefused('bad_encoding', f'the PNG has {header.channels} channels, not one')
-    if size is not None and found != size:
+    if size is not None and claimed != size:
         raise ImageRefused(
-            'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*found, *size)
+            'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*claimed, *size)
         )
-    if min(found) < 1 or max(found) > MAX_SIDE_PX or math.prod(found) > _MOST_PIXELS:
-        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*found))
+    if min(claimed) < 1 or max(claimed) > MAX_SIDE_PX or math.prod(claimed) > _MOST_PIXELS:
+        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*claimed))
     if has_surplus(bytes(data), header):
         raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
     import cv2  # slow to import, and few bags have compressed images
@@ -142,7 +136,7 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
         pixels = None
     if pixels is None:
         raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
-    if pixels.shape != found[::-1] or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels.shape != claimed[::-1] or pixels.dtype not in (np.uint8, np.uint16):
         raise ImageRefused(
             'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
         )
@@ -183,22 +177,6 @@ def refused_from_message(
         min(int(getattr(message, 'height', 0)), MAX_SIDE_PX),
         refused.reason,
         refused.detail,
-    )
-
-
-def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
-    """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
-    pixels = np.ascontiguousarray(image.pixels)
-    height, width = pixels.shape
-    return make(
-        IMAGE_TYPE,
-        header=make_header(image.time_ns, frame_id, make),
-        height=height,
-        width=width,
-        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
-        is_bigendian=int(sys.byteorder == 'big'),
-        step=width * pixels.itemsize,
-        data=pixels.reshape(-1).view(np.uint8),
     )
 
 
@@ -262,17 +240,6 @@ def attitude_from_message(message: Message) -> tuple[int, Floats]:
     return stamp_ns(message.header.stamp), quaternion_from_message(quaternion)
 
 
-def attitude_to_message(
-    time_ns: int, quaternion_xyzw: Floats, frame_id: str, make: Make
-) -> Message:
-    """Return a geometry_msgs/QuaternionStamped; ``frame_id`` is the inertial frame."""
-    return make(
-        ATTITUDE_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        quaternion=quaternion_to_message(quaternion_xyzw, make),
-    )
-
-
 def velocity_from_message(message: Message) -> tuple[int, Floats]:
     """
     Stamp and (3,) m/s of a geometry_msgs/TwistStamped.
@@ -288,36 +255,11 @@ def velocity_from_message(message: Message) -> tuple[int, Floats]:
     return stamp_ns(message.header.stamp), velocity_m_s
 
 
-def velocity_to_message(time_ns: int, velocity_m_s: Floats, frame_id: str, make: Make) -> Message:
-    """Return a geometry_msgs/TwistStamped without rotation."""
-    return make(
-        VELOCITY_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        twist=make(
-            'geometry_msgs/msg/Twist',
-            linear=vector_to_message(velocity_m_s, make),
-            angular=vector_to_message(np.zeros(3), make),
-        ),
-    )
-
-
 def temperature_from_message(message: Message) -> tuple[int, float]:
     """Stamp and degrees Celsius of a sensor_msgs/Temperature; NaN where it is not finite."""
     temperature_degc = float(message.temperature)
     known = math.isfinite(temperature_degc)
     return stamp_ns(message.header.stamp), temperature_degc if known else math.nan
-
-
-def temperature_to_message(
-    time_ns: int, temperature_degc: float, frame_id: str, make: Make
-) -> Message:
-    """Return a sensor_msgs/Temperature; its variance is 0, which means unknown in ROS."""
-    return make(
-        TEMPERATURE_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        temperature=float(temperature_degc),
-        variance=0.0,
-    )
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:

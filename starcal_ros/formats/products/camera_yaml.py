@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The ROS camera YAML, ``camera_info.yaml``, both ways, and the URLs that name one."""
+"""The camera of a ROS camera YAML and of files like it, and the URLs that name one."""
 
 from __future__ import annotations
 
@@ -13,17 +13,14 @@ from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
-import yaml
 
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.camera.lens import from_ros_distortion, ros_distortion
-from starcal_ros.camera.projection import ros_fit
+from starcal_ros.camera.lens import from_ros_distortion
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.formats.products.product_files import read_text
 from starcal_ros.record_fields import Finite, read_record, Shape
 from starcal_ros.untrusted import PARAMETER_BYTES, shown, yaml_value
 
-CAMERA_INFO_FILE = 'camera_info.yaml'
 DEFAULT_CAMERA_NAME = 'camera'
 _IS_MRCAL = re.compile(r'["\']lensmodel["\']\s*:')
 _OF_MRCAL = (4, 5, 8, 12)  # coefficients of OpenCV's models
@@ -68,36 +65,6 @@ class _CameraInfo:
         return camera
 
 
-def write_camera_info(
-    camera: CameraModel, path: Path, camera_name: str = DEFAULT_CAMERA_NAME
-) -> None:
-    """
-    Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
-
-    Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
-    make up for it as well as they can (`ros_fit`).
-
-    Raises ProductError when the file cannot be written.
-    """
-    fitted, _ = ros_fit(camera)
-    fx, _, fy, cx, cy = fitted.intrinsics.tolist()
-    distortion_model, D = ros_distortion(fitted.model, fitted.distortion)
-    content = {
-        'image_width': fitted.width,
-        'image_height': fitted.height,
-        'camera_name': camera_name,
-        'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        'distortion_model': distortion_model,
-        'distortion_coefficients': _matrix(1, len(D), D.tolist()),
-        'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
-        'projection_matrix': _matrix(
-            3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
-        ),
-    }
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    write_atomically(path, text)
-
-
 def _camera_of_mrcal(text: str) -> CameraModel:
     """Return the camera of a .cameramodel of mrcal; its extrinsics are not read."""
     content = ast.literal_eval(text[text.index('{') :])
@@ -124,7 +91,7 @@ def _camera_info_values(text: str) -> Mapping[str, Any]:
     These are a file of ``cv2.FileStorage``, a camchain of kalibr with one camera, and a printed
     ``CameraInfo`` message.
     """
-    if text.startswith('%YAML:1.0'):  # of OpenCV: neither this line nor the tag is YAML
+    if text.startswith('%YAML:1.0'):  # neither OpenCV's first line nor its tag is YAML
         text = text.partition('\n')[2].replace('!!opencv-matrix', '')
     content = yaml_value(text)
     if not isinstance(content, dict):
@@ -234,7 +201,3 @@ def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str
 def _as_written_or_decoded(path: Path) -> Path:
     """The path; ROS does not decode %20 in its URLs but others do, so both are taken."""
     return path if path.exists() else Path(unquote(str(path)))
-
-
-def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
-    return {'rows': rows, 'cols': cols, 'data': data}

@@ -10,33 +10,23 @@ written and read is equal to the last bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-import contextlib
-import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 import json
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
 from starcal_ros import untrusted
-from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.camera import CameraModel
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import is_marked, replacing, same_as_one_of
+from starcal_ros.files import replacing
 from starcal_ros.record_fields import Count, Finite, json_object, Quaternion, read_record
-from starcal_ros.records import (
-    ALIGNMENT_NAMES,
-    Calibration,
-    CameraGeometry,
-    check_calibration,
-    check_drawable,
-)
-from starcal_ros.untrusted import json_value, shown
+from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
+from starcal_ros.untrusted import shown
 
-OBSERVATIONS_FILE = 'observations.mcap'
-REPORT_FILE = 'report.html'
+STATE_CALIBRATIONS, STATE_ENSEMBLE = 'calibrations', 'ensemble'  # in a state folder
 SCHEMA = 1
 _LONGEST_REASON = 500  # characters: a text of the file may be in it
 CALIBRATION_FILE = 'calibration.json'
@@ -64,41 +54,6 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """
     with errors_as(ProductError, path, 'written'), replacing(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it where they are not there; raises ProductError."""
-    with errors_as(ProductError, path, 'created'):
-        path.mkdir(parents=True, exist_ok=True)
-
-
-def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
-    """
-    Check that a command may write its files: none is an input, and each is new or was its own.
-
-    Its own is a file that starcal wrote and nothing changed since.  Raises ProductError naming the
-    first file that would be replaced and the remedy.
-    """
-    inputs = tuple(inputs)
-    for path in outputs:
-        if same_as_one_of(path, inputs):
-            raise ProductError(
-                f'{path}: is an input of this command and would be replaced; choose another '
-                'place (-o)'
-            )
-        if os.path.isdir(path):
-            raise ProductError(f'{path}: is a folder, where a file is written; give another name')
-        if os.path.lexists(path) and not _is_own(path):
-            raise ProductError(
-                f'{path}: was not written by starcal, or was changed or copied since (or its file'
-                ' system keeps no extended attributes): give another name or remove it'
-            )
-
-
-def _is_own(path: Path) -> bool:
-    with contextlib.suppress(OSError, ValueError), untrusted.regular_file(path, False) as file:
-        return is_marked(file)
-    return False
 
 
 @dataclass(frozen=True)
@@ -181,6 +136,23 @@ def read_calibration(path: Path) -> Calibration:
     return calibration_from_content(path, content)
 
 
+def calibration_file(path: Path) -> Path:
+    """
+    Path of the calibration in a folder, the last in a state folder, or the file itself.
+
+    Raises ProductError if there is none.
+    """
+    if not path.is_dir():
+        return path
+    if (path / CALIBRATION_FILE).exists():
+        return path / CALIBRATION_FILE
+    activated = (path / STATE_CALIBRATIONS).glob(f'{8 * "[0-9]"}*_calibration_*.json')
+    last = max(activated, key=lambda file: int(file.name.partition('_')[0]), default=None)
+    if last is None:
+        raise ProductError(f'{path}: the folder holds no {CALIBRATION_FILE}')
+    return last
+
+
 def calibration_from_content(path: Path, content: Mapping[str, Any]) -> Calibration:
     """
     The calibration in the JSON object of a ``calibration.json``; other keys are ignored.
@@ -204,23 +176,6 @@ def calibration_from_content(path: Path, content: Mapping[str, Any]) -> Calibrat
     except ValueError as error:
         reason = ' '.join(str(error).split())
         raise ProductError(f'{path}: {reason[:_LONGEST_REASON]}') from error
-
-
-def prior_of(calibration: Calibration) -> CameraGeometry | None:
-    """Camera and alignment before a calibration, of its model; None if not recorded."""
-    camera = calibration.geometry.camera
-    count = len(camera.parameters)
-    try:
-        numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
-        if numbers.shape != (count + 4,):
-            return None
-        camera = dataclasses.replace(camera, parameters=numbers[:count])
-        check_plausible(camera)
-        prior = CameraGeometry(camera, numbers[count:])
-        check_drawable(prior)
-        return prior
-    except (KeyError, ValueError, TypeError, OverflowError):
-        return None
 
 
 def calibration_content(calibration: Calibration) -> dict[str, object]:

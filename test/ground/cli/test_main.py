@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli import main, node_processes
 from starcal_ground.cli.arguments import EXIT_INTERRUPTED
 from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import COMMANDS, parser
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.solve import software_version
 from starcal_ros.processes import module_command
@@ -365,8 +365,8 @@ def test_bags_without_a_usable_image(run: Run, tmp_path: Path) -> None:
 def test_images_of_a_wrong_encoding(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from starcal_ground.bag_writer import image_to_message
     from starcal_ros.formats.messages.message_codec import Make, Message
-    from starcal_ros.formats.messages.sensor_messages import image_to_message
 
     def colour(image: Image, frame_id: str, make: Make) -> Message:
         message = image_to_message(image, frame_id, make)

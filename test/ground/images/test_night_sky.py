@@ -16,6 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.night_sky import calibrated, camera_of, off_arcsec
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ground.images.from_stars import from_stars
 from starcal_ground.images.night_sky import calibrate_images, photographs_of
@@ -26,7 +27,6 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import load_catalog

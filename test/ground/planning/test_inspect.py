@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_REFUSED
 from starcal_ground.planning import inspect
 from starcal_ground.simulation import simulated_bag
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline import topics
@@ -159,7 +159,7 @@ def test_compressed_images_are_told_apart(tmp_path: Path, tiny_images: list[Imag
                 format=ending[1:],
                 data=np.asarray(coded[1]).ravel(),
             )
-            writer._write('/image', COMPRESSED_TYPE, tiny_images[k].time_ns, message)
+            writer.write('/image', COMPRESSED_TYPE, tiny_images[k].time_ns, message)
         for raw in reader.read_raw([TINY], [ATTITUDE]):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')

@@ -18,16 +18,15 @@ from markupsafe import Markup
 import numpy as np
 import pytest
 
+from starcal_ground import products
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
+from starcal_ground.products import prior_of, REPORT_FILE
 from starcal_ground.report import page as report
 from starcal_ros.formats.bag.reader import read_observations
-from starcal_ros.formats.products import product_folder
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
-    prior_of,
     read_calibration,
-    REPORT_FILE,
     write_calibration,
 )
 from starcal_ros.records import Ensemble
@@ -199,7 +198,7 @@ def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
         images_refused={evil: 1},
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)
-    shutil.copy(folder / product_folder.RESIDUALS_FILE, tmp_path)
+    shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
     text = page_of(tmp_path)
     assert '<script>alert' not in text and '<img src=x' not in text
 
@@ -217,13 +216,13 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         time_ns=0,
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)
-    left = product_folder.read_residuals(folder / product_folder.RESIDUALS_FILE)
+    left = products.read_residuals(folder / products.RESIDUALS_FILE)
     nothing = dataclasses.replace(
         left,
         used=np.zeros_like(left.used),
         attitude_error_arcsec=np.full_like(left.attitude_error_arcsec, np.nan),
     )
-    product_folder.write_residuals(nothing, tmp_path / product_folder.RESIDUALS_FILE)
+    products.write_residuals(nothing, tmp_path / products.RESIDUALS_FILE)
     assert '<html' in page_of(tmp_path)
 
 

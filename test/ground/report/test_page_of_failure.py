@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from starcal_ground.products import NotCalibrated
 from starcal_ground.report.page import write_failure_page
-from starcal_ros.formats.products.product_folder import NotCalibrated
 
 
 def test_a_remedy_is_a_sentence_and_only_a_parameter_is_code(tmp_path: Path) -> None:

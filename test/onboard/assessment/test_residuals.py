@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.products import read_residuals, write_residuals
 from starcal_ground.simulation import centroids as simulated_centroids
 from starcal_ground.simulation import scenario
 from starcal_ros.assessment.residuals import Residuals, residuals_of
@@ -17,7 +18,6 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.formats.products.product_folder import read_residuals, write_residuals
 
 SCENARIO = dataclasses.replace(scenario.scenario('small', seed=4), image_count=8)
 

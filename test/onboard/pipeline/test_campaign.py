@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ground.images.night_sky import calibrate_images
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.trend_table import Row
 import starcal_ros
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.records import Calibration
 
 pytestmark = pytest.mark.slow

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[import-not-found]
 
+from starcal_ground.products import write_camera_info
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import load_setup, Setup

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not-found]
 
+from starcal_ground.products import write_camera_info
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
-from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline.setup import (
     load_setup,

@@ -12,13 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: ignore[import-not-found]
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.simulation.scenario import attitude_samples, Detector
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.formats.bag.reader import Topics
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.pipeline import observe, solve, topics
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image

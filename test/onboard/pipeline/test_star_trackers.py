@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.formats.bag.reader import log_damage
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup

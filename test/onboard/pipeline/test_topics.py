@@ -10,9 +10,9 @@ from mission_files import attitudes, images, TINY  # type: ignore[import-not-fou
 import numpy as np
 import pytest
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPES,
     IMAGE_TYPE,
@@ -47,7 +47,7 @@ def bag(tmp_path: Path) -> Path:
                     rotation=quaternion_to_message(xyzw, make_message),
                 ),
             )
-            writer._write('/attitude', ATTITUDE_TYPES['transform'], time_ns, message)
+            writer.write('/attitude', ATTITUDE_TYPES['transform'], time_ns, message)
         for image in images()[:2]:
             height, width = image.pixels.shape
             grey = image.pixels >> 4 if image.pixels.dtype == np.uint16 else image.pixels
@@ -63,7 +63,7 @@ def bag(tmp_path: Path) -> Path:
                 step=3 * width,
                 data=cv2.merge([black, grey, black]).reshape(-1),
             )
-            writer._write('/image', IMAGE_TYPE, image.time_ns, message)
+            writer.write('/image', IMAGE_TYPE, image.time_ns, message)
     return tmp_path / 'bag'
 
 

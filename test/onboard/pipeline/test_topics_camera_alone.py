@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import (
     make_header,
     Message,
@@ -73,7 +73,7 @@ def write_bag(path: Path, kind: str) -> Path:
             writer.write_image(IMAGE_TOPIC, image, 'camera')
         for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC] if kind else []):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
-            writer._write('/gnc/state', kind, time_ns, attitude(kind, time_ns, xyzw))
+            writer.write('/gnc/state', kind, time_ns, attitude(kind, time_ns, xyzw))
     return path
 
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from starcal_ground.cli import main
-from starcal_ros.formats.products.product_folder import NOT_CALIBRATED_FILE
+from starcal_ground.products import NOT_CALIBRATED_FILE
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Image

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli import main
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
@@ -46,7 +46,7 @@ def _as(encoding: str, pixels: Callable[[Any], Any]) -> Write:
             step=len(data) // height,
             data=data,
         )
-        writer._write(IMAGE_TOPIC, IMAGE_TYPE, image.time_ns, message)
+        writer.write(IMAGE_TOPIC, IMAGE_TYPE, image.time_ns, message)
 
     return write
 
@@ -59,7 +59,7 @@ def _jpeg(writer: BagWriter, image: Image) -> None:
         format='jpeg',
         data=np.asarray(coded).ravel(),
     )
-    writer._write(IMAGE_TOPIC, COMPRESSED_TYPE, image.time_ns, message)
+    writer.write(IMAGE_TOPIC, COMPRESSED_TYPE, image.time_ns, message)
 
 
 def _raw(writer: BagWriter, image: Image) -> None:

@@ -15,6 +15,7 @@ from mcap import stream_reader
 import numpy as np
 import pytest
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import frames as frames_module
@@ -22,7 +23,6 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag import writer as writer_module
 from starcal_ros.formats.bag.frames import Frame, read_frames, read_telemetry, Telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.records import Image
 from starcal_ros.sky.attitude import AttitudeOptions
 

@@ -20,20 +20,20 @@ import pytest
 from rosbags.highlevel import AnyReader
 import yaml
 
+from starcal_ground.bag_writer import BagWriter, image_to_message
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.formats.bag import writer as writer_module
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import Damage, Topics
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
     CALIBRATION_TYPE,
     IMAGE_TYPE,
     stamp_ns,
 )
-from starcal_ros.formats.messages.sensor_messages import color_image_to_message, image_to_message
+from starcal_ros.formats.messages.sensor_messages import color_image_to_message
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
@@ -224,9 +224,9 @@ def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', make_message)
     with BagWriter(tmp_path / 'mixed') as writer:
         writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
-        writer._write('/image', IMAGE_TYPE, 7, bad)
-        number, _ = writer._channels['/image']
-        writer._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
+        writer.write('/image', IMAGE_TYPE, 7, bad)
+        number, _ = writer.messages._channels['/image']
+        writer.messages._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
         writer.write_image('/image', Image(9, np.zeros((2, 3), np.uint8)), '')
     first, second, third, last = images_of(tmp_path / 'mixed', stamp_offset_s=1e-9)
     assert isinstance(first, Image) and first.time_ns == 7

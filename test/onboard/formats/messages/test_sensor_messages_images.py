@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
+from starcal_ground.bag_writer import image_to_message
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import make_header
@@ -27,7 +28,6 @@ from starcal_ros.formats.messages.sensor_messages import (
     decode_image,
     decode_png,
     image_from_message,
-    image_to_message,
     refused_from_message,
 )
 from starcal_ros.records import Image

@@ -9,6 +9,11 @@ import numpy as np
 import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 
+from starcal_ground.bag_writer import (
+    attitude_to_message,
+    temperature_to_message,
+    velocity_to_message,
+)
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPES,
@@ -18,12 +23,9 @@ from starcal_ros.formats.messages.message_codec import (
 )
 from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
-    attitude_to_message,
     latest_at,
     temperature_from_message,
-    temperature_to_message,
     velocity_from_message,
-    velocity_to_message,
 )
 
 

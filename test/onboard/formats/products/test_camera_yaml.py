@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground.products import write_camera_info
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import ProductError
@@ -17,7 +18,6 @@ from starcal_ros.formats.products.camera_yaml import (
     read_camera_info,
     read_camera_name,
     resolve_url,
-    write_camera_info,
 )
 
 PARAMETERS = np.array(

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_folder import (
+from starcal_ground.products import (
     NOT_CALIBRATED_FILE,
     NotCalibrated,
     read_not_calibrated,
     write_not_calibrated,
 )
+from starcal_ros.errors import ProductError
 
 RECORD = NotCalibrated(
     'too few', ('a.mcap', 'b'), {'no_match': 3}, 'clock', ('seen',), ('stamp_offset_s: 3.0',), 'x'

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The folder of products of a calibration, as the tool writes it, and that of a calibrator's state.
+The folder of products of a calibration, as the tool writes it.
 
 It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_calibrated.json``.
 """
@@ -8,34 +8,38 @@ It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_cal
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+import contextlib
+import dataclasses
 from dataclasses import dataclass, fields
 import io
 import json
+import os
 from pathlib import Path
 
 import numpy as np
+import yaml
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.camera.lens import ros_distortion
+from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.formats.products.camera_yaml import (
-    CAMERA_INFO_FILE,
-    DEFAULT_CAMERA_NAME,
-    write_camera_info,
-)
+from starcal_ros.files import is_marked, same_as_one_of
+from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
-    OBSERVATIONS_FILE,
     read_json,
-    REPORT_FILE,
     write_atomically,
     write_calibration,
 )
 from starcal_ros.record_fields import json_object, plain_record, read_record
-from starcal_ros.records import Calibration, StarObservations
-from starcal_ros.untrusted import read_archive
+from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
+from starcal_ros.untrusted import json_value, read_archive, regular_file
 
 OBSERVATIONS_TOPIC = '/observations'
-STATE_CALIBRATIONS, STATE_ENSEMBLE = 'calibrations', 'ensemble'  # in a state folder
+CAMERA_INFO_FILE = 'camera_info.yaml'
+OBSERVATIONS_FILE, REPORT_FILE = 'observations.mcap', 'report.html'
 RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
     CALIBRATION_FILE,
@@ -60,32 +64,47 @@ def write_products(
     (folder / NOT_CALIBRATED_FILE).unlink(missing_ok=True)
 
 
+def write_camera_info(
+    camera: CameraModel, path: Path, camera_name: str = DEFAULT_CAMERA_NAME
+) -> None:
+    """
+    Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
+
+    Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
+    make up for it as well as they can (`ros_fit`).
+
+    Raises ProductError when the file cannot be written.
+    """
+    fitted, _ = ros_fit(camera)
+    fx, _, fy, cx, cy = fitted.intrinsics.tolist()
+    distortion_model, D = ros_distortion(fitted.model, fitted.distortion)
+    content = {
+        'image_width': fitted.width,
+        'image_height': fitted.height,
+        'camera_name': camera_name,
+        'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        'distortion_model': distortion_model,
+        'distortion_coefficients': _matrix(1, len(D), D.tolist()),
+        'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
+        'projection_matrix': _matrix(
+            3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+        ),
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    write_atomically(path, text)
+
+
+def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
+    return {'rows': rows, 'cols': cols, 'data': data}
+
+
 def write_observations(
     observations: Iterable[StarObservations], folder: Path, frame_id: str
 ) -> None:
     """Write the observations of a calibration with the frame of its camera; raises BagError."""
-    from starcal_ros.formats.bag.writer import BagWriter  # a vehicle may not have mcap
-
     with BagWriter(folder / OBSERVATIONS_FILE) as writer:
         for record in observations:
             writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
-
-
-def calibration_file(path: Path) -> Path:
-    """
-    Path of the calibration in a folder, the last in a state folder, or the file itself.
-
-    Raises ProductError if there is none.
-    """
-    if not path.is_dir():
-        return path
-    if (path / CALIBRATION_FILE).exists():
-        return path / CALIBRATION_FILE
-    activated = (path / STATE_CALIBRATIONS).glob(f'{8 * "[0-9]"}*_calibration_*.json')
-    last = max(activated, key=lambda file: int(file.name.partition('_')[0]), default=None)
-    if last is None:
-        raise ProductError(f'{path}: the folder holds no {CALIBRATION_FILE}')
-    return last
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
@@ -141,3 +160,55 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
         return read_record(NotCalibrated, content)
     except ValueError as error:
         raise ProductError(f'{path}: not a record of a failure: {error}') from error
+
+
+def prior_of(calibration: Calibration) -> CameraGeometry | None:
+    """Camera and alignment before a calibration, of its model; None if not recorded."""
+    camera = calibration.geometry.camera
+    count = len(camera.parameters)
+    try:
+        numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
+        if numbers.shape != (count + 4,):
+            return None
+        camera = dataclasses.replace(camera, parameters=numbers[:count])
+        check_plausible(camera)
+        prior = CameraGeometry(camera, numbers[count:])
+        check_drawable(prior)
+        return prior
+    except (KeyError, ValueError, TypeError, OverflowError):
+        return None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it where they are not there; raises ProductError."""
+    with errors_as(ProductError, path, 'created'):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
+    """
+    Check that a command may write its files: none is an input, and each is new or was its own.
+
+    Its own is a file that starcal wrote and nothing changed since.  Raises ProductError naming the
+    first file that would be replaced and the remedy.
+    """
+    inputs = tuple(inputs)
+    for path in outputs:
+        if same_as_one_of(path, inputs):
+            raise ProductError(
+                f'{path}: is an input of this command and would be replaced; choose another '
+                'place (-o)'
+            )
+        if os.path.isdir(path):
+            raise ProductError(f'{path}: is a folder, where a file is written; give another name')
+        if os.path.lexists(path) and not _is_own(path):
+            raise ProductError(
+                f'{path}: was not written by starcal, or was changed or copied since (or its file'
+                ' system keeps no extended attributes): give another name or remove it'
+            )
+
+
+def _is_own(path: Path) -> bool:
+    with contextlib.suppress(OSError, ValueError), regular_file(path, False) as file:
+        return is_marked(file)
+    return False
