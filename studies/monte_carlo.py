@@ -249,8 +249,11 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
     camera = field.truth.camera
     for cell, part in _cells(design, field):
         blocks = information_blocks(part)
+        least = {
+            tracker: map_bound_px(camera, bound('hierarchical', blocks, tracker))
+            for tracker in design.tracker_arcsec
+        }
         for tracker, share in itertools.product(design.tracker_arcsec, (0.0, OUTLIER_SHARE)):
-            least = map_bound_px(camera, bound('hierarchical', blocks, tracker))
             ensemble = observe(part, tracker, share)
             key: Row = {**cell, 'outlier_share': share}
             for row, estimate in _solutions(design, key, ensemble, field, tracker):
@@ -260,7 +263,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
                 yield {
                     **row,
                     'reported_px': map_bound_px(estimate.geometry.camera, estimate.map_covariance),
-                    'bound_px': least,
+                    'bound_px': least[tracker],
                     'rejected': int((~estimate.kept).sum()),
                     **{
                         f'{names[k]}_sigmas': float(e / s)

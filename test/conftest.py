@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
+import fcntl
 import functools
 import inspect
 import os
@@ -16,12 +17,14 @@ import sys
 import time
 from typing import Any
 
+from forked_process import ForkedProcess  # type: ignore[import-not-found]
 import pytest
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
+SLOW_S = 5.0  # of processor time: more than a test of one second takes on any machine
 FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 # Files of half a minute and more: last, one of them would keep one worker while the others wait.
@@ -50,6 +53,43 @@ def pytest_runtest_makereport(
     report = yield
     item.stash[FAILED] = item.stash.get(FAILED, False) or report.failed
     return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    """Fail a test that takes `SLOW_S` of processor time and is not marked ``slow``."""
+    before_s = sum(os.times()[:4])
+    yield
+    took_s = sum(os.times()[:4]) - before_s
+    if took_s > SLOW_S and not {'slow', 'nodes'} & {mark.name for mark in item.iter_markers()}:
+        pytest.fail(f'mark it slow: it took {took_s:.1f} s of processor time', pytrace=False)
+
+
+MadeOnce = Callable[[str, Callable[[Path], object]], Path]
+
+
+@pytest.fixture(scope='session')
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
+    """
+    Folders by name, each filled by the first worker of a run that needs it.
+
+    Tests must not change them.
+    """
+    base = tmp_path_factory.getbasetemp()
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        base = base.parent  # of all workers
+
+    def made(name: str, fill: Callable[[Path], object]) -> Path:
+        folder = base / f'once_{name}'
+        with folder.with_suffix('.lock').open('w') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.exists():
+                part = tmp_path_factory.mktemp(name)
+                fill(part)
+                part.rename(folder)
+        return folder
+
+    return made
 
 
 def free_domain() -> int:
@@ -90,9 +130,14 @@ def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
 class NodeProcess:
     """A node as a separate process with its output in a file."""
 
-    def __init__(self, name: str, log: Path, arguments: list[str]) -> None:
+    def __init__(self, name: str, log: Path, arguments: list[str], forked: bool) -> None:
         self.name = name
         self._log = log
+        self.process: ForkedProcess | subprocess.Popen[bytes]
+        log.touch()
+        if forked:
+            self.process = ForkedProcess(name, arguments, log)
+            return
         with log.open('wb') as output:
             self.process = subprocess.Popen(
                 [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments],
@@ -148,13 +193,19 @@ StartNode = Callable[..., NodeProcess]
 def start_node(
     ros_domain: None, tmp_path: Path, has_failed: Callable[[], bool]
 ) -> Iterator[StartNode]:
-    """Start node processes by module name; they are stopped at the end of the test."""
+    """
+    Start node processes by module name; they are stopped at the end of the test.
+
+    Not ``forked``, they start and end with an interpreter of their own.
+    """
     started: list[NodeProcess] = []
 
-    def start(name: str, *arguments: str, ros: tuple[str, ...] = ()) -> NodeProcess:
+    def start(
+        name: str, *arguments: str, ros: tuple[str, ...] = (), forked: bool = True
+    ) -> NodeProcess:
         ros_arguments = ['--ros-args', *ros] if ros else []
         log = tmp_path / f'{name}{len(started)}.log'
-        started.append(NodeProcess(name, log, [*arguments, *ros_arguments]))
+        started.append(NodeProcess(name, log, [*arguments, *ros_arguments], forked))
         return started[-1]
 
     yield start
@@ -170,27 +221,31 @@ def start_node(
 
 
 @pytest.fixture(scope='session')
-def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_bag(made_once: MadeOnce) -> Path:
     """Copy of the bag in the repository, with an absolute URL of its camera file."""
-    folder = tmp_path_factory.mktemp('bags') / 'tiny'
-    shutil.copytree(TINY, folder)
-    relative = (TINY / 'params.yaml').read_text()
-    params = relative.replace('camera.yaml', f'file://{folder}/camera.yaml')
-    assert params != relative
-    (folder / 'params.yaml').write_text(params)
-    return folder
+
+    def copy(folder: Path) -> None:
+        shutil.copytree(TINY, folder, dirs_exist_ok=True)
+        relative = (TINY / 'params.yaml').read_text()
+        params = relative.replace('camera.yaml', f'file://{TINY}/camera.yaml')
+        assert params != relative
+        (folder / 'params.yaml').write_text(params)
+
+    return made_once('tiny', copy)
 
 
 @pytest.fixture(scope='session')
-def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_products(made_once: MadeOnce, tiny_bag: Path) -> Path:
     """Products of `starcal calibrate` for that bag; tests must not change them."""
-    folder = tmp_path_factory.mktemp('tiny_products')
-    command = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate', str(tiny_bag)]
-    command += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, ''), done.stderr
-    assert 'accepted' in done.stdout
-    return folder
+
+    def calibrate(folder: Path) -> None:
+        command = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate', str(tiny_bag)]
+        command += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, ''), done.stderr
+        assert 'accepted' in done.stdout
+
+    return made_once('tiny_products', calibrate)
 
 
 def _seen(condition: Callable[..., object]) -> str:

@@ -98,7 +98,7 @@ def ideal_by_rotation(model: str, ideal: Floats) -> Floats:
     The first axis is x, then y; the last the three angles (Eqs. 34, 35 if perspective).
     """
     x, y = ideal[..., 0], ideal[..., 1]
-    theta = np.moveaxis(np.empty((2, 3, *x.shape)), 1, -1)
+    theta = np.empty((2, 3, *x.shape)).transpose(0, *range(2, x.ndim + 2), 1)
     if model == _EQUIDISTANT:
         m = _bend(x * x + y * y)
         theta[0, ..., 0] = m * x * y
@@ -150,7 +150,8 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
 
 def _planes(x: Floats, y: Floats) -> Floats:
     """Points (..., 2) stored as all x, then all y: arithmetic on them takes half the time."""
-    return np.moveaxis(np.stack([x, y]), 0, -1)
+    both = np.stack([x, y])
+    return both.transpose(*range(1, both.ndim), 0)
 
 
 def _radial(model: str, r2: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats | float]:
@@ -181,7 +182,7 @@ def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
     x_by_x, y_by_y = g + x * (by_x + 4 * p2), g + y * (by_y + 4 * p1)
     cross = x * (by_y + 2 * p1) + 2 * p2 * y
     kind = np.result_type(ideal, coefficients)
-    J = np.moveaxis(np.empty((2, 2, *np.broadcast(x, y).shape), kind), (0, 1), (-2, -1))
+    J = np.empty((2, 2, *x.shape), kind).transpose(*range(2, x.ndim + 2), 0, 1)
     J[..., 0, 0], J[..., 1, 1] = x_by_x, y_by_y
     J[..., 0, 1] = J[..., 1, 0] = cross
     if model in _WITH_PRISM:

@@ -100,7 +100,7 @@ def test_every_transition_in_every_state(
 ) -> None:
     """Each node survives all transitions, and a signal ends it with status 0 in every state."""
     ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
-    nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
+    nodes = [start_node(name, ros=ros, forked=False) for name in ('star_observer', 'calibrator')]
     # Each state meets both signals; the two nodes end by the same code.
     signals = [signal.SIGINT, signal.SIGTERM]
     for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
@@ -307,7 +307,7 @@ def test_nodes_end_after_several_signals(
     """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
     rng = random.Random(seed)
     ros = ('--params-file', str(tiny_bag / 'params.yaml'))
-    nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
+    nodes = [start_node(name, ros=ros, forked=False) for name in ('star_observer', 'calibrator')]
     managers = [Manager(client, node.name) for node in nodes]
     client.until(lambda: all(manager.state() == 'active' for manager in managers))
     for _ in range(rng.choice([2, 3])):

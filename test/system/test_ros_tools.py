@@ -135,7 +135,7 @@ def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
     ros2 = make(FAST)
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
     values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
-    remapped = tiny_bag / 'images.yaml'
+    remapped = tmp_path / 'images.yaml'
     remapped.write_text(yaml.safe_dump(values))
     launch = ros2.start(
         *('launch', 'starcal', 'replay.launch.py', f'params:={remapped}', f'bag:={tiny_bag}'),

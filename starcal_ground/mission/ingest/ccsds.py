@@ -23,7 +23,6 @@ from xml.etree import ElementTree
 import erfa
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.time_systems import from_text, system_of
@@ -99,6 +98,8 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
     Raises IngestError when the file cannot be read, does not cover a stamp, or names a centre, a
     time system or a frame that cannot be converted.
     """
+    from scipy.interpolate import CubicHermiteSpline  # a fifth of the start of a short command
+
     segments = read_segments(path, 'OEM')
     with mission_records.naming(path):
         at = np.array(at_ns, np.int64)

@@ -214,9 +214,9 @@ def _step(
     off = [math.log(before[0] / fx), float(before[3]) - cx, float(before[4]) - cy, -part]
     centre_px = CENTRE_RANGE * camera.width
     held = (1.7 / np.array([FOCAL_RANGE, centre_px, centre_px, DISTORTION_RANGE])) ** 2
-    weighted = J * weight[:, None]
-    N = np.tensordot(weighted, J, ((0, 1), (0, 1)))
-    b = np.tensordot(weighted, residual, ((0, 1), (0, 1)))
+    weighted = (J * weight[:, None]).reshape(-1, 7).T
+    N = weighted @ J.reshape(-1, 7)
+    b = weighted @ residual.reshape(-1)
     N[[3, 4, 5, 6], [3, 4, 5, 6]] += held
     b[3:] += held * off
     N[range(7), range(7)] *= 1.0 + 1e-12

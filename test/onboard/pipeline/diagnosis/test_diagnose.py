@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass
+import functools
 import json
 import math
 from pathlib import Path
@@ -46,6 +47,7 @@ def set_up(geometry: CameraGeometry) -> Setup:
     return load_setup({}, prior=geometry)
 
 
+@functools.cache
 def slewing_night() -> Night:
     """
     Four images, 20 s apart, of a spacecraft that slews 1 to 3 degrees a second about no one axis.
@@ -87,6 +89,7 @@ def slewing_night() -> Night:
     )
 
 
+@functools.cache
 def granasat_night() -> Night:
     if not GRANASAT.exists():
         pytest.skip('the real sky is not here')
