@@ -395,7 +395,6 @@ def options_of(values: Mapping[str, object]) -> dict[str, object]:
         'star_tracker_sigma_arcsec': (_SIGMA_ARCSEC,) * 3,
         'star_tracker_frame': '',
         'attitude_direction': 'st_to_inertial',
-        'attitude_message': 'quaternion',
         'stamp_offset_s': 0.0,
         # Rotations of single images have no rate, with which read-out and stamps are estimated.
         'shutter': 'global',
