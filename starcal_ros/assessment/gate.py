@@ -14,6 +14,7 @@ from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.temperature import camera_at
 from starcal_ros.options import option
 from starcal_ros.records import (
     Calibration,
@@ -179,6 +180,8 @@ def _changes(
     before, name, factor = prior, 'the prior', _PRIOR_FACTOR
     if active is not None:
         before, name, factor = active.geometry, 'the active calibration', 1.0
+        if calibration.temperature is not None:
+            before = camera_at(active, calibration.temperature.reference_degc)
     rotation_rad, left_px = movement(before, calibration.geometry)
     lens = 'the prior camera or its lens model does not match this lens (lens_model)'
     yield limit_check(
