@@ -133,8 +133,8 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
     """
     Parameters of a ROS 2 parameter file that apply to any of the named nodes.
 
-    Sections apply as in ROS: ``/**`` to all, then a node's own name, in any namespace that it is
-    given with a wildcard or not at all, later ones winning.
+    Sections apply as in ROS, later ones winning: ``/**``, ``/**/NODE`` and ``NODE``; those with
+    other wildcards are not read.
 
     Raises OptionError when the file cannot be read or is not a ROS parameter file, or has a
     section that seems meant for one of the nodes and applies to none.
@@ -203,16 +203,9 @@ def _flat(content: Mapping[str, object], namespace: str) -> dict[str, object]:
 
 
 def section_applies(section: str, node: str) -> bool:
-    """True if rcl gives a section to a node ``/namespace/name``: * is one part, ** any number."""
-    return _parts_match(section.lstrip('/').split('/'), node.lstrip('/').split('/'))
-
-
-def _parts_match(pattern: list[str], parts: list[str]) -> bool:
-    if not pattern or not parts:
-        return not parts and all(part == '**' for part in pattern)
-    if pattern[0] == '**':
-        return _parts_match(pattern[1:], parts) or _parts_match(pattern, parts[1:])
-    return pattern[0] in ('*', parts[0]) and _parts_match(pattern[1:], parts[1:])
+    """True if a section is ``/**``, ``/**/NODE`` or the name of a node ``/namespace/NODE``."""
+    name = node.lstrip('/')
+    return section.lstrip('/') in ('**', name, f'**/{name.rpartition("/")[2]}')
 
 
 def meant_node(section: str, nodes: Iterable[str]) -> str:

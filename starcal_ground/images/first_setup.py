@@ -91,10 +91,9 @@ def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
     there = {one.type_name for one in reader.topics(bags)}
     words = f'images of {topic}: {camera.in_a_sentence()}'
     has_velocity = VELOCITY_TYPE in there
-    kinds = [kind for kind, type_name in ATTITUDE_TYPES.items() if type_name in there]
-    if not kinds:
+    if not there & {*ATTITUDE_TYPES}:
         return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
-    options, attitudes = _aligned(bags, asked, camera, kinds[0])
+    options, attitudes = _aligned(bags, asked, camera)
     to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
     worth = _worth_stating(bags, asked, camera.camera, options)
     return FirstSetup(camera.camera, options, (words, attitudes), (*worth, *to_state))
@@ -118,13 +117,13 @@ def _worth_stating(
 
 
 def _aligned(
-    bags: Sequence[Path], asked: Topics, camera: FromStars, kind: str
+    bags: Sequence[Path], asked: Topics, camera: FromStars
 ) -> tuple[dict[str, object], str]:
     """Options of the attitudes in a bag, and a line on them."""
     prior = CameraGeometry(camera.camera, np.array([0.0, 0.0, 0.0, 1.0]))
     said = ''
     for direction in _DIRECTIONS:
-        options: dict[str, object] = {'attitude_direction': direction, 'attitude_message': kind}
+        options: dict[str, object] = {'attitude_direction': direction}
         setup = dataclasses.replace(load_setup(options, prior=prior), is_aligned=False)
         topics = choose_topics(bags, asked, setup)
         found = diagnose_bags(bags, asked, setup)

@@ -398,7 +398,6 @@ def options_of(values: Mapping[str, object]) -> dict[str, object]:
         'prior_alignment_sigma_deg': _SIGMA_ARCSEC / 3600.0,
         'star_tracker_frame': '',
         'attitude_direction': 'st_to_inertial',
-        'attitude_message': 'quaternion',
         'stamp_offset_s': 0.0,
         # Rotations of single images have no rate, with which read-out and stamps are estimated.
         'shutter': 'global',

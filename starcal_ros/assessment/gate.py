@@ -14,6 +14,7 @@ from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.temperature import camera_at
 from starcal_ros.options import option
 from starcal_ros.records import (
     Calibration,
@@ -289,6 +290,8 @@ def _changes(
     before, name, factors, centre_deg = prior, 'the prior', (_PRIOR_FACTOR, _PRIOR_ROTATION), 0.0
     if active is not None:
         before, name, factors = active.geometry, 'the active calibration', (1.0, 1.0)
+        if calibration.temperature is not None:
+            before = camera_at(active, calibration.temperature.reference_degc)
     else:
         camera = prior.camera
         centre_px = estimation.principal_point_prior * max(camera.width, camera.height)

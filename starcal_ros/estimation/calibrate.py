@@ -52,7 +52,7 @@ from starcal_ros.estimation.star_equations import (
     star_table,
     StarTable,
 )
-from starcal_ros.estimation.temperature import why_unsupported
+from starcal_ros.estimation.temperature import reference_degc, why_unsupported
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import (
     Assumptions,
@@ -482,7 +482,7 @@ def _result(
         attitude_seen=attitudes.seen,
         iterations=iterations,
         termination=termination,
-        thermal=_thermal(after, layout, covariance, options),
+        thermal=_thermal(after, layout, covariance, ensemble, options),
         shared_errors=judged.errors,
         tracker_errors=trackers,
         star_trackers=star_tracker_alignments(
@@ -512,14 +512,18 @@ def _considered(found: Posterior, problem: Problem, layout: Layout) -> Floats:
 
 
 def _thermal(
-    state: State, layout: Layout, covariance: Floats, options: CalibrationOptions
+    state: State,
+    layout: Layout,
+    covariance: Floats,
+    ensemble: Ensemble,
+    options: CalibrationOptions,
 ) -> TemperatureTerms | None:
     """Terms of temperature of a state; None where none was asked for."""
     if not (options.focal_temperature_order or options.alignment_temperature):
         return None
     sigma = np.sqrt(np.diag(covariance))
     return TemperatureTerms(
-        reference_degc=options.reference_temperature_degc,
+        reference_degc=reference_degc(ensemble),
         focal_per_degc=tuple(state.focal.tolist()),
         focal_per_degc_sigma=tuple(sigma[layout.of(['focal'])].tolist()),
         alignment_rate_rad_per_degc=tuple(state.rate.tolist()),

@@ -112,12 +112,6 @@ class CalibrationOptions:
     alignment_temperature: bool = option(
         False, 'estimate an alignment that is linear in temperature; not with method: per_image'
     )
-    reference_temperature_degc: float = option(
-        20.0,
-        'temperature at which a temperature-dependent camera and alignment are reported, degC',
-        low=-273.15,
-        high=1000.0,
-    )
     min_stars: int = 60  # observations in a calibration: about five for each unknown of a camera
     # Of 2000 stars without an outlier it rejects one in 12 calibrations.
     outlier_sigma: float = 4.5

@@ -34,6 +34,7 @@ from starcal_ros.estimation.options import (
 )
 from starcal_ros.estimation.problem import image_blocks, Problem, star_tracker_names, State
 from starcal_ros.estimation.star_equations import Measurements, StarTable
+from starcal_ros.estimation.temperature import reference_degc
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
 from starcal_ros.estimation.weights import FEWEST_STARS
 from starcal_ros.records import CameraGeometry, Ensemble
@@ -172,7 +173,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
             assumed_tracker_sigma_rad(options), (len(ensemble.images), 1)
         ),
         above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
-        - options.reference_temperature_degc,
+        - reference_degc(ensemble),
         star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
         first_from_star_tracker=mountings,
         mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,

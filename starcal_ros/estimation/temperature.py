@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.records import Calibration, CameraGeometry, TemperatureTerms
+from starcal_ros.records import Calibration, CameraGeometry, Ensemble, TemperatureTerms
 
 FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
 _SCALED = slice(0, 3)  # fx, skew, fy
@@ -60,6 +60,13 @@ def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
     x, y, z = rate
     half = np.eye(3) - 0.5 * dT * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.concatenate([turns(rate, above_reference_k).as_matrix(), dT * half], axis=-1)
+
+
+def reference_degc(ensemble: Ensemble) -> float:
+    """Temperature that terms refer to: the multiple of 10 degC nearest the mean of the images."""
+    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
+    measured_degc = temperatures_degc[np.isfinite(temperatures_degc)]
+    return 10.0 * round(float(measured_degc.mean()) / 10.0) if len(measured_degc) else 0.0
 
 
 def camera_at(calibration: Calibration, temperature_degc: float) -> CameraGeometry:

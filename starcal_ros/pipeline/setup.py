@@ -260,15 +260,6 @@ class NodeOptions:
 class ObserverOptions:
     """Inputs of the star observer."""
 
-    image_transport: str = option(
-        'raw',
-        'raw: sensor_msgs/Image on image; compressed: PNG in sensor_msgs/CompressedImage on'
-        ' image/compressed',
-        choices=('raw', 'compressed'),
-    )
-    image_queue: int = option(
-        20, 'depth of the queue of images that wait to be measured', low=1, high=1000
-    )
     attitude_timeout_s: float = option(
         10.0, 'longest wait of an image for the next attitude sample, wall clock, s', low=0.0
     )

@@ -87,48 +87,48 @@ def _choose_attitudes(
 
     A star tracker may drop out, but not all of them.
     """
-    kind = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
-    fitting = [topic.name for topic in there if topic.type_name == kind]
+    kinds = {topic.name: topic.type_name for topic in there if topic.type_name in ATTITUDE_TYPES}
     named = [f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings] if setup else []
-    more = tuple(name if name in fitting else '' for name in named)
+    more = tuple(name if name in kinds else '' for name in named)
     for name in set(named) - set(more):
         reader.log_damage(
-            f'{name}: no such topic of type {kind}; the star tracker that more_star_trackers names'
+            f'{name}: no such topic of attitudes; the star tracker that more_star_trackers names'
             ' is left out'
         )
-    first = [name for name in fitting if name not in named]
+    first = [name for name in kinds if name not in named]
     if setup and not (asked or first) and any(more):
         reader.log_damage(
-            f'no topic of type {kind} but those of more_star_trackers; the first star tracker,'
+            'no topic of attitudes but those of more_star_trackers; the first star tracker,'
             f' {setup.frames.star_tracker_frame}, is left out'
         )
         return '', more
-    only = first[0] if named and len(first) == 1 else ''
+    # Poses, transforms and orientations of an Imu may be those of anything else.
+    likely = [name for name in first if kinds[name] == ATTITUDE_TYPE] or first
+    if len(likely) > 1 and not asked:
+        listed = ', '.join(f'{name} ({kinds[name].rpartition("/")[2]})' for name in likely)
+        raise BagError(
+            f'{", ".join(map(str, paths))}: several topics may hold the attitudes: {listed};'
+            ' choose one with --attitude-topic'
+        )
+    name = asked or ''.join(likely)
+    own = [kind for topic, kind in kinds.items() if topic.lstrip('/') == name.lstrip('/')]
     try:
-        return _choose(paths, kind, asked or only, 'attitude'), more
+        return _choose(paths, own[0] if own else ATTITUDE_TYPE, name, 'attitude'), more
     except BagError as error:
-        if first:
-            raise
-        raise BagError(f'{error}{_other_attitudes(there, asked)}; {_CAMERA_ALONE}') from error
+        alone = '' if first else f'; {_CAMERA_ALONE}'
+        raise BagError(f'{error}{_not_read(there, asked)}{alone}') from error
 
 
-def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
-    """Return which topics may hold the attitudes in messages of another type, and the remedy."""
-    names = {kind: name for name, kind in ATTITUDE_TYPES.items()}
-    text = ''
-    for topic in there:
-        if asked and topic.name.lstrip('/') != asked.lstrip('/'):
-            continue
-        name = topic.type_name.rpartition('/')[2]
-        if topic.type_name in names:
-            option = f'attitude_message: {names[topic.type_name]}'
-            text += f'; {topic.name} is a {name}: if it holds the attitudes, set {option}'
-        elif _LIKE_ATTITUDES.search(name):
-            text += (
-                f'; {topic.name} is a {name}, which is not read: publish its orientation as a'
-                f' QuaternionStamped, or as a PoseStamped with attitude_message: pose'
-            )
-    return text
+def _not_read(there: Sequence[reader.Topic], asked: str) -> str:
+    """Return which topics seem to hold attitudes in messages that are not read, and the remedy."""
+    return ''.join(
+        f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}, which is not read: publish its'
+        ' orientation as a QuaternionStamped or PoseStamped'
+        for topic in there
+        if topic.type_name not in ATTITUDE_TYPES
+        and _LIKE_ATTITUDES.search(topic.type_name.rpartition('/')[2])
+        and (not asked or topic.name.lstrip('/') == asked.lstrip('/'))
+    )
 
 
 def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:
@@ -245,7 +245,7 @@ def without_attitudes(
     has_images = bool(kinds & _IMAGE_TYPES)
     if camera_alone:
         return has_images
-    others = {*ATTITUDE_TYPES.values(), OBSERVATIONS_TYPE}
+    others = {*ATTITUDE_TYPES, OBSERVATIONS_TYPE}
     return has_images and not (kinds & others or asked.attitude or stated_tracker(options))
 
 

@@ -139,7 +139,7 @@ class BagPlayer(PrintableLog):
         """Wait until the topics that matter have subscribers and no more come, or the timeout."""
         attitudes = self._of(ATTITUDE_TYPE)
         # Of other types, one holds the attitudes, and the others may be there for anything.
-        others = [] if attitudes else self._of(*ATTITUDE_TYPES.values())
+        others = [] if attitudes else self._of(*ATTITUDE_TYPES)
         needed = [*self._images, *attitudes] or list(self._players)
         other = self.own.wait_for_topic
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s

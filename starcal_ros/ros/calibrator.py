@@ -124,7 +124,7 @@ class Calibrator(StarcalNode):
         if self._own.set_camera_info_service:
             self._driver = CameraDriver(self, self._own.set_camera_info_service)
         self.inputs.add(
-            ObservationsMessage,
+            (ObservationsMessage,),
             'observations',
             self.taking(self._on_observations),
             _OBSERVATIONS,

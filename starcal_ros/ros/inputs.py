@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+import contextlib
 from dataclasses import dataclass
 import threading
 from typing import Any
@@ -31,13 +32,15 @@ def with_reliability(qos: QoSProfile, reliability: ReliabilityPolicy) -> QoSProf
 
 @dataclass
 class _Input:
-    kind: Any
+    kinds: tuple[Any, ...]
     topic: str
+    name: str  # of the topic on the graph, after remapping
     callback: Callable[..., None]
     qos: QoSProfile
     adapts: bool
     group: CallbackGroup
     override: QoSOverridingOptions | None
+    kind: Any = None
     subscription: Any = None
     lost: int = 0
 
@@ -46,9 +49,10 @@ class Inputs:
     """
     The subscriptions of a node, each in a callback group of its own unless one is given.
 
-    DDS does not connect a reliable subscription to a best-effort publisher. An adaptive
-    subscription is created again as best effort if a publisher offers only that; lost messages of
-    reliable publishers are then not repeated.  The ROS parameter
+    Of several types of message, the first that a publisher of the topic has is received, and
+    before there is one, the first.  DDS does not connect a reliable subscription to a best-effort
+    publisher. An adaptive subscription is created again as best effort if a publisher offers only
+    that; lost messages of reliable publishers are then not repeated.  The ROS parameter
     ``qos_overrides.<topic>.subscription.reliability`` fixes the reliability of such a
     subscription. Safe to use from several threads.
     """
@@ -60,7 +64,7 @@ class Inputs:
 
     def add(
         self,
-        kind: Any,
+        kinds: tuple[Any, ...],
         topic: str,
         callback: Callable[..., None],
         qos: QoSProfile,
@@ -68,13 +72,19 @@ class Inputs:
         adapts: bool = False,
         group: CallbackGroup | None = None,
     ) -> None:
-        """Subscribe to a topic; with ``adapts`` its reliability may fall to best effort."""
+        """
+        Subscribe to a topic, whose publishers may send any one of some types of message.
+
+        With ``adapts`` its reliability may fall to best effort.
+        """
         group = group or MutuallyExclusiveCallbackGroup()
-        override = _reliability_override(self._node, topic) if adapts else None
-        one = _Input(kind, topic, callback, qos, adapts and not override, group, override)
+        name = self._node.resolve_topic_name(topic)
+        override = _reliability_override(self._node, name) if adapts else None
+        entry = _Input(kinds, topic, name, callback, qos, adapts and not override, group, override)
         with self._lock:
-            self._subscribe(one)
-            self._inputs.append(one)
+            entry.kind = _kind_of(entry, self._node.get_publishers_info_by_topic(name))
+            self._subscribe(entry)
+            self._inputs.append(entry)
 
     def close(self) -> None:
         """Destroy all subscriptions; safe to call twice."""
@@ -85,7 +95,7 @@ class Inputs:
     def names(self) -> list[str]:
         """Names of the topics on the graph, after remapping."""
         with self._lock:
-            return sorted(one.subscription.topic_name for one in self._inputs)
+            return sorted(entry.name for entry in self._inputs)
 
     def lost(self) -> dict[str, int]:
         """
@@ -95,7 +105,7 @@ class Inputs:
         repeated yet.
         """
         with self._lock:
-            return {one.subscription.topic_name: one.lost for one in self._inputs}
+            return {entry.name: entry.lost for entry in self._inputs}
 
     def incompatible(self) -> list[str]:
         """
@@ -104,32 +114,47 @@ class Inputs:
         Topics have their names on the graph, after remapping.
         """
         with self._lock:
-            return [text for one in self._inputs for text in self._check(one)]
+            return [text for entry in self._inputs for text in self._check(entry)]
 
-    def _check(self, one: _Input) -> list[str]:
-        name = one.subscription.topic_name
-        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
-        refused = [qos for qos in offers if _mismatch(qos, one.qos)]
-        lower = with_reliability(one.qos, ReliabilityPolicy.BEST_EFFORT)
-        if one.adapts and not all(_mismatch(qos, lower) for qos in refused):
-            one.qos = lower
-            self._node.destroy_subscription(one.subscription)
-            self._subscribe(one)
+    def _check(self, entry: _Input) -> list[str]:
+        name, publishers = entry.name, self._node.get_publishers_info_by_topic(entry.name)
+        received = _type_name(kind := _kind_of(entry, publishers))
+        if kind is not entry.kind:
+            # Subscribed at the next look: a participant of DDS has one type for a topic, and the
+            # executor may still use the subscription of the other.
+            self._node.destroy_subscription(entry.subscription)
+            entry.kind, entry.subscription = kind, None
+            self._node.get_logger().info(f'{name}: received as {received}, as sent')
+            return []
+        if entry.subscription is None:
+            with contextlib.suppress(RuntimeError):  # still in use: at the look after this
+                self._subscribe(entry)
+        offers = [info.qos_profile for info in publishers if info.topic_type == received]
+        others = sorted({info.topic_type for info in publishers} - {received})
+        refused = [qos for qos in offers if _mismatch(qos, entry.qos)]
+        lower = with_reliability(entry.qos, ReliabilityPolicy.BEST_EFFORT)
+        if entry.adapts and not all(_mismatch(qos, lower) for qos in refused):
+            entry.qos = lower
+            self._node.destroy_subscription(entry.subscription)
+            self._subscribe(entry)
             self._node.get_logger().info(f'{name}: received as best effort, as offered')
             refused = [qos for qos in refused if _mismatch(qos, lower)]
-        return [f'{name}: {_mismatch(qos, one.qos)}' for qos in refused]
+        return [
+            *(f'{name}: a publisher sends {other}, not {received}' for other in others),
+            *(f'{name}: {_mismatch(qos, entry.qos)}' for qos in refused),
+        ]
 
-    def _subscribe(self, one: _Input) -> None:
+    def _subscribe(self, entry: _Input) -> None:
         def count(event: Any) -> None:
-            one.lost += event.total_count_change
+            entry.lost += event.total_count_change
 
-        one.subscription = self._node.create_subscription(
-            one.kind,
-            one.topic,
-            one.callback,
-            one.qos,
-            callback_group=one.group,
-            qos_overriding_options=one.override,
+        entry.subscription = self._node.create_subscription(
+            entry.kind,
+            entry.topic,
+            entry.callback,
+            entry.qos,
+            callback_group=entry.group,
+            qos_overriding_options=entry.override,
             # rclpy's own event callback warns of the name before remapping.
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda _event: None, message_lost=count
@@ -137,15 +162,27 @@ class Inputs:
         )
 
 
-def _reliability_override(node: Node, topic: str) -> QoSOverridingOptions | None:
+def _kind_of(entry: _Input, publishers: Sequence[Any]) -> Any:
+    """The first type of message of an input that a publisher shows; the present one if none."""
+    shown = {info.topic_type for info in publishers}
+    return next(
+        (kind for kind in entry.kinds if _type_name(kind) in shown), entry.kind or entry.kinds[0]
+    )
+
+
+def _type_name(kind: Any) -> str:
+    return f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+
+
+def _reliability_override(node: Node, name: str) -> QoSOverridingOptions | None:
     """
-    Options that apply the user's override of the reliability of a subscription.
+    Options that apply the user's override of the reliability of the subscription of a topic.
 
     Without an override nothing is declared.  Otherwise rclpy would mistake the default for the
     user's choice when an adaptive subscription is created again.
     """
-    name = f'qos_overrides.{node.resolve_topic_name(topic)}.subscription.reliability'
-    given = name in getattr(node, '_parameter_overrides', {})  # rclpy has no public access to it
+    option = f'qos_overrides.{name}.subscription.reliability'
+    given = option in getattr(node, '_parameter_overrides', {})  # rclpy has no public access to it
     return QoSOverridingOptions([QoSPolicyKind.RELIABILITY]) if given else None
 
 

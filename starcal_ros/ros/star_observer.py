@@ -55,13 +55,8 @@ from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WAR
 from starcal_ros.sky.attitude import attitude_sample
 
 NAME = 'star_observer'
-# Values of the option `attitude_message`.
-_ATTITUDE_MESSAGES = {
-    'quaternion': QuaternionStamped,
-    'pose': PoseStamped,
-    'transform': TransformStamped,
-    'imu': Imu,
-}
+_ATTITUDES = (QuaternionStamped, PoseStamped, TransformStamped, Imu)
+_IMAGES = 20  # that wait with their pixels: 200 MB of 5 megapixels and 16 bit
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
 _STAMP_NS = operator.itemgetter(0)
@@ -106,7 +101,7 @@ class StarObserver(StarcalNode):
         )
         self._camera_info = None
         self._camera_infos = self.create_lifecycle_publisher(
-            CameraInfo, 'image_camera_info', QoSProfile(depth=self._own.image_queue)
+            CameraInfo, 'image_camera_info', QoSProfile(depth=_IMAGES)
         )
         self._publishers_made = [self._observations, self._annotated, self._camera_infos]
 
@@ -135,30 +130,23 @@ class StarObserver(StarcalNode):
         )
         self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
-            self._own.image_queue, self._own.attitude_timeout_s, self._star_trackers.has_come
+            _IMAGES, self._own.attitude_timeout_s, self._star_trackers.has_come
         )
         self._worker = threading.Thread(target=self._measure_all, name='measure')
         self._worker.start()
-        attitude_message = _ATTITUDE_MESSAGES[self._setup.attitude.attitude_message]
-        images = QoSProfile(depth=self._own.image_queue)
-        for kind, topic, callback, qos, adapts in (
-            (CalibrationMessage, 'calibration', self._on_calibration, LATCHED, False),
-            (TwistStamped, 'velocity', self._on_velocity, _SAMPLES, True),
-            (Temperature, 'temperature', self._on_temperature, _SAMPLES, True),
-            (attitude_message, 'attitude', self._on_attitude, _SAMPLES, True),
-            (*self._image_input(), self._on_image, images, True),
+        images = QoSProfile(depth=_IMAGES)
+        for kinds, topic, callback, qos, adapts in (
+            ((CalibrationMessage,), 'calibration', self._on_calibration, LATCHED, False),
+            ((TwistStamped,), 'velocity', self._on_velocity, _SAMPLES, True),
+            ((Temperature,), 'temperature', self._on_temperature, _SAMPLES, True),
+            (_ATTITUDES, 'attitude', self._on_attitude, _SAMPLES, True),
+            ((ImageMessage, CompressedImage), 'image', self._on_image, images, True),
         ):
-            self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
+            self.inputs.add(kinds, topic, self.taking(callback), qos, adapts=adapts)
         for which, mounting in enumerate(self._setup.mountings, 1):
             callback = functools.partial(self._add_attitude, which)
             topic = f'{mounting.frame}/attitude'
-            self.inputs.add(attitude_message, topic, self.taking(callback), _SAMPLES, adapts=True)
-
-    def _image_input(self) -> tuple[Any, str]:
-        if self._own.image_transport == 'raw':
-            return ImageMessage, 'image'
-        # Name as in image_transport, so that a remap of `image` applies.
-        return CompressedImage, self.resolve_topic_name('image') + '/compressed'
+            self.inputs.add(_ATTITUDES, topic, self.taking(callback), _SAMPLES, adapts=True)
 
     def deactivate(self) -> None:
         """Close the inputs and drop the images in the queue."""
@@ -180,7 +168,6 @@ class StarObserver(StarcalNode):
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
         why = self._unmatched.diagnosis
-        image_topic = self.resolve_topic_name(self._image_input()[1])
         counts = dict(self._counts)  # the worker thread continues counting
         unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
         not_used = [f'{name or first}: {one.images}' for name, one in unfit.items()]
@@ -188,7 +175,7 @@ class StarObserver(StarcalNode):
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
             'images_waiting': len(self._queue),
-            'images_lost': self.inputs.lost().get(image_topic, 0),
+            'images_lost': self.inputs.lost().get(self.resolve_topic_name('image'), 0),
             'image_rate_hz': _short(self._image_arrivals.rate_hz()),
             'latency_median_s': _short(self._latency_s.median()),
             'latency_worst_s': _short(self._latency_s.largest()),
@@ -221,7 +208,7 @@ class StarObserver(StarcalNode):
         """Return the image and attitude topics that sent nothing yet."""
         further = zip(self._setup.mountings, self._star_trackers.histories[1:], strict=True)
         taken = {
-            self._image_input()[1]: self.taken(self._on_image),
+            'image': self.taken(self._on_image),
             'attitude': self.taken(self._on_attitude),
             **{f'{mounting.frame}/attitude': len(history) for mounting, history in further},
         }
@@ -325,7 +312,7 @@ class StarObserver(StarcalNode):
 
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:
-            detail = f'{self._own.image_queue} images were in the queue'
+            detail = f'{_IMAGES} images were in the queue'
             self._publish(self._refused(waiting, 'overrun', detail))
             return
         offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera

@@ -54,13 +54,6 @@ class AttitudeOptions:
         'prior orientation of the camera in the frame of each additional star tracker, one'
         ' quaternion (x, y, z, w) after another',
     )
-    attitude_message: str = option(
-        'quaternion',
-        'message type of the attitudes; quaternion: geometry_msgs/QuaternionStamped, pose:'
-        ' geometry_msgs/PoseStamped, transform: geometry_msgs/TransformStamped, imu: the'
-        ' orientation in sensor_msgs/Imu',
-        choices=('quaternion', 'pose', 'transform', 'imu'),
-    )
 
 
 def attitude_sample(

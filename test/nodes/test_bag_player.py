@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 import threading
 from typing import Any, TYPE_CHECKING
@@ -33,25 +34,29 @@ from starcal_ros.ros import bag_player
 
 pytestmark = pytest.mark.nodes
 
+IMAGES = 30
+
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     zero = make_message('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0)
     messages: list[tuple[int, str, str, Any]] = []
-    for time_ns, xyzw in attitudes():
+    first_ns, last_ns = attitudes()[0][0], attitudes()[-1][0]
+    shifts_ns = [turn * (last_ns - first_ns + 10**9) for turn in range(IMAGES // len(images()))]
+    for time_ns, xyzw in ((ns + shift_ns, q) for shift_ns in shifts_ns for ns, q in attitudes()):
         rotation = quaternion_to_message(xyzw, make_message)
         pose = make_message('geometry_msgs/msg/Pose', position=zero, orientation=rotation)
         header = make_header(time_ns, 'icrf', make_message)
         message = make_message(POSE_TYPE, header=header, pose=pose)
         messages.append((time_ns, '/attitude', POSE_TYPE, message))
-    for image in images():
+    for shift_ns, image in itertools.product(shifts_ns, images()):
         message = make_message(
             COMPRESSED_TYPE,
-            header=make_header(image.time_ns, 'camera', make_message),
+            header=make_header(image.time_ns + shift_ns, 'camera', make_message),
             format='mono16; png compressed',
             data=cv2.imencode('.png', image.pixels)[1].reshape(-1),
         )
-        messages.append((image.time_ns, '/image/compressed', COMPRESSED_TYPE, message))
+        messages.append((image.time_ns + shift_ns, '/image/compressed', COMPRESSED_TYPE, message))
     with BagWriter(tmp_path / 'bag') as writer:
         for time_ns, topic, kind, message in sorted(messages, key=lambda one: one[0]):
             writer.write(topic, kind, time_ns, message)
@@ -61,16 +66,15 @@ def bag(tmp_path: Path) -> Path:
 def test_compressed_images_are_paced(
     client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
 ) -> None:
-    """A queue of two overflows where they are not."""
+    """A queue of twenty overflows where they are not."""
     found: list[Any] = client.collect(StarObservations, 'observations')
-    options = ('image_transport:=compressed', 'attitude_message:=pose', 'image_queue:=2')
-    given = [part for one in (*options, 'attitude_timeout_s:=60.0') for part in ('-p', one)]
+    given = ('-p', 'attitude_timeout_s:=60.0', '-r', 'image:=image/compressed')
     start_node('star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *given))
     client.until_listened()
     patient = ('-p', 'wait_for_subscribers_s:=100.0', '-p', 'images_in_flight:=2')
     player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0', *patient))
     assert player.wait(120.0) == 0, player.said()
-    client.until(lambda: len(found) == len(images()))
+    client.until(lambda: len(found) == IMAGES)
     assert [one.refusal for one in found] == [''] * len(found)
     assert 'playing anyway' not in player.said()
 

@@ -21,7 +21,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped, TwistStamped
+from geometry_msgs.msg import QuaternionStamped, Twist, TwistStamped
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
@@ -266,8 +266,13 @@ def test_a_publisher_that_is_not_received_is_named(
     assert newest(diagnostics, 'star_observer')[0] == b'\x01'
     assert refused in observer.said()
     client.node.destroy_publisher(image)
-    client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
+    latched = client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
     refused = '/calibration: Volatile publisher and transient local subscription'
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
+    client.node.destroy_publisher(latched)
+    client.node.create_publisher(Twist, '/spacecraft/velocity', 10)
+    refused = '/spacecraft/velocity: a publisher sends geometry_msgs/msg/Twist, not '
+    refused += 'geometry_msgs/msg/TwistStamped'
     client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
 
 

@@ -99,7 +99,6 @@ def test_the_policies_name_what_the_nodes_have(
 @pytest.mark.parametrize(
     ('node', 'option', 'name'),
     [
-        ('star_observer', 'image_transport', 'image/compressed'),
         ('star_observer', 'more_star_trackers', 'FRAME/attitude'),
         ('star_observer', 'use_sim_time', '/clock'),
         ('calibrator', 'set_camera_info_service', 'that service'),

@@ -314,11 +314,11 @@ def test_every_image_gets_one_answer(
     assert diagnostics[0].status[0].level == b'\x01'
 
 
-def test_attitudes_of_an_imu_are_taken_by_parameter(
+def test_attitudes_of_an_imu_are_taken_by_their_type(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
     """The orientations of an Imu serve as the quaternions do."""
-    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_message:=imu'))
+    start_node('star_observer', ros=parameters(tiny_bag))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, 'image', 50)
     attitudes = client.publisher(Imu, 'attitude', 200)
@@ -400,14 +400,15 @@ def test_observations_carry_rate_and_velocity_sigma(
 
 
 def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A PNG on image/compressed gives the same observations as the raw image, also remapped."""
+    """A topic of PNG gives the same observations as that of the raw image."""
     # A small message waits behind a large one of its participant, under load longer than 10 s.
     patient = 'attitude_timeout_s:=60.0'
     raw_observer = start_node('star_observer', ros=(*parameters(tiny_bag, patient), *REMAPS))
     start_node(
         'star_observer',
         ros=(
-            *(*parameters(tiny_bag, patient, 'image_transport:=compressed'), *REMAPS),
+            *(*parameters(tiny_bag, patient), '-r', 'image:=/opnav/image_raw/compressed'),
+            *('-r', 'attitude:=/star_tracker/attitude'),
             *('-r', 'observations:=of_png', '-r', '__node:=png_observer'),
         ),
     )
@@ -438,22 +439,20 @@ def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path
 
 def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
     """With more images than the queue holds, each is answered, the surplus with overrun."""
-    start_node(
-        'star_observer', ros=parameters(tiny_bag, 'image_queue:=5', 'attitude_timeout_s:=60.0')
-    )
+    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=60.0'))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     images = client.publisher(Image, 'image', 50)
     attitudes = client.publisher(QuaternionStamped, 'attitude')
     client.until_listened()
-    for first, end in ((1, 5), (6, 8), (9, 11)):
+    for first, end in ((1, 20), (21, 30), (31, 40)):
         for k in range(first, end + 1):
             images.publish(blank(k))
-        # DDS itself keeps no more than five: these are taken before the next are sent.
+        # DDS itself keeps no more than twenty: these are taken before the next are sent.
         client.until(functools.partial(is_waiting, diagnostics, end))
     attitudes.publish(attitude(100_000_000_000))
-    client.until(lambda: len(answers) == 11)
-    assert [a.refusal for a in answers] == ['wrong_size'] * 5 + ['overrun'] * 6
+    client.until(lambda: len(answers) == 40)
+    assert [a.refusal for a in answers] == ['wrong_size'] * 20 + ['overrun'] * 20
 
 
 def is_waiting(diagnostics: list[Any], images: int) -> bool:
@@ -704,12 +703,12 @@ def test_parameters_while_running(client: Client, start_node: StartNode, tiny_ba
     described = client.call(
         DescribeParameters,
         '/star_observer/describe_parameters',
-        names=['max_attitude_gap_s', 'attitude_direction', 'image_queue'],
+        names=['max_attitude_gap_s', 'attitude_direction', 'max_images'],
     )
-    gap, direction, queue = described.descriptors
+    gap, direction, images = described.descriptors
     assert gap.floating_point_range[0].from_value == 0.0
     assert 'inertial_to_st' in direction.description
-    assert queue.integer_range[0].to_value == 1000
+    assert images.integer_range[0].to_value == 100_000
     client.until(lambda: state_of(client) == 'active')
     assert 'in use' in set_gap(client, 1.0)
     assert change_state(client, Transition.TRANSITION_DEACTIVATE)

@@ -24,6 +24,7 @@ SUBJECTS = {  # tests of several modules together
         'nodes',
         'object_store',
         'observer_threads',
+        'onboard_alone',
         'set_up_mistakes',
         'star_trackers',
     ),

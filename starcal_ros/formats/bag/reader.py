@@ -70,7 +70,7 @@ _OF_IMAGES = (
 )
 # Topics of other types may be unknown to the converter, which then stops.
 _CONVERTED = frozenset(
-    [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES.values(), VELOCITY_TYPE, TEMPERATURE_TYPE]
+    [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES, VELOCITY_TYPE, TEMPERATURE_TYPE]
 )
 _LONGEST_NAME = 4096  # Linux has no longer path
 

@@ -53,13 +53,8 @@ OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
 CALIBRATION_TYPE = 'starcal/msg/Calibration'
 STATUS_TYPE = 'starcal/msg/EnsembleStatus'
 
-ATTITUDE_TYPES = {
-    'quaternion': ATTITUDE_TYPE,
-    'pose': POSE_TYPE,
-    'transform': ALIGNMENT_TYPE,
-    'imu': IMU_TYPE,
-}
-"""Values of the option `attitude_message`, and the type of message of each."""
+ATTITUDE_TYPES = (ATTITUDE_TYPE, POSE_TYPE, ALIGNMENT_TYPE, IMU_TYPE)
+"""Types of message that may hold attitudes; the first is for nothing else."""
 
 Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
 T = TypeVar('T')

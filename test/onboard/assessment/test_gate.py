@@ -16,6 +16,7 @@ from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.gate import GateOptions, judge, reasons_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.temperature import camera_at
 from starcal_ros.options import names_of
 from starcal_ros.records import (
     Calibration,
@@ -25,6 +26,7 @@ from starcal_ros.records import (
     GateCheck,
     HeldTerm,
     ResidualBin,
+    TemperatureTerms,
 )
 
 CAMERA = CameraModel(
@@ -311,6 +313,21 @@ def test_an_active_calibration_of_another_lens_model_is_compared_too() -> None:
         'max_change_px'
     ]
     assert check.found == pytest.approx(3.916, rel=0.05)
+
+
+def test_a_change_is_that_at_one_temperature() -> None:
+    """A focal length that grows with temperature has not changed between two references."""
+    terms = TemperatureTerms(20.0, (1e-3,), (1e-5,), (1e-5, 2e-5, 0.0), (1e-6,) * 3)
+    active = dataclasses.replace(GOOD, temperature=terms)
+    warm = dataclasses.replace(
+        GOOD,
+        geometry=camera_at(active, 50.0),
+        temperature=dataclasses.replace(terms, reference_degc=50.0),
+    )
+    change = checks(warm, GateOptions(), active)
+    assert change['max_change_px'].found < 1e-6 and change['max_rotation_deg'].found < 1e-6
+    # Without terms it has: the limits see it.
+    assert 'max_change_px' in limits_in(reasons(warm, GateOptions(), GOOD))
 
 
 def test_a_calibration_without_maps_cannot_be_judged() -> None:

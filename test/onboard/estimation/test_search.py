@@ -77,7 +77,7 @@ def warm() -> Ensemble:
                 # fx, skew and fy together scale the image about the principal point.
                 measured_px=centre_px + factor * (image.measured_px - centre_px),
                 icrf_from_star_tracker_xyzw=reported.as_quat(),
-                temperature_degc=EIGHT.reference_temperature_degc + dT,
+                temperature_degc=20.0 + dT,
             )
         )
     return Ensemble(tuple(images))
@@ -126,7 +126,7 @@ def numerical(given: Ensemble, minimum: Minimum) -> Residuals:
         out = []
         for k, image in enumerate(given.images):
             own, alignment = parameters.copy(), at_reference
-            dT = image.temperature_degc - EIGHT.reference_temperature_degc
+            dT = image.temperature_degc - 20.0
             if q:
                 own[:3] *= 1.0 + focal @ [dT, dT * dT][:q]
             if axes:

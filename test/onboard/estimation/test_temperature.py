@@ -39,7 +39,7 @@ TRACKER_ARCSEC = (10.0, 10.0, 40.0)
 FREE = [
     PARAMETER_NAMES.index(name) for name in estimated_parameters(CalibrationOptions(), 'plumb_bob')
 ]
-REFERENCE_DEGC = 15.0
+REFERENCE_DEGC = 10.0
 TEMPERATURES_DEGC = np.array([-20.0, 12.0, -5.0, 31.0, 3.0, 40.0, -14.0, 22.0, 9.0, 35.0])
 # A lens of a few 10^-5 per degree (0.4 px at the edge over 60 degrees), and a mount that turns by
 # arcseconds per degree.
@@ -109,7 +109,6 @@ def options(method: str = 'hierarchical', order: int = 2, **other: object) -> Ca
         'velocity_sigma_m_s': 10.0,
         'focal_temperature_order': order,
         'alignment_temperature': method != 'per_image',
-        'reference_temperature_degc': REFERENCE_DEGC,
         **other,
     }
     return CalibrationOptions(method=method, **values)  # type: ignore[arg-type]
@@ -129,6 +128,29 @@ def error_of(estimate: Estimate) -> np.ndarray:
     )
     parameters = estimate.geometry.camera.parameters - TRUTH.camera.parameters
     return np.asarray(np.r_[parameters, -(one.inv() * true).as_rotvec()])
+
+
+@pytest.mark.parametrize(
+    ('temperatures_degc', 'expected'),
+    [
+        (TEMPERATURES_DEGC, 10.0),
+        (np.array([-18.0, -12.0, np.nan]), -20.0),
+        (np.full(3, 4.9), 0.0),
+        (np.array([5.1]), 10.0),
+        (np.full(2, np.nan), 0.0),  # no term is estimated then
+    ],
+)
+def test_the_reference_is_the_multiple_of_ten_nearest_the_mean(
+    temperatures_degc: np.ndarray, expected: float
+) -> None:
+    images = observed((), np.zeros(3)).images
+    ensemble = Ensemble(
+        tuple(
+            dataclasses.replace(image, temperature_degc=float(degc))
+            for image, degc in zip(images, temperatures_degc, strict=False)
+        )
+    )
+    assert temperature.reference_degc(ensemble) == expected
 
 
 @pytest.mark.parametrize('focal', [(), (3e-5,), (3e-5, -2e-7)])

@@ -121,7 +121,7 @@ def test_a_wrong_one_is_tried_seldom_and_costs_no_image(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('which', 'says'),
     [
-        ('other', '/other/attitude: no such topic of type geometry_msgs/msg/QuaternionStamped;'),
+        ('other', '/other/attitude: no such topic of attitudes;'),
         ('first', 'the first star tracker, star_tracker, is left out'),
     ],
 )

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Attitudes of other types in a bag, and colour images: chosen by the options."""
+"""Attitudes of other types in a bag, and colour images."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPES,
+    ALIGNMENT_TYPE,
+    ATTITUDE_TYPE,
     IMAGE_TYPE,
+    IMU_TYPE,
     make_header,
+    POSE_TYPE,
     quaternion_to_message,
     vector_to_message,
 )
@@ -38,7 +41,7 @@ def bag(tmp_path: Path) -> Path:
     with BagWriter(tmp_path / 'bag') as writer:
         for time_ns, xyzw in attitudes():
             message = make_message(
-                ATTITUDE_TYPES['transform'],
+                ALIGNMENT_TYPE,
                 header=make_header(time_ns, 'icrf', make_message),
                 child_frame_id='st',
                 transform=make_message(
@@ -47,7 +50,7 @@ def bag(tmp_path: Path) -> Path:
                     rotation=quaternion_to_message(xyzw, make_message),
                 ),
             )
-            writer.write('/attitude', ATTITUDE_TYPES['transform'], time_ns, message)
+            writer.write('/attitude', ALIGNMENT_TYPE, time_ns, message)
         for image in images()[:2]:
             height, width = image.pixels.shape
             grey = image.pixels >> 4 if image.pixels.dtype == np.uint16 else image.pixels
@@ -68,7 +71,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def test_stars_are_found_in_the_channel_and_with_the_transforms(bag: Path) -> None:
-    setup = setup_with(attitude_message='transform', image_channel='green')
+    setup = setup_with(image_channel='green')
     chosen = topics.choose_topics([bag], Topics(), setup)
     assert chosen.attitude == '/attitude'
     records = list(topics.read([bag], chosen, setup))
@@ -77,18 +80,66 @@ def test_stars_are_found_in_the_channel_and_with_the_transforms(bag: Path) -> No
     assert min(len(record) for record in records) > 10
 
 
-@pytest.mark.parametrize('asked', ['', 'attitude'])
-def test_a_bag_of_transforms_has_no_attitudes_by_default(bag: Path, asked: str) -> None:
+SEVERAL = 'several topics may hold the attitudes: '
+NOT_READ = (
+    'no topic of type .*QuaternionStamped.*; /a is a PoseWithCovarianceStamped, which is not read'
+    ': publish its orientation as a QuaternionStamped or PoseStamped; starcal calibrate'
+    ' --camera-alone'
+)
+
+
+def with_topics(folder: Path, kinds: dict[str, str]) -> list[Path]:
+    """A bag of an image and of topics with a message each, which nobody decodes."""
+    with BagWriter(folder) as writer:
+        writer.write_image('/image', images()[0], 'camera')
+        for name, kind in kinds.items():
+            channel, _ = writer.messages._open(name, kind)
+            writer.messages._writer.add_message(channel, 1, b'', publish_time=1)
+    return [folder]
+
+
+@pytest.mark.parametrize(
+    ('kinds', 'asked', 'chosen'),
+    [
+        ({'/a': ALIGNMENT_TYPE}, '', '/a'),
+        ({'/a': ALIGNMENT_TYPE}, 'a', '/a'),
+        ({'/a': IMU_TYPE, '/b': ATTITUDE_TYPE, '/c': POSE_TYPE}, '', '/b'),
+        ({'/a': IMU_TYPE, '/b': ATTITUDE_TYPE}, 'a', '/a'),
+    ],
+)
+def test_the_topic_of_the_attitudes_follows_from_the_types(
+    tmp_path: Path, kinds: dict[str, str], asked: str, chosen: str
+) -> None:
     """Without a setup too, as for `starcal inspect`."""
+    bags = with_topics(tmp_path / 'bag', kinds)
     for setup in (setup_with(), None):
-        with pytest.raises(BagError, match='no topic.*QuaternionStamped') as caught:
-            topics.choose_topics([bag], Topics(attitude=asked), setup)
-        remedy = '/attitude is a TransformStamped: if it holds the attitudes, set attitude_message'
-        assert f'{remedy}: transform' in str(caught.value)
+        assert topics.choose_topics(bags, Topics(attitude=asked), setup).attitude == chosen
+
+
+@pytest.mark.parametrize(
+    ('kinds', 'asked', 'said'),
+    [
+        (
+            {'/a': IMU_TYPE, '/b': POSE_TYPE},
+            '',
+            rf'{SEVERAL}/a \(Imu\), /b \(PoseStamped\); choose',
+        ),
+        ({'/a': ATTITUDE_TYPE, '/b': ATTITUDE_TYPE}, '', 'choose one with --attitude-topic$'),
+        ({'/a': ATTITUDE_TYPE}, 'b', r'no topic b of type .*Stamped \(available: /a\)'),
+        ({'/a': 'geometry_msgs/msg/PoseWithCovarianceStamped'}, '', NOT_READ),
+    ],
+)
+def test_attitudes_that_are_not_chosen_are_named(
+    tmp_path: Path, kinds: dict[str, str], asked: str, said: str
+) -> None:
+    bags = with_topics(tmp_path / 'bag', kinds)
+    for setup in (setup_with(), None):
+        with pytest.raises(BagError, match=said):
+            topics.choose_topics(bags, Topics(attitude=asked), setup)
 
 
 def test_without_a_channel_the_refusal_names_the_option(bag: Path) -> None:
-    setup = setup_with(attitude_message='transform')
+    setup = setup_with()
     records = list(topics.read([bag], topics.choose_topics([bag], Topics(), setup), setup))
     assert {record.refusal for record in records} == {'bad_encoding'}
     assert 'image_channel' in records[0].detail

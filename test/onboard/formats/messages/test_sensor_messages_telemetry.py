@@ -16,8 +16,12 @@ from starcal_ground.bag_writer import (
 )
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
+    ALIGNMENT_TYPE,
+    ATTITUDE_TYPE,
     ATTITUDE_TYPES,
+    IMU_TYPE,
     make_header,
+    POSE_TYPE,
     quaternion_to_message,
     vector_to_message,
 )
@@ -64,13 +68,13 @@ def test_temperature_round_trip(make: Any) -> None:
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
-@pytest.mark.parametrize('kind', list(ATTITUDE_TYPES))
+@pytest.mark.parametrize('kind', ATTITUDE_TYPES)
 def test_attitudes_of_each_type_are_read(make: Any, kind: str) -> None:
     message = attitude_message(kind, make)
     time_ns, xyzw = attitude_from_message(message)
     assert time_ns == 5
     np.testing.assert_array_equal(xyzw, XYZW)
-    if kind == 'imu':
+    if kind == IMU_TYPE:
         message.orientation_covariance[0] = -1.0  # sensor_msgs/Imu: orientation not known
         assert np.isnan(attitude_from_message(message)[1]).all()
 
@@ -83,13 +87,13 @@ def attitude_message(kind: str, make: Any) -> Any:
     rotation = quaternion_to_message(XYZW, make)
     zero = vector_to_message(np.zeros(3), make)
     fields: dict[str, Any] = {'header': make_header(5, 'icrf', make)}
-    if kind == 'quaternion':
+    if kind == ATTITUDE_TYPE:
         fields['quaternion'] = rotation
-    elif kind == 'pose':
+    elif kind == POSE_TYPE:
         point = make('geometry_msgs/msg/Point', x=1.0, y=2.0, z=3.0)
         pose = make('geometry_msgs/msg/Pose', position=point, orientation=rotation)
         fields['pose'] = pose
-    elif kind == 'transform':
+    elif kind == ALIGNMENT_TYPE:
         transform = make('geometry_msgs/msg/Transform', translation=zero, rotation=rotation)
         fields |= {'child_frame_id': 'st', 'transform': transform}
     else:
@@ -101,7 +105,7 @@ def attitude_message(kind: str, make: Any) -> Any:
             'linear_acceleration': zero,
             'linear_acceleration_covariance': np.zeros(9),
         }
-    return make(ATTITUDE_TYPES[kind], **fields)
+    return make(kind, **fields)
 
 
 def test_the_last_sample_at_or_before_an_image_counts() -> None:

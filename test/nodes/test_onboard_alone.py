@@ -1,0 +1,135 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The onboard package alone: nodes and a calibration where nothing else can be imported.
+
+Processes import the standard library, ROS, starcal_ros, and the closure of `ONBOARD` alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import metadata
+import json
+from pathlib import Path
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from ament_index_python.packages import get_packages_with_prefixes
+from packaging.requirements import Requirement
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration, EnsembleStatus
+from starcal_ros.formats.messages.record_messages import calibration_from_message
+
+pytestmark = [pytest.mark.nodes, pytest.mark.usefixtures('onboard')]
+
+ROOT = Path(__file__).parents[2]
+# mcap and rosbags read bags and the state folder; a node without state_dir needs neither.
+ONBOARD = ('numpy', 'scipy', 'opencv-python-headless', 'pyerfa', 'PyYAML', 'mcap', 'rosbags')
+ON_THE_GROUND = (
+    *('starcal_ground', 'studies', 'bench', 'tools'),
+    *('PIL', 'argcomplete', 'astropy', 'contourpy', 'dask', 'jinja2', 'rich', 'threadpoolctl'),
+)
+# Python runs it before anything else.
+SITECUSTOMIZE = """
+import sys
+
+class Onboard:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition('.')[0]
+        is_of_python = top in sys.stdlib_module_names or top.startswith('_sysconfigdata')
+        if not is_of_python and top not in {allowed}:
+            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name)
+
+sys.meta_path.insert(0, Onboard())
+"""
+IMPORTED = """
+import importlib, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        print(error.name)
+"""
+CALIBRATED = """
+import json, sys
+import starcal_ros
+found = starcal_ros.calibrate_bag(sys.argv[1], sys.argv[2])
+print(json.dumps([found.accepted, found.images_used, found.geometry.camera.parameters.tolist()]))
+"""
+
+
+def closure(names: tuple[str, ...]) -> Iterator[metadata.Distribution]:
+    """Distributions and those that they need, directly or not."""
+    waiting, known = list(names), set(names)
+    while waiting:
+        distribution = metadata.distribution(waiting.pop())
+        yield distribution
+        for requirement in map(Requirement, distribution.requires or ()):
+            is_needed = not requirement.marker or requirement.marker.evaluate({'extra': ''})
+            if is_needed and requirement.name not in known:
+                known.add(requirement.name)
+                waiting.append(requirement.name)
+
+
+@pytest.fixture
+def onboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The processes that a test starts import nothing that does not fly."""
+    tops = {
+        Path(file.parts[0]).name.partition('.')[0]
+        for distribution in closure(ONBOARD)
+        for file in distribution.files or ()
+    }
+    allowed = sorted({*tops, *get_packages_with_prefixes(), 'starcal_ros', 'sitecustomize'})
+    assert not {*ON_THE_GROUND} & {*allowed}
+    (tmp_path / 'sitecustomize.py').write_text(SITECUSTOMIZE.format(allowed=allowed))
+    monkeypatch.setenv('PYTHONPATH', f'{tmp_path}:{ROOT}')
+
+
+def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, text=True, check=False
+    )
+
+
+def test_what_stays_on_the_ground_cannot_be_imported() -> None:
+    done = run('-c', IMPORTED, *ON_THE_GROUND)
+    assert (done.returncode, done.stdout.split()) == (0, [*ON_THE_GROUND])
+
+
+def test_nodes_and_interface_calibrate_a_bag(
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+) -> None:
+    """The same calibration from the messages of a player and from the bag; with a state folder."""
+    values = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', f'state_dir:={tmp_path}/kept')
+    remaps = [
+        *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
+        *('-r', 'velocity:=/spacecraft/velocity'),
+    ]
+    for name in ('star_observer', 'calibrator'):
+        start_node(name, ros=(*values, *remaps))
+    client.until_listened()
+    player = start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
+    assert player.wait(120.0) == 0, player.said()
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images_saved == 10)
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert answer.success, answer.message
+    published = client.latched(Calibration, 'calibration')
+    client.until(lambda: published)
+    done = run('-c', CALIBRATED, tiny_bag, tiny_bag / 'params.yaml')
+    assert (done.returncode, done.stderr) == (0, '')
+    is_accepted, images, parameters = json.loads(done.stdout)
+    assert is_accepted and published[0].accepted
+    assert images == published[0].images_used == 10
+    camera = calibration_from_message(published[0]).geometry.camera
+    assert parameters == camera.parameters.tolist()
