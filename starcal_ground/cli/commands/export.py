@@ -78,14 +78,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = read_calibration(calibration_file(args.calibration))
     names = None
     if args.spacecraft_id is not None:
-        names = SpiceNames(
-            args.spacecraft_id,
-            args.instrument_id,
-            args.star_tracker_id,
-            args.camera_frame,
-            args.star_tracker_frame,
-            args.pixel_size_um,
-        )
+        names = arguments.record_of(SpiceNames, args)
     make_folder(args.output)
     observations: Iterable[StarObservations] = ()
     if args.to == 'ck':

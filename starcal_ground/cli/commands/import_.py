@@ -76,14 +76,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ground.mission.ingest.mission_records import Guard
 
-    options = ImageOptions(
-        time_key=args.time_key,
-        hdu=args.hdu,
-        channel=args.channel,
-        bayer=args.bayer,
-        value_range=None if args.value_range is None else tuple(args.value_range),
-        temperature_key=args.temperature_key,
-    )
+    options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=None)
     needed = 4 * (1 + len(args.more_star_trackers))
     given = len(args.alignment)
     if args.camera and given != needed and (given or args.more_star_trackers):
