@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.from_stars import pinhole
-from starcal_ground.images.image_series import ImageFile
+from starcal_ground.images.photographs import ImageFile
 from starcal_ground.mission.ingest import ccsds, kernels, mission_records
 from starcal_ground.mission.ingest.mission_records import Attitudes, EME2000_NOTE, Velocities
 from starcal_ros.camera import line_of_sight, pixel_grid
