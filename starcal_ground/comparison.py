@@ -189,14 +189,14 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
 def content(comparison: Comparison) -> dict[str, object]:
     """A comparison as a JSON object; a number that is not finite is null."""
 
-    def of_map(found: DifferenceMap) -> dict[str, object]:
+    def of_map(moved: DifferenceMap) -> dict[str, object]:
         names = ('worst_px', 'rms_px', 'worst_sigmas', 'rms_sigmas')
-        numbers = (*found.worst_and_rms_px, *found.worst_and_rms_sigmas)
+        numbers = (*moved.worst_and_rms_px, *moved.worst_and_rms_sigmas)
         lengths = dict(zip(names, numbers, strict=True))
-        return {**lengths, 'difference_px': found.difference_px, 'sigmas': found.sigmas}
+        return {**lengths, 'difference_px': moved.difference_px, 'sigmas': moved.sigmas}
 
     total = comparison.total
-    found = {
+    values = {
         'parameter_names': comparison.a.parameter_names,
         'a': comparison.a.geometry.camera.parameters,
         'b': comparison.b.geometry.camera.parameters,
@@ -213,4 +213,4 @@ def content(comparison: Comparison) -> dict[str, object]:
         'accepted': [comparison.a.accepted, comparison.b.accepted],
         'notes': comparison.notes,
     }
-    return json_object(found)
+    return json_object(values)

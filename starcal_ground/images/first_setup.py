@@ -59,10 +59,10 @@ class FirstSetup:
         """Text of the parameter file, with what is left to state as comments."""
         values = {'camera_info_url': CAMERA_FILE, **self.options}
         options = yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
-        found = ''.join(f'# {line}\n' for line in self.found)
+        findings = ''.join(f'# {line}\n' for line in self.found)
         to_state = ''.join(f'# {line}\n' for line in self.to_state)
         parameters = textwrap.indent(options + to_state, 4 * ' ')
-        return f'{found}/**:\n  ros__parameters:\n{parameters}'
+        return f'{findings}/**:\n  ros__parameters:\n{parameters}'
 
 
 def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
@@ -71,20 +71,20 @@ def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
 
     Raises NotFromStars when the stars give no camera.
     """
-    found, notes = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
+    stars, notes = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
     options = night_sky.site_of(photographs)
     to_state = () if options else (_OF_PLACE,)
-    return FirstSetup(found.camera, options, (found.in_a_sentence(), *notes), to_state)
+    return FirstSetup(stars.camera, options, (stars.in_a_sentence(), *notes), to_state)
 
 
-def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
+def of_bags(bags: Sequence[Path], topics: Topics) -> FirstSetup:
     """
     The camera of a bag, and the alignment and direction of its attitudes where it has any.
 
     Raises NotFromStars when the stars give no camera. Raises BagError when a bag cannot be read,
     or several topics have a type. Raises OptionError when attitudes and images do not agree.
     """
-    topic = choose_image_topic(bags, asked)
+    topic = choose_image_topic(bags, topics)
     camera = night_sky.camera_of_bags(bags, topic, {}, _LOOKED_AT)
     there = {one.type_name for one in reader.topics(bags)}
     words = f'images of {topic}: {camera.in_a_sentence()}'
@@ -92,13 +92,13 @@ def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
     kinds = [kind for kind, type_name in ATTITUDE_TYPES.items() if type_name in there]
     if not kinds:
         return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
-    options, attitudes = _aligned(bags, asked, camera, kinds[0])
+    options, attitudes = _aligned(bags, topics, camera, kinds[0])
     to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
     return FirstSetup(camera.camera, options, (words, attitudes), to_state)
 
 
 def _aligned(
-    bags: Sequence[Path], asked: Topics, camera: FromStars, kind: str
+    bags: Sequence[Path], given: Topics, camera: FromStars, kind: str
 ) -> tuple[dict[str, object], str]:
     """Options of the attitudes in a bag, and a line on them."""
     prior = CameraGeometry(camera.camera, np.array([0.0, 0.0, 0.0, 1.0]))
@@ -106,11 +106,11 @@ def _aligned(
     for direction in _DIRECTIONS:
         options: dict[str, object] = {'attitude_direction': direction, 'attitude_message': kind}
         setup = dataclasses.replace(load_setup(options, prior=prior), is_aligned=False)
-        topics = choose_topics(bags, asked, setup)
-        found = diagnose_bags(bags, asked, setup)
-        alignment, sentence = found_alignment(found)
+        topics = choose_topics(bags, given, setup)
+        diagnosis = diagnose_bags(bags, given, setup)
+        alignment, sentence = found_alignment(diagnosis)
         if alignment is not None:
-            line = f'attitudes of {topics.attitude}: {direction}, {found.images} images agree'
+            line = f'attitudes of {topics.attitude}: {direction}, {diagnosis.images} images agree'
             return {**options, 'prior_alignment': alignment}, line
         said = said or sentence
     raise OptionError(f'{bags[0]}: the attitudes do not fit the images: {said}')

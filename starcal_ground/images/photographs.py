@@ -196,12 +196,12 @@ def _plausible(focal_px: float, of: Photograph) -> float:
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
     """By time, then name; equal stamps, as of copied files, a second apart."""
     ordered = sorted(photographs, key=lambda one: (one.time_ns, one.path.name))
-    found: list[Photograph] = []
+    distinct: list[Photograph] = []
     for one in ordered:
-        if found and one.time_ns <= found[-1].time_ns:
-            one = replace(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
-        found.append(one)
-    return found
+        if distinct and one.time_ns <= distinct[-1].time_ns:
+            one = replace(one, time_ns=distinct[-1].time_ns + _SAME_STAMP_NS)
+        distinct.append(one)
+    return distinct
 
 
 def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:

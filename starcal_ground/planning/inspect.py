@@ -92,7 +92,7 @@ class Inspection:
 
 def inspect(
     paths: Sequence[Path],
-    asked: Topics,
+    given: Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
     camera_alone: bool = False,
@@ -113,21 +113,21 @@ def inspect(
     chosen, seen, by_stars = None, [], False
     try:
         if by_stars := bag_topics.without_attitudes(
-            paths, asked, setup.options() if setup else {}, camera_alone
+            paths, given, setup.options() if setup else {}, camera_alone
         ):
             setup = None
-            chosen = Topics(image=bag_topics.choose_image_topic(paths, asked))
+            chosen = Topics(image=bag_topics.choose_image_topic(paths, given))
         if setup:
             from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
 
-            source = source_of(paths, setup, asked)
+            source = source_of(paths, setup, given)
             chosen, setup, notes = source.topics, source.setup, source.notes
-            found = bag_topics.read(paths, chosen, setup)
-        elif (chosen := chosen or bag_topics.choose_topics(paths, asked)).observations:
-            found = reader.read_observations(paths, chosen.observations)
+            records = bag_topics.read(paths, chosen, setup)
+        elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:
+            records = reader.read_observations(paths, chosen.observations)
         else:
-            found = placed(paths, chosen, options)
-        for observations in found:
+            records = placed(paths, chosen, options)
+        for observations in records:
             seen.append(observations)
             on_image()
     except (BagError, OptionError) as error:
@@ -186,11 +186,11 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
-    found = []
+    contents = []
     for name, type_name in sorted(type_names.items()):
         steps_s = np.diff(sorted(stamps[name])) / NANOSECONDS_PER_SECOND
         middle_s = float(np.median(steps_s)) if steps_s.size else 0.0
-        found.append(
+        contents.append(
             TopicContent(
                 name=name,
                 type_name=type_name,
@@ -204,7 +204,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                 bad=bad[name],
             )
         )
-    return tuple(found)
+    return tuple(contents)
 
 
 def _kind(message: message_fields.Message) -> str:

@@ -230,7 +230,6 @@ def used_images(
     ]
 
 
-_DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are written
 _PRODUCTS = (
     calibration_json.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
@@ -245,15 +244,13 @@ class Found:
     """
     Contents of a folder; ``residuals`` and ``observations`` are None without a file.
 
-    ``pictures`` are in the order of `thumbnails.ordered`, ``files`` the names of the products
-    beside the report.
+    ``pictures`` are in the order of `thumbnails.ordered`.
     """
 
     calibration: Calibration
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
     pictures: tuple[thumbnails.Thumbnail, ...]
-    files: tuple[str, ...] = _PRODUCTS
 
 
 def write_report(folder: Path) -> Path:
@@ -268,7 +265,7 @@ def write_report(folder: Path) -> Path:
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / REPORT_FILE
-    write_atomically(path, with_digests(render(_read_folder(folder), folder), folder))
+    write_atomically(path, render(_read_folder(folder), folder))
     return path
 
 
@@ -287,7 +284,6 @@ def _read_folder(folder: Path) -> Found:
         product_folder.read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER),
-        tuple(name for name in _PRODUCTS if (folder / name).is_file()),
     )
 
 
@@ -295,34 +291,26 @@ def _observations(bag: Path) -> Iterator[StarObservations]:
     return reader.read_observations([bag], reader.choose_topic([bag], OBSERVATIONS_TYPE))
 
 
-def with_digests(text: str, folder: Path) -> str:
-    """The page of a folder with the SHA-256 digests of its products, which must be written."""
-    for name in _PRODUCTS:
-        if (folder / name).is_file():
-            (digest,) = inputs_of([folder / name]).values()
-            text = text.replace(_DIGEST.format(name), digest)
-    return text
-
-
-def render(found: Found, folder: Path) -> str:
+def render(contents: Found, folder: Path) -> str:
     """
-    HTML text of the report of a folder, for `with_digests`.
+    HTML text of the report of a folder, whose products must be written: it has their digests.
 
     Raises ProductError when the contents cannot be drawn.
     """
     try:
-        return page_template('report.html').render(_context(found))
+        return page_template('report.html').render(_context(contents, folder))
     # A file can hold numbers that no calibration has; the errors of drawing have no common base.
     except Exception as error:
         why = f'{type(error).__name__}: {error}'
         raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
 
 
-def _context(found: Found) -> Mapping[str, object]:
-    calibration, residuals, pictures = found.calibration, found.residuals, found.pictures
-    observations = found.observations or ()
+def _context(contents: Found, folder: Path) -> Mapping[str, object]:
+    calibration, residuals, pictures = contents.calibration, contents.residuals, contents.pictures
+    observations = contents.observations or ()
     prior = calibration_json.prior_of(calibration)
     refused = calibration.images_refused
+    products = [name for name in _PRODUCTS if (folder / name).is_file()]
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
@@ -346,7 +334,7 @@ def _context(found: Found) -> Mapping[str, object]:
         'refused_stars': refused_stars(observations, pictures),
         'model_rows': verdict.model_rows(calibration),
         'star_marks': star_marks(observations),
-        'files': [(name, _DIGEST.format(name)) for name in found.files],
+        'files': [(name, *inputs_of([folder / name]).values()) for name in products],
         'has_images': any(not one.reason for one in pictures),
         'used_images': used_images(observations, pictures),
         'options': _options(calibration),

@@ -125,10 +125,10 @@ def _names(paths: Sequence[Path]) -> str:
 
 def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
     """Files of patterns, each once, in order of their names."""
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for pattern in patterns:
         names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
         if not names:
             raise OptionError(f'{option}: no file matches {pattern}')
-        found |= dict.fromkeys(map(Path, names))
-    return list(found)
+        files |= dict.fromkeys(map(Path, names))
+    return list(files)

@@ -163,14 +163,14 @@ def _settings(params: str) -> tuple[tuple[str, ...], str]:
 
 def digest(files: Sequence[str | Path], version: str = '') -> str:
     """Digest of the contents of files, those that do not exist left out; raises OSError."""
-    found = hashlib.sha256(version.encode())
+    sha256 = hashlib.sha256(version.encode())
     for file in files:
         if not os.path.lexists(file):
             continue  # metadata.yaml of a bag, which need not be there
         with untrusted.regular_file(Path(file)) as stream:
             while block := stream.read(1 << 20):
-                found.update(block)
-    return found.hexdigest()
+                sha256.update(block)
+    return sha256.hexdigest()
 
 
 def _task(
@@ -204,7 +204,7 @@ def _task(
 
 def _bags(listed: dict[str, Entry]) -> dict[str, list[Entry]]:
     """Bag folders with a metadata.yaml, and single files elsewhere; no files of an archive."""
-    found: dict[str, list[Entry]] = {}
+    bags: dict[str, list[Entry]] = {}
     for name, entry in listed.items():
         folder, file = posixpath.split(name)
         # One image each: the state of a calibrator, calibrated there.
@@ -212,10 +212,10 @@ def _bags(listed: dict[str, Entry]) -> dict[str, list[Entry]]:
             continue
         metadata = listed.get(posixpath.join(folder, _METADATA))
         if metadata and file != OBSERVATIONS_FILE:
-            found.setdefault(folder, [metadata]).append(entry)
+            bags.setdefault(folder, [metadata]).append(entry)
         else:
-            found[name] = [entry]
-    return found
+            bags[name] = [entry]
+    return bags
 
 
 @dataclass(frozen=True)
@@ -240,10 +240,10 @@ class Cameras:
 
     def of(self, name: str) -> tuple[str, str]:
         """Spacecraft and camera of a path below the root, empty if nothing names them."""
-        found = self._row(name)
+        names = self._row(name)
         if self.pattern and (match := self.pattern.match(name)):
-            found = {**match.groupdict(), **found}
-        return found.get(_KEYS[0], ''), found.get(_KEYS[1], '')
+            names = {**match.groupdict(), **names}
+        return names.get(_KEYS[0], ''), names.get(_KEYS[1], '')
 
     def params_of(self, name: str) -> str:
         """Absolute path of the parameters of a bag; empty if there are none."""
@@ -273,7 +273,7 @@ def _compiled(pattern: str) -> re.Pattern[str]:
     """Expression for the start of a path, up to the segment of the last name."""
     start = pattern[: pattern.rindex('}') + 1] if '}' in pattern else pattern
     start += pattern[len(start) :].partition('/')[0]
-    found, names = '', []
+    expression, names = '', []
     for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
         if other or (name and name not in _KEYS) or name in names:
             raise OptionError(
@@ -281,8 +281,8 @@ def _compiled(pattern: str) -> re.Pattern[str]:
                 ' {camera}'
             )
         names += [name] if name else []
-        found += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
-    return re.compile(f'{found}(?:/|$)')
+        expression += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
+    return re.compile(f'{expression}(?:/|$)')
 
 
 def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
@@ -290,7 +290,7 @@ def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
     rows = csv.DictReader(text.splitlines(), restval='')
     if 'path' not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= {*_COLUMNS}:
         raise OptionError(f'{path}: the first line does not name columns of {", ".join(_COLUMNS)}')
-    found = []
+    cameras = []
     for row in rows:
         if None in row:
             raise OptionError(f'{path}:{rows.line_num}: more values than columns')
@@ -299,8 +299,8 @@ def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
             raise OptionError(f'{path}:{rows.line_num}: no path')
         if 'params' in values:
             values['params'] = os.path.abspath(path.parent / values['params'])
-        found.append(values)
-    return tuple(found)
+        cameras.append(values)
+    return tuple(cameras)
 
 
 @dataclass(frozen=True)
@@ -403,8 +403,8 @@ def _custom_data(metadata: Path) -> dict[str, str]:
     """Texts that the recorder of a bag was given; empty where there are none."""
     try:
         content = untrusted.yaml_value(untrusted.read_text(metadata, untrusted.METADATA_BYTES))
-        found = content['rosbag2_bagfile_information']['custom_data']
-        return {name: value for name, value in found.items() if isinstance(value, str)}
+        texts = content['rosbag2_bagfile_information']['custom_data']
+        return {name: value for name, value in texts.items() if isinstance(value, str)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
 
