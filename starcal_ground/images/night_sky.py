@@ -8,7 +8,7 @@ calibration of these bags is the same as that of any bag.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import itertools
@@ -90,6 +90,29 @@ class NightSky:
         else:
             return one
         return refused_image(one.time_ns, one.width, one.height, reason, detail)
+
+
+def from_images(
+    paths: Sequence[Path],
+    topics: Topics,
+    values: Mapping[str, object],
+    folder: Path,
+    lens: tuple[float, float] = (0.0, 0.0),
+    on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
+) -> tuple[NightSky, list[Path]]:
+    """
+    Set-up of a calibration of photographs or of bags without attitudes, and the files it reads.
+
+    ``lens`` is the focal length (mm) and the pixel size (um) of photographs, 0 where not given.
+    ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
+    the stars give no camera.
+    """
+    photographs = image_paths(paths)
+    if not photographs:
+        return from_bags(paths, topics, values, folder), reader.mcap_files(paths)
+    chosen, notes = photographs_of(photographs, *lens)
+    on_notes(notes)
+    return from_photographs(chosen, values, folder), [one.path for one in chosen]
 
 
 def photographs_of(
@@ -290,13 +313,7 @@ def calibrate_images(
     paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         folder = Path(name)
-        if image_paths(paths):
-            photographs, _ = photographs_of(paths)
-            files = [photograph.path for photograph in photographs]
-            sky = from_photographs(photographs, options, folder)
-        else:
-            files = reader.mcap_files(paths)
-            sky = from_bags(paths, Topics(image=image_topic), options, folder)
+        sky, files = from_images(paths, Topics(image=image_topic), options, folder)
         inputs = inputs_of(files)
         campaign = calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air)
     return campaign.calibration

@@ -174,23 +174,18 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
         )
         stated = _of_tags(path, tags, gps, width, height)
         stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
-    if not (focal_length_mm or pixel_um):
-        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
-    given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
-    if math.isnan(given_px):
-        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
-    if math.isnan(_plausible(given_px, stated)):
+    given_px = math.nan
+    if focal_length_mm or pixel_um:
+        given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
+    focal_px = stated.focal_px if math.isnan(given_px) else given_px
+    if _SHORTEST < focal_px / math.hypot(stated.width, stated.height) < _LONGEST:
+        return replace(stated, focal_px=focal_px)
+    if focal_px == given_px:
         raise IngestError(
             f'{path}: --focal-length-mm and --pixel-size-um give a focal length of {given_px:.3g}'
             f' px for {stated.width} x {stated.height} pixels'
         )
-    return replace(stated, focal_px=given_px)
-
-
-def _plausible(focal_px: float, of: Photograph) -> float:
-    """A focal length, or NaN for one that no camera has."""
-    ratio = focal_px / math.hypot(of.width, of.height)
-    return focal_px if _SHORTEST < ratio < _LONGEST else math.nan
+    return replace(stated, focal_px=math.nan)  # no camera has it
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:

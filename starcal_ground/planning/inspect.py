@@ -21,9 +21,8 @@ from starcal_ros.formats.messages.image_messages import decode_png
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis import bags
-from starcal_ros.pipeline.diagnosis.bags import placed, refusals, Refused
+from starcal_ros.pipeline.diagnosis.bags import Refused
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
@@ -76,7 +75,7 @@ class Inspection:
 
     bags: tuple[str, ...]
     topics: tuple[TopicContent, ...]
-    chosen: Topics | None
+    chosen: bag_topics.Topics | None
     images: int
     refused: tuple[Refused, ...]
     longest_attitude_gap_s: float
@@ -92,7 +91,7 @@ class Inspection:
 
 def inspect(
     paths: Sequence[Path],
-    given: Topics,
+    given: bag_topics.Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
     camera_alone: bool = False,
@@ -116,7 +115,7 @@ def inspect(
             paths, given, setup.options() if setup else {}, camera_alone
         ):
             setup = None
-            chosen = Topics(image=bag_topics.choose_image_topic(paths, given))
+            chosen = bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given))
         if setup:
             from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
 
@@ -126,7 +125,7 @@ def inspect(
         elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:
             records = reader.read_observations(paths, chosen.observations)
         else:
-            records = placed(paths, chosen, options)
+            records = bags.placed(paths, chosen, options)
         for observations in records:
             seen.append(observations)
             on_image()
@@ -143,13 +142,13 @@ def inspect(
         problems += _shortages(used, status)
     if chosen and seen and not used:
         command = '' if by_stars else 'starcal diagnose'
-        problems += _causes(paths, chosen, setup, refusals(seen), command)
+        problems += _causes(paths, chosen, setup, bags.refusals(seen), command)
     return Inspection(
         bags=tuple(map(str, paths)),
         topics=topics,
         chosen=chosen,
         images=len(seen),
-        refused=refusals(seen),
+        refused=bags.refusals(seen),
         longest_attitude_gap_s=max(
             (o.attitude_gap_s for o in used if math.isfinite(o.attitude_gap_s)), default=math.nan
         ),
@@ -220,7 +219,7 @@ def _kind(message: message_fields.Message) -> str:
 
 def _causes(
     paths: Sequence[Path],
-    chosen: Topics,
+    chosen: bag_topics.Topics,
     setup: Setup | None,
     refused: Sequence[Refused],
     command: str,

@@ -31,13 +31,8 @@ from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
-from starcal_ros.formats.products import calibration_json, product_folder
+from starcal_ros.formats.products import calibration_json, product_files, product_folder
 from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE
-from starcal_ros.formats.products.product_files import (
-    OBSERVATIONS_FILE,
-    REPORT_FILE,
-    write_atomically,
-)
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.records import (
@@ -234,7 +229,7 @@ _PRODUCTS = (
     calibration_json.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
     product_folder.RESIDUALS_FILE,
-    OBSERVATIONS_FILE,
+    product_files.OBSERVATIONS_FILE,
 )
 PDF_FILE = 'report.pdf'
 
@@ -250,7 +245,7 @@ class Found:
     calibration: Calibration
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
-    pictures: tuple[thumbnails.Thumbnail, ...]
+    pictures: tuple[Thumbnail, ...]
 
 
 def write_report(folder: Path) -> Path:
@@ -264,14 +259,17 @@ def write_report(folder: Path) -> Path:
     failure = product_folder.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
-    path = folder / REPORT_FILE
-    write_atomically(path, render(_read_folder(folder), folder))
+    path = folder / product_files.REPORT_FILE
+    product_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
 
 def _read_folder(folder: Path) -> Found:
     residuals = folder / product_folder.RESIDUALS_FILE
-    observations, ensemble = folder / OBSERVATIONS_FILE, folder / product_folder.STATE_ENSEMBLE
+    observations, ensemble = (
+        folder / product_files.OBSERVATIONS_FILE,
+        folder / product_folder.STATE_ENSEMBLE,
+    )
     calibration = calibration_json.read_calibration(product_folder.calibration_file(folder))
     recorded = None
     if observations.is_file():
@@ -376,8 +374,8 @@ def write_failure_page(record: product_folder.NotCalibrated, folder: Path) -> Pa
         for reason, count in record.images_refused.items()
     ]
     text = page_template('failure.html').render(record=record, pictures=pictures, refused=refused)
-    path = folder / REPORT_FILE
-    write_atomically(path, text)
+    path = folder / product_files.REPORT_FILE
+    product_files.write_atomically(path, text)
     return path
 
 
@@ -459,5 +457,5 @@ def write_pdf(page: Path) -> Path:
     within_page = weasyprint.URLFetcher(allowed_protocols=('data',))
     document = weasyprint.HTML(string=light(page.read_text()), url_fetcher=within_page)
     path = page.with_name(PDF_FILE)
-    write_atomically(path, document.write_pdf())
+    product_files.write_atomically(path, document.write_pdf())
     return path

@@ -29,17 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground.mission.trend import places
-from starcal_ground.mission.trend.places import Entry
-from starcal_ground.mission.trend.trend_table import (
-    COMPUTED,
-    failure,
-    kept_name,
-    RECORDED,
-    Row,
-    row_of,
-    Table,
-)
+from starcal_ground.mission.trend import places, trend_table
 from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
@@ -131,7 +121,7 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
 
 def _tasks(
     root: str,
-    listed: dict[str, Entry],
+    listed: dict[str, places.Entry],
     cameras: Cameras,
     version: str,
     settings_of: Callable[[str], tuple[tuple[str, ...], str]],
@@ -176,12 +166,12 @@ def digest(files: Sequence[str | Path], version: str = '') -> str:
 def _task(
     root: str,
     name: str,
-    files: Sequence[Entry],
+    files: Sequence[places.Entry],
     cameras: Cameras,
     version: str = '',
     params: str = '',
     settings: tuple[tuple[str, ...], str] = ((), ''),
-    others: Sequence[Entry] = (),
+    others: Sequence[places.Entry] = (),
 ) -> Task:
     """A task; ``version`` is that which would calibrate a bag, ``others`` are read with it."""
     # A calibration is the same whatever is beside it, a bag is not.
@@ -202,9 +192,9 @@ def _task(
     )
 
 
-def _bags(listed: dict[str, Entry]) -> dict[str, list[Entry]]:
+def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
     """Bag folders with a metadata.yaml, and single files elsewhere; no files of an archive."""
-    bags: dict[str, list[Entry]] = {}
+    bags: dict[str, list[places.Entry]] = {}
     for name, entry in listed.items():
         folder, file = posixpath.split(name)
         # One image each: the state of a calibrator, calibrated there.
@@ -321,7 +311,7 @@ class Answer:
     """
 
     key: str = ''
-    row: Row | None = None
+    row: trend_table.Row | None = None
     calibration: str = ''
     is_silence: bool = False
 
@@ -343,7 +333,7 @@ def compute(task: Task) -> Answer:
 
 def failed(task: Task, error: str, is_passing: bool = False, is_silence: bool = False) -> Answer:
     """Answer to a task that failed."""
-    row = dataclasses.replace(failure(task.url, error), is_passing=is_passing)
+    row = dataclasses.replace(trend_table.failure(task.url, error), is_passing=is_passing)
     return Answer(row=_of_task(row, task), is_silence=is_silence)
 
 
@@ -373,11 +363,19 @@ def _answer(task: Task, path: Path) -> Answer:
             return Answer(key)
         if not task.is_bag:
             made, temperature = _recorded(path)
-            return Answer(key, _of_task(row_of(made, key, task.url, RECORDED, temperature), task))
+            return Answer(
+                key,
+                _of_task(
+                    trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature),
+                    task,
+                ),
+            )
         setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
         campaign = calibrate_bags([path], setup, Topics())
         made, records = campaign.calibration, campaign.observations
-        row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
+        row = trend_table.row_of(
+            made, key, task.url, trend_table.COMPUTED, _mean_temperature(records)
+        )
         text = calibration_json.calibration_text(made)
         return Answer(key, _of_task(row, task, path), text)
     except (StarcalError, ValueError) as error:
@@ -387,7 +385,7 @@ def _answer(task: Task, path: Path) -> Answer:
         return failed(task, str(error).replace(str(path), task.url))
 
 
-def _of_task(row: Row, task: Task, bag: Path = Path()) -> Row:
+def _of_task(row: trend_table.Row, task: Task, bag: Path = Path()) -> trend_table.Row:
     """A row with what its task and the metadata of the bag add."""
     names = _custom_data(bag / 'metadata.yaml') if task.is_bag else {}
     return dataclasses.replace(
@@ -471,7 +469,7 @@ class Done:
     known: int = 0
     silent: int = 0
 
-    def count(self, table: Table, task: Task, answer: Answer) -> None:
+    def count(self, table: trend_table.Table, task: Task, answer: Answer) -> None:
         """Put an answer into the table, and count it."""
         row = answer.row
         if row is None or table.has(row):
@@ -479,7 +477,7 @@ class Done:
             self.known += bool(answer.key)
             return
         if answer.calibration:
-            folder = table.path.with_name(KEPT_FOLDER) / kept_name(row)
+            folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
             product_files.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
@@ -489,7 +487,7 @@ class Done:
 
 
 def update(
-    table: Table,
+    table: trend_table.Table,
     tasks: Iterable[Task],
     workers: int = 0,
     scheduler: str = '',
@@ -530,7 +528,7 @@ def update(
 
 
 def _not_known(
-    table: Table, tasks: Iterable[Task], done: Done, failures: dict[str, bool]
+    table: trend_table.Table, tasks: Iterable[Task], done: Done, failures: dict[str, bool]
 ) -> Iterator[Task]:
     """Tasks that the table has no row of, then failures to try again; others are counted."""
     again: list[Task] = []
