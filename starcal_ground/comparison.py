@@ -10,12 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import (
-    chi_squared,
-    ChiSquared,
-    lines_of_sight,
-    parameter_difference,
-)
+from starcal_ros.assessment import agreement
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -89,7 +84,7 @@ class Comparison:
     rotation_rad: float
     before: DifferenceMap
     after: DifferenceMap
-    total: ChiSquared
+    total: agreement.ChiSquared
     notes: tuple[str, ...]
 
     @property
@@ -120,7 +115,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         raise ProductError(
             f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
         )
-    difference = parameter_difference(b.geometry, a.geometry)
+    difference = agreement.parameter_difference(b.geometry, a.geometry)
     sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     rotation, _ = Rotation.align_vectors(new, old)
@@ -138,14 +133,14 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         rotation_rad=float(rotation.magnitude()),
         before=_map(new - old, a.geometry, sight_sigma_rad),
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
-        total=chi_squared(difference, a.covariance + b.covariance),
+        total=agreement.chi_squared(difference, a.covariance + b.covariance),
         notes=_notes(a, b, difference, sigma),
     )
 
 
 def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
     """Lines of sight of the grid, (GRID^2, 3), star tracker frame."""
-    directions = lines_of_sight(geometry, GRID, GRID)
+    directions = agreement.lines_of_sight(geometry, GRID, GRID)
     if not np.isfinite(directions).all():
         raise ProductError(
             'a calibration has pixels without a line of sight: its distortion folds'
@@ -205,14 +200,14 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
 def content(comparison: Comparison) -> dict[str, object]:
     """A comparison as a JSON object; a number that is not finite is null."""
 
-    def of_map(found: DifferenceMap) -> dict[str, object]:
+    def of_map(moved: DifferenceMap) -> dict[str, object]:
         names = ('worst_px', 'rms_px', 'worst_sigmas', 'rms_sigmas')
-        numbers = (*found.worst_and_rms_px, *found.worst_and_rms_sigmas)
+        numbers = (*moved.worst_and_rms_px, *moved.worst_and_rms_sigmas)
         lengths = dict(zip(names, numbers, strict=True))
-        return {**lengths, 'difference_px': found.difference_px, 'sigmas': found.sigmas}
+        return {**lengths, 'difference_px': moved.difference_px, 'sigmas': moved.sigmas}
 
     total = comparison.total
-    found = {
+    values = {
         'parameter_names': comparison.a.parameter_names,
         'a': comparison.a.geometry.camera.parameters,
         'b': comparison.b.geometry.camera.parameters,
@@ -229,4 +224,4 @@ def content(comparison: Comparison) -> dict[str, object]:
         'accepted': [comparison.a.accepted, comparison.b.accepted],
         'notes': comparison.notes,
     }
-    return json_object(found)
+    return json_object(values)

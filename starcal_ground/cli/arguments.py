@@ -6,20 +6,24 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 import contextlib
+import dataclasses
 import json
 import math
 from pathlib import Path
 import sys
 from types import FrameType
-from typing import Any, NoReturn, TYPE_CHECKING
+from typing import Any, NoReturn, TYPE_CHECKING, TypeVar
 
 from starcal_ground.cli.terminal import print_text
 from starcal_ground.products import check_outputs
 from starcal_ros.text import printable
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from starcal_ros.pipeline.topics import Topics
 
+Record = TypeVar('Record', bound='DataclassInstance')
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
 BAGS = 'an .mcap file or a bag folder'
 BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
@@ -131,6 +135,11 @@ def add_remaps(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument(
         '--remap', type=_remap, action='append', default=[], metavar='A:=B', help=what
     )
+
+
+def record_of(kind: type[Record], args: argparse.Namespace) -> Record:
+    """The record whose fields are the arguments of their names."""
+    return kind(**{field.name: vars(args)[field.name] for field in dataclasses.fields(kind)})
 
 
 def add_json(command: argparse.ArgumentParser) -> None:

@@ -96,24 +96,19 @@ def calibrate_into(
         if with_report:
             thread.submit(_load_report)
         made = _calibrated(folder, observed, inputs(), album)
-        pictures: Sequence[thumbnails.Thumbnail] = ()
+        pictures: tuple[thumbnails.Thumbnail, ...] = ()
         with drawings.kind('pictures of images'):
-            pictures = drawn.result()
-        written = thread.submit(_write_all, made, pictures, folder)
-        page, report = '', ''
-        try:
-            if with_report:
-                with drawings.kind('report'):
-                    page, report = _drawn(made, pictures, folder)
-        finally:
-            written.result()
-            if not page:  # one that is there is of the products that were replaced
-                (folder / products.REPORT_FILE).unlink(missing_ok=True)
+            pictures = thumbnails.ordered(drawn.result())
+    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
+    products.write_products(made.calibration, folder, made.residuals)
+    page, report, path = '', '', folder / products.REPORT_FILE
+    if with_report:
+        with drawings.kind('report'):
+            page, report = _drawn(made, pictures, folder)
     if page:
-        from starcal_ground.report.page import with_digests
-
-        # After the products that it is of.
-        product_files.write_atomically(folder / products.REPORT_FILE, with_digests(page, folder))
+        product_files.write_atomically(path, page)
+    else:  # one that is there is of the products that were replaced
+        path.unlink(missing_ok=True)
     return made, report
 
 
@@ -144,23 +139,15 @@ def _load_report() -> None:
         page.page_template('report.html')
 
 
-def _write_all(
-    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
-) -> None:
-    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    products.write_products(made.calibration, folder, made.residuals)
-
-
 def _drawn(
-    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
+    made: campaign.Campaign, pictures: tuple[thumbnails.Thumbnail, ...], folder: Path
 ) -> tuple[str, str]:
-    """The report of what is being written, and where it will be; or why there is none."""
+    """The report of the products of a folder, and where it will be; or why there is none."""
     try:
         from starcal_ground.report import page
     except ModuleNotFoundError as error:
         return '', f'no report: {missing_package(error, "report")}'
-    ordered = thumbnails.ordered(pictures)
-    content = page.Found(made.calibration, made.residuals, made.observations, ordered)
+    content = page.Found(made.calibration, made.residuals, made.observations, pictures)
     return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
 
 

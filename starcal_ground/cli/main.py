@@ -80,9 +80,9 @@ class _TopFormatter(argparse.RawDescriptionHelpFormatter):
         self._action_max_length = 13  # argparse neglects the indent of the longest, calibrate
 
 
-def parser() -> argparse.ArgumentParser:
+def parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     """
-    Parser of the tool.
+    Parser of the tool; of a command line that names a command, with the arguments of that alone.
 
     It stores the name of the command in ``command``, None without one, its function in ``run``,
     and a request for the version in ``version``.
@@ -95,7 +95,11 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument('--version', action='store_true', help='show the version and exit')
     commands = top.add_subparsers(metavar='COMMAND', dest='command', title='commands')
+    named = next((word for word in argv if word in COMMANDS), None)
     for name in COMMANDS:
+        if named not in (None, name):
+            commands.add_parser(name)
+            continue
         file = 'import_' if name == 'import' else name  # a word of Python
         module = importlib.import_module(f'starcal_ground.cli.commands.{file}')
         summary, _, text = (module.__doc__ or '').strip().partition('\n\n')
@@ -119,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         terminal.open_missing_streams()
         if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
             sys.stdout.reconfigure(errors='backslashreplace')
-        tool = parser()
+        tool = parser(sys.argv[1:] if argv is None else argv)
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
 

@@ -16,27 +16,20 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
+from starcal_ground.report import verdict
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import INTRINSIC_NAMES
-from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
-from starcal_ros.text import printable, significant
+from starcal_ros.text import printable
 
 _HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
 _STALE = ('stale', 'yellow')
-_UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
-    'focal_temperature_1': ' /degC',
-    'focal_temperature_2': ' /degC²',
-    'tau_x': ' rad',
-    'tau_y': ' rad',
-}
-"""By parameter; the coefficients of the lens have none."""
 _SHADES = ' ░▒▓█'
 _TIGHTEST = 6  # gate checks shown of a calibration that passed
 
 
 @dataclass(frozen=True)
-class Seen:
+class Received:
     """Newest messages of each topic; None or empty before the first."""
 
     images: int = 0
@@ -47,7 +40,7 @@ class Seen:
     candidate: Calibration | None = None
     health: Mapping[str, tuple[int, str]] = field(default_factory=dict)
 
-    def with_image(self, observations: StarObservations) -> Seen:
+    def with_image(self, observations: StarObservations) -> Received:
         """A copy with one more image."""
         refused = Counter(self.refused)
         if observations.refusal:
@@ -73,23 +66,25 @@ def _lines(lines: Iterable[Text]) -> Text:
     return Text('\n').join(lines)
 
 
-def view(seen: Seen) -> Group:
+def view(received: Received) -> Group:
     """All panels in one column of 80 characters."""
     return Group(
-        Panel(_images(seen), title='images', title_align='left'),
-        Panel(_ensemble(seen), title='ensemble', title_align='left'),
-        Panel(_calibration(seen), title='calibration', title_align='left'),
-        Panel(_health(seen.health), title='nodes', title_align='left'),
+        Panel(_images(received), title='images', title_align='left'),
+        Panel(_ensemble(received), title='ensemble', title_align='left'),
+        Panel(_calibration(received), title='calibration', title_align='left'),
+        Panel(_health(received.health), title='nodes', title_align='left'),
     )
 
 
-def _images(seen: Seen) -> Text:
-    last = seen.last
+def _images(received: Received) -> Text:
+    last = received.last
     if last is None:
         return Line('no image since the start of this view', 'dim')
-    refused = sum(seen.refused.values())
-    lines = [Line(f'{seen.images} since the start of this view, {seen.images - refused} used')]
-    for reason, count in sorted(seen.refused.items(), key=lambda item: -item[1]):
+    refused = sum(received.refused.values())
+    lines = [
+        Line(f'{received.images} since the start of this view, {received.images - refused} used')
+    ]
+    for reason, count in sorted(received.refused.items(), key=lambda item: -item[1]):
         lines.append(Line(f'  {count} refused: {reason.replace("_", " ")}', 'yellow'))
     line = Line(f'last {utc_text(last.time_ns)}: ')
     if last.refusal:
@@ -99,8 +94,8 @@ def _images(seen: Seen) -> Text:
     return _lines([*lines, line])
 
 
-def _ensemble(seen: Seen) -> Group | Text:
-    status = seen.status
+def _ensemble(received: Received) -> Group | Text:
+    status = received.status
     if status is None:
         return Line('no status received from a calibrator', 'dim')
     head = Line()
@@ -115,14 +110,14 @@ def _ensemble(seen: Seen) -> Group | Text:
     for name, justify in (('1-sigma of', 'left'), ('calibrated now', 'right'),
                           ('active', 'right')):  # fmt: skip
         sigmas.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
-    active = _sigmas(seen.active)
+    active = _sigmas(received.active)
     for name, sigma in zip(status.parameter_names, status.predicted_sigma, strict=True):
         before = active.get(name)
         style = 'green' if before is not None and sigma < before else ''
         sigmas.add_row(
             Line(name),
-            Line(_sigma_text(name, float(sigma)), style),
-            Line('' if before is None else _sigma_text(name, before)),
+            Line(verdict.sigma_text(name, float(sigma)), style),
+            Line('' if before is None else verdict.sigma_text(name, before)),
         )
     grid = Table.grid(padding=(0, 3))
     grid.add_row(sigmas, coverage_text(status.coverage))
@@ -151,21 +146,12 @@ def _sigmas(calibration: Calibration | None) -> dict[str, float]:
     return dict(zip(calibration.parameter_names, sigma.tolist(), strict=True))
 
 
-def _sigma_text(name: str, sigma: float) -> str:
-    if not np.isfinite(sigma):
-        return 'unobservable'
-    if name.startswith('alignment'):
-        per = '/degC' if name.endswith('_temperature') else ''
-        return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
-    return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
-
-
-def _calibration(seen: Seen) -> Group | Text:
+def _calibration(received: Received) -> Group | Text:
     parts: list[Text | Table] = []
-    if seen.active is None:
+    if received.active is None:
         parts.append(Line('none active: the prior is in use', 'dim'))
     else:
-        active = seen.active
+        active = received.active
         style = 'green' if active.accepted else 'bold red'
         words = 'accepted by the gate' if active.accepted else 'activated against the gate'
         parts.append(
@@ -176,9 +162,9 @@ def _calibration(seen: Seen) -> Group | Text:
                 style,
             )
         )
-    last = seen.candidate or seen.active
-    if seen.candidate is not None:
-        reasons = '; '.join(seen.candidate.reasons)
+    last = received.candidate or received.active
+    if received.candidate is not None:
+        reasons = '; '.join(received.candidate.reasons)
         parts.append(Line(f'last candidate refused: {reasons}', 'bold red'))
     if last is not None:
         parts.append(_gate(last))

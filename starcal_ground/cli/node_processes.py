@@ -102,7 +102,7 @@ def calibrate_with_nodes(
                 )
                 stack.callback(_stop, nodes[name])
         _wait_for_images(image_count, state / 'ensemble', nodes, folder, on_image)
-        asked = subprocess.run(
+        answer = subprocess.run(
             node_command('starcal_ground.ros.calibrate_client', []),
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -110,10 +110,10 @@ def calibrate_with_nodes(
             text=True,
             check=False,
         )
-        if asked.returncode:
-            raise NodeError(f'{asked.stderr.strip()} (see the log files in {folder})')
+        if answer.returncode:
+            raise NodeError(f'{answer.stderr.strip()} (see the log files in {folder})')
         activated = next((state / 'calibrations').glob('*.json'), None)
-        return (read_calibration(activated) if activated else None), asked.stdout.strip()
+        return (read_calibration(activated) if activated else None), answer.stdout.strip()
 
 
 def _wait_for_images(
@@ -131,14 +131,14 @@ def _wait_for_images(
                 said = (folder / f'{name}.log').read_text(errors='replace').strip()
                 last = said.rpartition('\n')[2]
                 raise NodeError(f'{name} ended before the calibration: {last}')
-        found = len(list(ensemble.glob('*.mcap')))
-        if found > kept or nodes['bag_player'].poll() is None:
+        saved = len(list(ensemble.glob('*.mcap')))
+        if saved > kept or nodes['bag_player'].poll() is None:
             since_s = time.monotonic()
         elif time.monotonic() > since_s + _QUIET_S:
             return
-        for _ in range(found - kept):
+        for _ in range(saved - kept):
             on_image()
-        kept = found
+        kept = saved
         time.sleep(0.05)
 
 

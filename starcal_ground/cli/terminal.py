@@ -73,31 +73,16 @@ def progress_bar(total: int | None, label: str) -> Iterator[Callable[[], None]]:
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:
     """
-    Print a table: drawn on a terminal, aligned text elsewhere.
+    Print a table in aligned columns; on a terminal its header is bold, over a line.
 
     The first ``left`` columns are left-aligned, the others right-aligned.
     """
-    rows = [tuple(map(printable, row)) for row in rows]
-    if not sys.stdout.isatty():
-        for line in table_lines(header, rows, left):
-            print(line)
-        return
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False, header_style='bold'
-    )
-    for k, name in enumerate(header):
-        # On a narrow terminal a name may be folded, a number never.
-        table.add_column(
-            name, justify='left' if k < left else 'right', no_wrap=k >= left, overflow='fold'
-        )
-    for row in rows:
-        table.add_row(*map(Text, row))  # Text: brackets in a name are not markup
-    Console().print(table)
+    first, *lines = table_lines(header, [tuple(map(printable, row)) for row in rows], left)
+    _print_styled(first, 'bold')
+    if sys.stdout.isatty():
+        print('─' * max(map(len, (first, *lines))))
+    for line in lines:
+        print(line)
 
 
 def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
@@ -114,10 +99,15 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]], left: int 
 
 def print_verdict(good: bool, text: str) -> None:
     """Print a verdict, in colour on a terminal."""
+    _print_styled(text, 'bold green' if good else 'bold red')
+
+
+def _print_styled(text: str, style: str) -> None:
+    """Print a text in a style of rich on a terminal, plain elsewhere."""
     if not sys.stdout.isatty():
         print_text(text)
         return
     from rich.console import Console
     from rich.text import Text
 
-    Console().print(Text(printable(text), style='bold green' if good else 'bold red'))
+    Console().print(Text(printable(text), style), soft_wrap=True)

@@ -61,10 +61,10 @@ class FirstSetup:
         """Text of the parameter file, with what is left to state as comments."""
         values = {'camera_info_url': CAMERA_FILE, **self.options}
         options = yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
-        found = ''.join(f'# {line}\n' for line in self.found)
+        findings = ''.join(f'# {line}\n' for line in self.found)
         to_state = ''.join(f'# {line}\n' for line in self.to_state)
         parameters = textwrap.indent(options + to_state, 4 * ' ')
-        return f'{found}/**:\n  ros__parameters:\n{parameters}'
+        return f'{findings}/**:\n  ros__parameters:\n{parameters}'
 
 
 def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
@@ -73,29 +73,29 @@ def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
 
     Raises NotFromStars when the stars give no camera.
     """
-    found, notes = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
+    stars, notes = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
     options = night_sky.site_of(photographs)
     to_state = () if options else (_OF_PLACE,)
-    return FirstSetup(found.camera, options, (found.in_a_sentence(), *notes), to_state)
+    return FirstSetup(stars.camera, options, (stars.in_a_sentence(), *notes), to_state)
 
 
-def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
+def of_bags(bags: Sequence[Path], topics: Topics) -> FirstSetup:
     """
     The camera of a bag, and the alignment and direction of its attitudes where it has any.
 
     Raises NotFromStars when the stars give no camera. Raises BagError when a bag cannot be read,
     or several topics have a type. Raises OptionError when attitudes and images do not agree.
     """
-    topic = choose_image_topic(bags, asked)
+    topic = choose_image_topic(bags, topics)
     camera = night_sky.camera_of_bags(bags, topic, {}, _LOOKED_AT)
     there = {one.type_name for one in reader.topics(bags)}
     words = f'images of {topic}: {camera.in_a_sentence()}'
     has_velocity = VELOCITY_TYPE in there
     if not there & {*ATTITUDE_TYPES}:
         return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
-    options, attitudes = _aligned(bags, asked, camera)
+    options, attitudes = _aligned(bags, topics, camera)
     to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
-    worth = _worth_stating(bags, asked, camera.camera, options)
+    worth = _worth_stating(bags, topics, camera.camera, options)
     return FirstSetup(camera.camera, options, (words, attitudes), (*worth, *to_state))
 
 
@@ -117,7 +117,7 @@ def _worth_stating(
 
 
 def _aligned(
-    bags: Sequence[Path], asked: Topics, camera: FromStars
+    bags: Sequence[Path], given: Topics, camera: FromStars
 ) -> tuple[dict[str, object], str]:
     """Options of the attitudes in a bag, and a line on them."""
     prior = CameraGeometry(camera.camera, np.array([0.0, 0.0, 0.0, 1.0]))
@@ -125,11 +125,11 @@ def _aligned(
     for direction in _DIRECTIONS:
         options: dict[str, object] = {'attitude_direction': direction}
         setup = dataclasses.replace(load_setup(options, prior=prior), is_aligned=False)
-        topics = choose_topics(bags, asked, setup)
-        found = diagnose_bags(bags, asked, setup)
-        alignment, sentence = found_alignment(found)
+        topics = choose_topics(bags, given, setup)
+        diagnosis = diagnose_bags(bags, given, setup)
+        alignment, sentence = found_alignment(diagnosis)
         if alignment is not None:
-            line = f'attitudes of {topics.attitude}: {direction}, {found.images} images agree'
+            line = f'attitudes of {topics.attitude}: {direction}, {diagnosis.images} images agree'
             return {**options, 'prior_alignment': alignment}, line
         said = said or sentence
     raise OptionError(f'{bags[0]}: the attitudes do not fit the images: {said}')

@@ -95,7 +95,7 @@ class FromStars:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Sources:
     """
     Sources of an image: all by their light, and the compact ones, without glare.
 
@@ -146,21 +146,21 @@ def from_stars(
             ' their region (starcal catalog)'
         )
     first, compact_first = matched
-    found, other_focal_px = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
-    if len(found) < min_images:
+    matches, other_focal_px = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
+    if len(matches) < min_images:
         raise NotFromStars(
-            f'{len(found)} of {len(seen)} images match the sky, {min_images} are needed: {ADVICE};'
-            ' no clouds, no lights, no frames of anything else'
+            f'{len(matches)} of {len(seen)} images match the sky, {min_images} are needed:'
+            f' {ADVICE}; no clouds, no lights, no frames of anything else'
         )
-    camera, rotations = _common_camera(found, catalog, first.camera)
+    camera, rotations = _common_camera(matches, catalog, first.camera)
     return FromStars(
         camera, first.mirrored, rotations, len(seen), other_focal_px, frozenset(copies)
     )
 
 
-def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], list[int]]:
+def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], list[int]]:
     """Sources of the images that differ, their size, and the stamps of copies."""
-    seen: list[_Seen] = []
+    seen: list[_Sources] = []
     size = (0, 0)
     sums = set()
     noises: list[Floats] = []
@@ -185,7 +185,7 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], lis
         middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
         compact = sources.xy_px[sources.wide_px <= middle_px]
         stars = _count_of_stars(image.pixels, sources)
-        seen.append(_Seen(image.time_ns, sources.xy_px, compact, stars))
+        seen.append(_Sources(image.time_ns, sources.xy_px, compact, stars))
     return seen, size, copies
 
 
@@ -245,7 +245,7 @@ def _without_distortion(size: tuple[int, int], focal_px: float, model: str) -> C
 
 
 def _first_match(
-    seen: Sequence[_Seen], cameras: Sequence[CameraModel], catalog: StarCatalog
+    seen: Sequence[_Sources], cameras: Sequence[CameraModel], catalog: StarCatalog
 ) -> tuple[search.SkyMatch, bool] | None:
     """An image identified with one of the cameras, and whether by its compact sources."""
     deadline_s = time.thread_time() + _SEARCH_S
@@ -284,10 +284,10 @@ def _of_better_lens(sky: search.SkyMatch, xy_px: Floats, catalog: StarCatalog) -
 
 
 def _all_matches(
-    seen: Sequence[_Seen], first: search.SkyMatch, compact_first: bool, catalog: StarCatalog
+    seen: Sequence[_Sources], first: search.SkyMatch, compact_first: bool, catalog: StarCatalog
 ) -> dict[int, search.SkyMatch]:
     """The images that the camera of the first match identifies, by stamp, mirrored back."""
-    found: dict[int, search.SkyMatch] = {}
+    matches: dict[int, search.SkyMatch] = {}
     camera = first.camera
     before: search.SkyMatch | search.NotFound = search.NotFound('')
     for one in seen:
@@ -296,9 +296,9 @@ def _all_matches(
             rankings = [search.mirror(xy_px, camera.width) for xy_px in rankings]
         for sky in _attempts(rankings, camera, catalog, before):
             if isinstance(sky, search.SkyMatch):
-                found[one.time_ns] = before = sky
+                matches[one.time_ns] = before = sky
                 break
-    return found
+    return matches
 
 
 def _attempts(
@@ -316,16 +316,16 @@ def _attempts(
 
 
 def _of_one_lens(
-    found: Mapping[int, search.SkyMatch],
+    matches: Mapping[int, search.SkyMatch],
 ) -> tuple[dict[int, search.SkyMatch], tuple[float, ...]]:
     """
     The matches with the focal length of most, and the focal lengths of the others.
 
     A few others are false, of another lens, or pictures of a screen that shows the sky.
     """
-    if not found:
+    if not matches:
         return {}, ()
-    focal_px = np.array([_focal_px(sky.camera, sky.camera.model) for sky in found.values()])
+    focal_px = np.array([_focal_px(sky.camera, sky.camera.model) for sky in matches.values()])
     low, high = np.percentile(focal_px, [10, 90])
     if high > (1 + _SAME_CAMERA) * low:
         raise NotFromStars(
@@ -333,7 +333,7 @@ def _of_one_lens(
             f' focus; with one lens, its zoom and focus fixed, {ADVICE}'
         )
     alike = np.abs(focal_px / np.median(focal_px) - 1) < _SAME_CAMERA
-    kept = {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
+    kept = {t: sky for (t, sky), same in zip(matches.items(), alike, strict=True) if same}
     return kept, tuple(focal_px[~alike].tolist())
 
 
@@ -351,21 +351,21 @@ def _focal_px(camera: CameraModel, model: str) -> float:
 
 
 def _common_camera(
-    found: Mapping[int, search.SkyMatch], catalog: StarCatalog, camera: CameraModel
+    matches: Mapping[int, search.SkyMatch], catalog: StarCatalog, camera: CameraModel
 ) -> tuple[CameraModel, dict[int, Rotation]]:
     """The camera that fits all matches, and the rotations ``icrf_from_camera`` with it."""
-    stars = sum(len(sky.xy_px) for sky in found.values())
-    parameters = np.median([sky.camera.parameters for sky in found.values()], axis=0)
+    stars = sum(len(sky.xy_px) for sky in matches.values())
+    parameters = np.median([sky.camera.parameters for sky in matches.values()], axis=0)
     camera = dataclasses.replace(camera, parameters=parameters)
-    if len(found) < 2 or stars < 30:
-        return camera, {t: sky.camera_from_icrf.inv() for t, sky in found.items()}
+    if len(matches) < 2 or stars < 30:
+        return camera, {t: sky.camera_from_icrf.inv() for t, sky in matches.items()}
     options = CalibrationOptions(
         method='per_image', min_images=1, min_stars=10, velocity_sigma_m_s=0.0
     )
-    images = tuple(_observations(*one, catalog, camera) for one in found.items())
+    images = tuple(_observations(*one, catalog, camera) for one in matches.items())
     geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     fit = estimate_calibration(Ensemble(images), geometry, options)
-    rotations = dict(zip(found, fit.linear.state.camera_from_icrf.inv(), strict=True))
+    rotations = dict(zip(matches, fit.linear.state.camera_from_icrf.inv(), strict=True))
     return dataclasses.replace(fit.geometry.camera, field=None), rotations
 
 

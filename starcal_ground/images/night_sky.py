@@ -8,7 +8,7 @@ calibration of these bags is the same as that of any bag.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import itertools
@@ -91,6 +91,29 @@ class NightSky:
         return refused_image(one.time_ns, one.width, one.height, reason, detail)
 
 
+def from_images(
+    paths: Sequence[Path],
+    topics: Topics,
+    values: Mapping[str, object],
+    folder: Path,
+    lens: tuple[float, float] = (0.0, 0.0),
+    on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
+) -> tuple[NightSky, list[Path]]:
+    """
+    Set-up of a calibration of photographs or of bags without attitudes, and the files it reads.
+
+    ``lens`` is the focal length (mm) and the pixel size (um) of photographs, 0 where not given.
+    ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
+    the stars give no camera.
+    """
+    photographs = image_paths(paths)
+    if not photographs:
+        return from_bags(paths, topics, values, folder), reader.mcap_files(paths)
+    chosen, notes = photographs_of(photographs, *lens)
+    on_notes(notes)
+    return from_photographs(chosen, values, folder), [one.path for one in chosen]
+
+
 def photographs_of(
     paths: Sequence[Path], focal_length_mm: float = 0.0, pixel_um: float = 0.0
 ) -> tuple[list[Photograph], list[str]]:
@@ -137,18 +160,18 @@ def from_photographs(
 
     Raises NotFromStars when the stars give no camera.
     """
-    found, notes = camera_of_photographs(photographs, values)
+    stars, notes = camera_of_photographs(photographs, values)
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
         for image in _images(photographs, Refusals()):
-            if found.mirrored:
+            if stars.mirrored:
                 image = Image(image.time_ns, image.pixels[:, ::-1].copy())
             writer.write_image('/camera/image_raw', image, 'camera')
     stated = {**site_of(photographs), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
-    return _set_up(found, [bag], stated, folder, is_located, Topics(), notes)
+    return _set_up(stars, [bag], stated, folder, is_located, Topics(), notes)
 
 
 def camera_of_photographs(
@@ -178,19 +201,19 @@ def _images(photographs: Sequence[Photograph], refusals: Refusals) -> Iterator[I
 
 
 def from_bags(
-    bags: Sequence[Path], asked: Topics, values: Mapping[str, object], folder: Path
+    bags: Sequence[Path], topics: Topics, values: Mapping[str, object], folder: Path
 ) -> NightSky:
     """
     Set-up of a calibration of bags without attitudes; attitudes by the stars go into a folder.
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
-    found = camera_of_bags(bags, choose_image_topic(bags, asked), values)
+    stars = camera_of_bags(bags, choose_image_topic(bags, topics), values)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
-    if is_located and min(found.icrf_from_camera) < CLOCKS_SET_NS:
+    if is_located and min(stars.icrf_from_camera) < CLOCKS_SET_NS:
         values = {'velocity_sigma_m_s': EARTH_M_S, **values}
-    return _set_up(found, bags, values, folder, is_located, asked)
+    return _set_up(stars, bags, values, folder, is_located, topics)
 
 
 def camera_of_bags(
@@ -203,10 +226,10 @@ def camera_of_bags(
     """
     read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
     images = (image for image in read if isinstance(image, Image))
-    found = _found(itertools.islice(images, most), values, None)
-    if found.mirrored:
+    stars = _found(itertools.islice(images, most), values, None)
+    if stars.mirrored:
         raise NotFromStars('the images are mirrored: mirror them where they are read out')
-    return found
+    return stars
 
 
 def _found(
@@ -222,28 +245,28 @@ def _found(
 
 
 def _set_up(
-    found: FromStars,
+    stars: FromStars,
     bags: Sequence[Path],
     values: Mapping[str, object],
     folder: Path,
     is_located: bool,
-    asked: Topics,
+    given: Topics,
     notes: Sequence[str] = (),
 ) -> NightSky:
     attitudes = folder / 'attitudes.mcap'
     with BagWriter(attitudes) as writer:
-        for time_ns in sorted(found.icrf_from_camera):
-            xyzw = found.icrf_from_camera[time_ns].as_quat()
+        for time_ns in sorted(stars.icrf_from_camera):
+            xyzw = stars.icrf_from_camera[time_ns].as_quat()
             writer.write_attitude(_ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
-    prior = CameraGeometry(found.camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    prior = CameraGeometry(stars.camera, np.array([0.0, 0.0, 0.0, 1.0]))
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
-    notes = [*notes, found.in_a_sentence()]
+    notes = [*notes, stars.in_a_sentence()]
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
-    topics = dataclasses.replace(asked, attitude=_ATTITUDE_TOPIC)
-    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics, found.copies_ns)
+    topics = dataclasses.replace(given, attitude=_ATTITUDE_TOPIC)
+    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics, stars.copies_ns)
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:
@@ -296,13 +319,7 @@ def calibrate_images(
     paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         folder = Path(name)
-        if image_paths(paths):
-            photographs, _ = photographs_of(paths)
-            files = [photograph.path for photograph in photographs]
-            sky = from_photographs(photographs, options, folder)
-        else:
-            files = reader.mcap_files(paths)
-            sky = from_bags(paths, Topics(image=image_topic), options, folder)
+        sky, files = from_images(paths, Topics(image=image_topic), options, folder)
         inputs = inputs_of(files)
         campaign = calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air)
     return campaign.calibration

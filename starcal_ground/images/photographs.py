@@ -1,5 +1,11 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Photographs: JPEG, PNG, TIFF, FITS and camera raw, with the facts that the files state."""
+"""
+Image files: photographs with the facts that they state, and series that become messages.
+
+Photographs are JPEG, PNG, TIFF, FITS and camera raw.  A series, FITS, TIFF or PNG, gets the times
+of its exposures and one scale: a ROS image has 8 or 16 bit per pixel.  Integers that fit are kept;
+other values, mostly floating point, are mapped to 16 bit with one recorded scale for all images.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +16,7 @@ from datetime import datetime, timezone
 import glob
 import importlib
 import io
+import itertools
 import math
 import os
 from pathlib import Path
@@ -25,7 +32,14 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
-from starcal_ros.formats.image_files import Card, content_of, decoded, MOST_VALUES, read_fits
+from starcal_ros.formats.image_files import (
+    Card,
+    content_of,
+    decoded,
+    MOST_VALUES,
+    read_fits,
+    read_image,
+)
 
 # Of files whose content says nothing, as of damaged ones.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts')
@@ -160,34 +174,29 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
         )
         stated = _of_tags(path, tags, gps, width, height)
         stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
-    if not (focal_length_mm or pixel_um):
-        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
-    given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
-    if math.isnan(given_px):
-        return replace(stated, focal_px=_plausible(stated.focal_px, stated))
-    if math.isnan(_plausible(given_px, stated)):
+    given_px = math.nan
+    if focal_length_mm or pixel_um:
+        given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
+    focal_px = stated.focal_px if math.isnan(given_px) else given_px
+    if _SHORTEST < focal_px / math.hypot(stated.width, stated.height) < _LONGEST:
+        return replace(stated, focal_px=focal_px)
+    if focal_px == given_px:
         raise IngestError(
             f'{path}: --focal-length-mm and --pixel-size-um give a focal length of {given_px:.3g}'
             f' px for {stated.width} x {stated.height} pixels'
         )
-    return replace(stated, focal_px=given_px)
-
-
-def _plausible(focal_px: float, of: Photograph) -> float:
-    """A focal length, or NaN for one that no camera has."""
-    ratio = focal_px / math.hypot(of.width, of.height)
-    return focal_px if _SHORTEST < ratio < _LONGEST else math.nan
+    return replace(stated, focal_px=math.nan)  # no camera has it
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
     """By time, then name; equal stamps, as of copied files, a second apart."""
     ordered = sorted(photographs, key=lambda one: (one.time_ns, one.path.name))
-    found: list[Photograph] = []
+    distinct: list[Photograph] = []
     for one in ordered:
-        if found and one.time_ns <= found[-1].time_ns:
-            one = replace(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
-        found.append(one)
-    return found
+        if distinct and one.time_ns <= distinct[-1].time_ns:
+            one = replace(one, time_ns=distinct[-1].time_ns + _SAME_STAMP_NS)
+        distinct.append(one)
+    return distinct
 
 
 def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
@@ -232,10 +241,8 @@ def pixels_of_photograph(path: Path) -> Pixels:
     if values.dtype in (np.uint8, np.uint16):
         return values
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    if values.dtype.kind in 'iu' and low >= 0 and high <= 65535:
-        return values.astype(np.uint16)
-    scaled = (np.nan_to_num(values, nan=low) - low) * (65000.0 / max(high - low, 1e-30))
-    return np.rint(scaled).astype(np.uint16)
+    scale = _scale([values.dtype], low, high)
+    return scale.to_dn(values) if scale.step > 0 else np.zeros(values.shape, np.uint16)
 
 
 def _check_whole(path: Path, content: bytes) -> None:
@@ -449,3 +456,163 @@ def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Ph
     words = [str(header[key].value) for key in ('TELESCOP', 'INSTRUME') if key in header]
     height, width = values.shape[:2]
     return Photograph(path, time_ns, dated, dated, width, height, focal_px, None, ' '.join(words))
+
+
+_ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
+_FULL = 65000  # of 16 bit; the end of the range means saturation
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """
+    How the files are read.
+
+    ``time_key`` is the FITS keyword of the middle of the exposure (empty: the standard keywords);
+    ``times`` holds stamps by file name, which replace it.  ``hdu`` is the number or name of a FITS
+    extension (empty: the first image), ``channel`` red, green or blue of a colour image, ``bayer``
+    the pattern of a mosaic, ``value_range`` the range mapped to 16 bit (None: that of the images).
+    """
+
+    time_key: str = ''
+    times: Mapping[str, int] | None = None
+    hdu: str = ''
+    channel: str = ''
+    bayer: str = ''
+    value_range: tuple[float, float] | None = None
+    temperature_key: str = ''
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """
+    An image file: stamp of the middle of the exposure, size, range and noise of its pixels.
+
+    ``saturation`` is the FITS keyword SATURATE, NaN without one; ``temperature_degc`` likewise.
+    """
+
+    path: Path
+    time_ns: int
+    width: int
+    height: int
+    dtype: np.dtype[Any]
+    low: float
+    high: float
+    noise: float
+    saturation: float
+    temperature_degc: float
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Mapping of pixel values to 16 bit, ``dn = round((value - offset) / step)``; or none."""
+
+    offset: float
+    step: float
+    dtype: type[np.uint8] | type[np.uint16]
+
+    @property
+    def is_none(self) -> bool:
+        """True if pixel values are not scaled."""
+        return (self.offset, self.step) == (0.0, 1.0)
+
+    def to_dn(self, values: NDArray[Any]) -> Pixels:
+        """Pixels of values; not-a-number becomes the median of the image."""
+        if self.is_none and values.dtype.kind in 'ui':
+            return self._cast(values)
+        middle = float(np.nanmedian(values)) if np.isnan(values).any() else 0.0
+        pixels = self._cast(np.zeros(values.shape, self.dtype))
+        for top in range(0, len(values), _ROWS):
+            known = np.nan_to_num(values[top : top + _ROWS], nan=middle)
+            dn = np.rint((known - self.offset) / self.step)
+            pixels[top : top + _ROWS] = np.clip(dn, 0, np.iinfo(self.dtype).max)
+        return pixels
+
+    def _cast(self, values: NDArray[Any]) -> Pixels:
+        return values.astype(np.uint8) if self.dtype is np.uint8 else values.astype(np.uint16)
+
+
+def look(path: Path, options: ImageOptions) -> ImageFile:
+    """Stamp, size and range of an image file; raises IngestError with the remedy."""
+    values, header = _of_options(path, options)
+    finite = np.isfinite(values)
+    if not finite.any():
+        raise IngestError(f'{path}: no pixel is a finite number')
+    some = values.flat[int(finite.argmax())]
+    steps = np.abs(np.diff(values[:: max(1, len(values) // 200)].astype(np.float64), axis=1))
+    height, width = values.shape
+    return ImageFile(
+        path,
+        _time_ns(path, header, options),
+        width,
+        height,
+        values.dtype,
+        float(values.min(where=finite, initial=some)),
+        float(values.max(where=finite, initial=some)),
+        # The median step between neighbours is 0.954 sigma for white noise.
+        float(np.nanmedian(steps)) / 0.954,
+        number(header, 'SATURATE'),
+        number(header, options.temperature_key),
+    )
+
+
+def pixels_of(path: Path, options: ImageOptions, scale: Scale) -> Pixels:
+    """Pixels (height, width) of an image file, in 8 or 16 bit."""
+    pixels = scale.to_dn(_of_options(path, options)[0])
+    pixels.setflags(write=False)
+    return pixels
+
+
+def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
+    """The scale of all images; none if whole numbers fit 16 bit.  Raises IngestError."""
+    kinds = [file.dtype for file in files] if options.value_range is None else []
+    low, high = options.value_range or (
+        min(file.low for file in files),
+        max(file.high for file in files),
+    )
+    scale = _scale(kinds, low, high)
+    if not scale.step > 0:
+        raise IngestError(f'--value-range: {low:g} to {high:g} is empty')
+    return scale
+
+
+def _scale(kinds: Sequence[np.dtype[Any]], low: float, high: float) -> Scale:
+    """The scale of values of some types from ``low`` to ``high``; without a type to 16 bit."""
+    if kinds and all(kind.kind in 'ui' for kind in kinds):
+        if low >= 0 and high <= 65535:
+            eight = all(kind.itemsize == 1 for kind in kinds)
+            return Scale(0.0, 1.0, np.uint8 if eight else np.uint16)
+        if high - low <= _FULL:
+            return Scale(low, 1.0, np.uint16)
+    return Scale(low, (high - low) / _FULL, np.uint16)
+
+
+def check_alike(files: Sequence[ImageFile]) -> None:
+    """Check that images have one size and different stamps; raises IngestError."""
+    first = files[0]
+    for file in files:
+        if (file.width, file.height) != (first.width, first.height):
+            raise IngestError(
+                f'{file.path}: {file.width} x {file.height} pixels, {first.path} has '
+                f'{first.width} x {first.height}: import the images of one camera and mode'
+            )
+    by_time = sorted(files, key=lambda file: file.time_ns)
+    for before, after in itertools.pairwise(by_time):
+        if before.time_ns == after.time_ns:
+            raise IngestError(f'{after.path}: has the time of {before.path}')
+
+
+def _of_options(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str, Card]]:
+    return read_image(path, options.hdu, options.channel, options.bayer)
+
+
+def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
+    if options.times is not None:
+        if path.name not in options.times:
+            raise IngestError(f'{path}: not in the table of --times')
+        return options.times[path.name]
+    if not header:
+        raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
+    try:
+        return middle_of_exposure(header, options.time_key)
+    except (TimeError, ValueError, OverflowError) as error:
+        raise IngestError(f'{path}: {error}') from error

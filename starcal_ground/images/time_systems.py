@@ -63,10 +63,10 @@ def from_text(text: str, system: str) -> int:
 
     Raises TimeError for other text, a date alone, or a time before 1972.
     """
-    found = _TIME.fullmatch(text.strip())
-    if not found:
+    match = _TIME.fullmatch(text.strip())
+    if not match:
         raise TimeError(f'{text!r} is not a date and time, as 2026-05-15T07:20:00.5')
-    day, hour, minute, second, fraction = found.groups()
+    day, hour, minute, second, fraction = match.groups()
     if hour is None:
         raise TimeError(f'{text!r} has no time of day')  # midnight would be a guess
     if second == '60' and (system, hour, minute) != ('UTC', '23', '59'):
@@ -194,8 +194,8 @@ def _stamp(header: Mapping[str, Card], name: str) -> int:
         for key in clocks
     }
     if len(stamps) != 1:
-        found = f'{", ".join(clocks)} differ' if clocks else 'no keyword has one'
-        raise TimeError(f'{name} = {text!r} has no time of day, and {found}: {_INSTEAD}')
+        clocks_found = f'{", ".join(clocks)} differ' if clocks else 'no keyword has one'
+        raise TimeError(f'{name} = {text!r} has no time of day, and {clocks_found}: {_INSTEAD}')
     return stamps.pop()
 
 

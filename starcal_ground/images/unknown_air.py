@@ -121,14 +121,14 @@ def with_air(
     return [through.get(one.time_ns, one) for one in observations], text
 
 
-def _speed_m_s(images: Sequence[_Seen]) -> float:
+def _speed_m_s(images: Sequence[_Equations]) -> float:
     """Speed of the observer that explains the shifts of the stars where there is no air."""
     inverse, h = _common(images, SPACE_M_S)
     own = images[0].of_camera
     return float(np.linalg.norm((inverse @ h)[own : own + 3]))
 
 
-def _shapes_px(images: Sequence[_Seen], zenith: Floats, size_arcsec: float) -> Floats:
+def _shapes_px(images: Sequence[_Equations], zenith: Floats, size_arcsec: float) -> Floats:
     """Change (m,) of focal length, aspect ratio and skew by which an image differs, px."""
     left = [
         one.residual - one.by_air(zenith[k : k + 1])[:, 0] * (size_arcsec / USUAL_ARCSEC[0])
@@ -136,15 +136,15 @@ def _shapes_px(images: Sequence[_Seen], zenith: Floats, size_arcsec: float) -> F
     ]
     inverse, _ = _common(images, SPACE_M_S)
     h = np.sum([one.by_common.T @ r for one, r in zip(images, left, strict=True)], axis=0)
-    found = []
+    shapes = []
     for one, r in zip(images, left, strict=True):
         own = one.by_common[:, :3]
-        found.append(np.linalg.lstsq(own, r - one.by_common @ (inverse @ h), rcond=1e-10)[0])
-    return np.asarray(np.linalg.norm(found, axis=1))
+        shapes.append(np.linalg.lstsq(own, r - one.by_common @ (inverse @ h), rcond=1e-10)[0])
+    return np.asarray(np.linalg.norm(shapes, axis=1))
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Equations:
     """
     Stars (n) of an image: their directions, ICRF, and equations free of the rotation of the image.
 
@@ -175,7 +175,7 @@ def _without(turns: Floats, columns: Floats) -> Floats:
     return np.asarray(columns - turns @ (turns.T @ columns))
 
 
-def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen]:
+def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Equations]:
     """Equations of the best stars of each image, without those that no camera like it fits."""
     chosen = []
     for one in used:
@@ -195,7 +195,7 @@ def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen
     return [_seen(one, camera, first_ns) for one in kept]
 
 
-def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
+def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Equations:
     start = realigned(CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0])), one)
     camera_from_icrf = start.icrf_from_camera(one.icrf_from_star_tracker_xyzw).as_matrix().T
     e = one.direction_icrf @ camera_from_icrf.T
@@ -212,7 +212,7 @@ def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
     by_field = np.einsum('ab,nt->nabt', np.eye(2), waves).reshape(len(e), 2, -1) / sigma
     by_common = np.concatenate([by_camera / sigma, by_velocity, by_field], axis=2).reshape(n, -1)
     residual = ((one.measured_px - xy)[..., None] / sigma).reshape(n, 1)
-    return _Seen(
+    return _Equations(
         one.direction_icrf,
         camera_from_icrf[2],
         SIDEREAL_RAD_S * (one.time_ns - first_ns) / NANOSECONDS_PER_SECOND,
@@ -224,7 +224,7 @@ def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
     )
 
 
-def _common(images: Sequence[_Seen], velocity_m_s: float) -> tuple[Floats, Floats]:
+def _common(images: Sequence[_Equations], velocity_m_s: float) -> tuple[Floats, Floats]:
     """Inverse (c, c) of the information on what is common to images, and the gradient (c,)."""
     H = np.sum([one.by_common.T @ one.by_common for one in images], axis=0)
     own = images[0].of_camera
@@ -246,7 +246,7 @@ class _Choice:
     highest: int
 
 
-def _searched(images: Sequence[_Seen]) -> _Site:
+def _searched(images: Sequence[_Equations]) -> _Site:
     """
     The latitude that fits best, and the sidereal times.
 
@@ -259,7 +259,7 @@ def _searched(images: Sequence[_Seen]) -> _Site:
     variance = max((total - without_air) / max(freedom, 1), 1.0)
     inverse, h = _common(images, EARTH_M_S)
     fit = _Fit(images, inverse, h, variance)
-    found = []
+    sites = []
     by_gain = operator.attrgetter('gain')
     for times in (fit.by_stamps, fit.by_images):
         coarse = max((times(latitude, None) for latitude in _LATITUDES_RAD), key=by_gain)
@@ -267,17 +267,17 @@ def _searched(images: Sequence[_Seen]) -> _Site:
         fine = max((times(latitude, coarse) for latitude in near.clip(-1.5, 1.5)), key=by_gain)
         # The mean of a likelihood is that over all times, not over those about the best.
         best = fine if len(fine.times_rad) else coarse
-        found.append(dataclasses.replace(best, gain=coarse.gain - without_air / variance))
-    return max(found, key=by_gain)
+        sites.append(dataclasses.replace(best, gain=coarse.gain - without_air / variance))
+    return max(sites, key=by_gain)
 
 
-def _high(one: _Seen, zenith: Floats) -> Mask:
+def _high(one: _Equations, zenith: Floats) -> Mask:
     """Which zeniths (k, 3) are well above the stars of an image."""
     lowest = (one.direction @ zenith.T).min(axis=0)
     return np.asarray((zenith @ one.boresight > _LOWEST_BORESIGHT) & (lowest > LEAST_COSINE))
 
 
-def _choice(one: _Seen, zenith: Floats, times_rad: Floats) -> _Choice:
+def _choice(one: _Equations, zenith: Floats, times_rad: Floats) -> _Choice:
     columns = one.by_air(zenith)
     return _Choice(
         times_rad,
@@ -297,7 +297,7 @@ def _of_mean(chi2: Floats, at: int, variance: float) -> float:
 class _Fit:
     """Images with the information and the gradient of what is common, and the noise."""
 
-    images: Sequence[_Seen]
+    images: Sequence[_Equations]
     inverse: Floats
     h: Floats
     variance: float

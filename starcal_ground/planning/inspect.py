@@ -20,9 +20,8 @@ from starcal_ros.formats.messages import message_codec
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message, decode_png
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis import bags
-from starcal_ros.pipeline.diagnosis.bags import placed, refusals, Refused
+from starcal_ros.pipeline.diagnosis.bags import Refused
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
@@ -75,7 +74,7 @@ class Inspection:
 
     bags: tuple[str, ...]
     topics: tuple[TopicContent, ...]
-    chosen: Topics | None
+    chosen: bag_topics.Topics | None
     images: int
     refused: tuple[Refused, ...]
     longest_attitude_gap_s: float
@@ -91,7 +90,7 @@ class Inspection:
 
 def inspect(
     paths: Sequence[Path],
-    asked: Topics,
+    given: bag_topics.Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
     camera_alone: bool = False,
@@ -112,21 +111,21 @@ def inspect(
     chosen, seen, by_stars = None, [], False
     try:
         if by_stars := bag_topics.without_attitudes(
-            paths, asked, setup.options() if setup else {}, camera_alone
+            paths, given, setup.options() if setup else {}, camera_alone
         ):
             setup = None
-            chosen = Topics(image=bag_topics.choose_image_topic(paths, asked))
+            chosen = bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given))
         if setup:
             from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
 
-            source = source_of(paths, setup, asked)
+            source = source_of(paths, setup, given)
             chosen, setup, notes = source.topics, source.setup, source.notes
-            found = bag_topics.read(paths, chosen, setup)
-        elif (chosen := chosen or bag_topics.choose_topics(paths, asked)).observations:
-            found = reader.read_observations(paths, chosen.observations)
+            records = bag_topics.read(paths, chosen, setup)
+        elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:
+            records = reader.read_observations(paths, chosen.observations)
         else:
-            found = placed(paths, chosen, options)
-        for observations in found:
+            records = bags.placed(paths, chosen, options)
+        for observations in records:
             seen.append(observations)
             on_image()
     except (BagError, OptionError) as error:
@@ -142,13 +141,13 @@ def inspect(
         problems += _shortages(used, status)
     if chosen and seen and not used:
         command = '' if by_stars else 'starcal diagnose'
-        problems += _causes(paths, chosen, setup, refusals(seen), command)
+        problems += _causes(paths, chosen, setup, bags.refusals(seen), command)
     return Inspection(
         bags=tuple(map(str, paths)),
         topics=topics,
         chosen=chosen,
         images=len(seen),
-        refused=refusals(seen),
+        refused=bags.refusals(seen),
         longest_attitude_gap_s=max(
             (o.attitude_gap_s for o in used if math.isfinite(o.attitude_gap_s)), default=math.nan
         ),
@@ -185,11 +184,11 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
-    found = []
+    contents = []
     for name, type_name in sorted(type_names.items()):
         steps_s = np.diff(sorted(stamps[name])) / NANOSECONDS_PER_SECOND
         middle_s = float(np.median(steps_s)) if steps_s.size else 0.0
-        found.append(
+        contents.append(
             TopicContent(
                 name=name,
                 type_name=type_name,
@@ -203,7 +202,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                 bad=bad[name],
             )
         )
-    return tuple(found)
+    return tuple(contents)
 
 
 def _kind(message: message_codec.Message) -> str:
@@ -219,7 +218,7 @@ def _kind(message: message_codec.Message) -> str:
 
 def _causes(
     paths: Sequence[Path],
-    chosen: Topics,
+    chosen: bag_topics.Topics,
     setup: Setup | None,
     refused: Sequence[Refused],
     command: str,

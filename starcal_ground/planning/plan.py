@@ -226,9 +226,9 @@ def _as_estimated(
     problem = dataclasses.replace(
         problem, star_tracker_sigma_rad=np.tile(sigma_rad, (len(candidates), 1))
     )
-    found = estimate.linear.state
-    state = start_of(problem, estimate.geometry, len(found.focal), bool(len(found.rate)))
-    return problem, dataclasses.replace(state, focal=found.focal, rate=found.rate)
+    estimated = estimate.linear.state
+    state = start_of(problem, estimate.geometry, len(estimated.focal), bool(len(estimated.rate)))
+    return problem, dataclasses.replace(state, focal=estimated.focal, rate=estimated.rate)
 
 
 _CANDIDATES = 150  # in a cone: on the whole sky 16 degrees apart
@@ -344,16 +344,16 @@ def plan_pointings(ensemble: Ensemble, setup: Setup, request: Request) -> Plan:
     OptionError for a sigma that is not estimated, or if no pointing is allowed or shows a star.
     """
     setup = aligned_by(ensemble, setup)
-    found = estimated(ensemble, setup)
-    wanted = target(found, request.minimise)
+    estimate = estimated(ensemble, setup)
+    wanted = target(estimate, request.minimise)
     pointings = _allowed(request)
-    images = [_expected(found, ensemble, setup, one) for one in pointings]
+    images = [_expected(estimate, ensemble, setup, one) for one in pointings]
     if not any(map(len, images)):
         raise OptionError('no pointing that is allowed shows a star')
-    each = prospect(found, images, setup.calibration)
+    each = prospect(estimate, images, setup.calibration)
     chosen = _chosen(each, wanted, request, pointings, np.array([len(i) > 0 for i in images]))
     stars = [len(images[k]) for k in chosen]
-    sigmas = forecast(found, wanted, each.variances(chosen, wanted.squares), stars)
+    sigmas = forecast(estimate, wanted, each.variances(chosen, wanted.squares), stars)
     few = np.flatnonzero(sigmas[1:] > (1.0 - _HELPS) * sigmas[:-1])
     enough = int(few[0]) if len(few) else None
     now, *after = sigmas.tolist()

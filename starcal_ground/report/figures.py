@@ -711,7 +711,7 @@ def _draw_graticule(panel: svg.Panel) -> None:
             panel.text(x[36], y[36], f'{svg.in_digits(degrees)}°', svg.MUTED)
 
 
-def write_comparison(found: Comparison, path: Path) -> None:
+def write_comparison(comparison: Comparison, path: Path) -> None:
     """
     Draw the difference of two calibrations over the detector, with and without common rotation.
 
@@ -722,21 +722,21 @@ def write_comparison(found: Comparison, path: Path) -> None:
     """
     if path.suffix != '.svg':
         raise OptionError(f'{path}: the name must end in .svg')
-    camera = found.a.geometry.camera
+    camera = comparison.a.geometry.camera
     maps = [
-        _difference(camera, found.before, 'lines of sight, B minus A'),
-        _difference(camera, found.after, 'common rotation removed'),
+        _difference(camera, comparison.before, 'lines of sight, B minus A'),
+        _difference(camera, comparison.after, 'common rotation removed'),
     ]
     write_atomically(path, svg.sheet([maps]).document())
 
 
-def _difference(camera: CameraModel, found: DifferenceMap, title: str) -> svg.Drawing:
+def _difference(camera: CameraModel, difference: DifferenceMap, title: str) -> svg.Drawing:
     """Length in pixels as colours from zero, direction as arrows with a scale."""
-    sigmas, _ = found.worst_and_rms_sigmas
+    sigmas, _ = difference.worst_and_rms_sigmas
     in_sigmas = f', {significant(sigmas, 2)} sigma' if np.isfinite(sigmas) else ''
     drawn = detector_map(
-        found.length_px[::2, ::2], camera, ' px', shift_px=found.difference_px[::2, ::2]
+        difference.length_px[::2, ::2], camera, ' px', shift_px=difference.difference_px[::2, ::2]
     )
     return svg.sheet(
-        [[drawn]], f'{title}: at most {significant(found.length_px.max(), 3)} px{in_sigmas}'
+        [[drawn]], f'{title}: at most {significant(difference.length_px.max(), 3)} px{in_sigmas}'
     )

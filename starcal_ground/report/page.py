@@ -23,7 +23,7 @@ from markupsafe import Markup
 import numpy as np
 
 from starcal_ground import products
-from starcal_ground.products import CAMERA_INFO_FILE, OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ground.products import CAMERA_INFO_FILE
 from starcal_ground.report import figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
 from starcal_ground.report.thumbnails import star_of, Thumbnail
@@ -34,7 +34,6 @@ from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import (
@@ -227,12 +226,11 @@ def used_images(
     ]
 
 
-_DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are written
 _PRODUCTS = (
     product_files.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
     products.RESIDUALS_FILE,
-    OBSERVATIONS_FILE,
+    products.OBSERVATIONS_FILE,
 )
 PDF_FILE = 'report.pdf'
 
@@ -242,15 +240,13 @@ class Found:
     """
     Contents of a folder; ``residuals`` and ``observations`` are None without a file.
 
-    ``pictures`` are in the order of `thumbnails.ordered`, ``files`` the names of the products
-    beside the report.
+    ``pictures`` are in the order of `thumbnails.ordered`.
     """
 
     calibration: Calibration
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
-    pictures: tuple[thumbnails.Thumbnail, ...]
-    files: tuple[str, ...] = _PRODUCTS
+    pictures: tuple[Thumbnail, ...]
 
 
 def write_report(folder: Path) -> Path:
@@ -264,14 +260,17 @@ def write_report(folder: Path) -> Path:
     failure = products.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
-    path = folder / REPORT_FILE
-    write_atomically(path, with_digests(render(_read_folder(folder), folder), folder))
+    path = folder / products.REPORT_FILE
+    product_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
 
 def _read_folder(folder: Path) -> Found:
     residuals = folder / products.RESIDUALS_FILE
-    observations, ensemble = folder / OBSERVATIONS_FILE, folder / product_files.STATE_ENSEMBLE
+    observations, ensemble = (
+        folder / products.OBSERVATIONS_FILE,
+        folder / product_files.STATE_ENSEMBLE,
+    )
     calibration = product_files.read_calibration(product_files.calibration_file(folder))
     recorded = None
     if observations.is_file():
@@ -284,7 +283,6 @@ def _read_folder(folder: Path) -> Found:
         products.read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER),
-        tuple(name for name in _PRODUCTS if (folder / name).is_file()),
     )
 
 
@@ -292,34 +290,26 @@ def _observations(bag: Path) -> Iterator[StarObservations]:
     return reader.read_observations([bag], reader.choose_topic([bag], OBSERVATIONS_TYPE))
 
 
-def with_digests(text: str, folder: Path) -> str:
-    """The page of a folder with the SHA-256 digests of its products, which must be written."""
-    for name in _PRODUCTS:
-        if (folder / name).is_file():
-            (digest,) = inputs_of([folder / name]).values()
-            text = text.replace(_DIGEST.format(name), digest)
-    return text
-
-
-def render(found: Found, folder: Path) -> str:
+def render(contents: Found, folder: Path) -> str:
     """
-    HTML text of the report of a folder, for `with_digests`.
+    HTML text of the report of a folder, whose products must be written: it has their digests.
 
     Raises ProductError when the contents cannot be drawn.
     """
     try:
-        return page_template('report.html').render(_context(found))
+        return page_template('report.html').render(_context(contents, folder))
     # A file can hold numbers that no calibration has; the errors of drawing have no common base.
     except Exception as error:
         why = f'{type(error).__name__}: {error}'
         raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
 
 
-def _context(found: Found) -> Mapping[str, object]:
-    calibration, residuals, pictures = found.calibration, found.residuals, found.pictures
-    observations = found.observations or ()
+def _context(contents: Found, folder: Path) -> Mapping[str, object]:
+    calibration, residuals, pictures = contents.calibration, contents.residuals, contents.pictures
+    observations = contents.observations or ()
     prior = products.prior_of(calibration)
     refused = calibration.images_refused
+    written = [name for name in _PRODUCTS if (folder / name).is_file()]
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
@@ -343,7 +333,7 @@ def _context(found: Found) -> Mapping[str, object]:
         'refused_stars': refused_stars(observations, pictures),
         'model_rows': verdict.model_rows(calibration),
         'star_marks': star_marks(observations),
-        'files': [(name, _DIGEST.format(name)) for name in found.files],
+        'files': [(name, *inputs_of([folder / name]).values()) for name in written],
         'has_images': any(not one.reason for one in pictures),
         'used_images': used_images(observations, pictures),
         'options': _options(calibration),
@@ -385,8 +375,8 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
         for reason, count in record.images_refused.items()
     ]
     text = page_template('failure.html').render(record=record, pictures=pictures, refused=refused)
-    path = folder / REPORT_FILE
-    write_atomically(path, text)
+    path = folder / products.REPORT_FILE
+    product_files.write_atomically(path, text)
     return path
 
 
@@ -468,5 +458,5 @@ def write_pdf(page: Path) -> Path:
     within_page = weasyprint.URLFetcher(allowed_protocols=('data',))
     document = weasyprint.HTML(string=light(page.read_text()), url_fetcher=within_page)
     path = page.with_name(PDF_FILE)
-    write_atomically(path, document.write_pdf())
+    product_files.write_atomically(path, document.write_pdf())
     return path

@@ -151,8 +151,8 @@ def named(scale: Scale, most: int = 6) -> list[tuple[float, str]]:
 def light(text: str) -> str:
     """Text with the colours of the light palette in place of the variables of its drawings."""
     css = (Path(__file__).parent / 'templates' / 'report.css').read_text()
-    found = _PALETTE.search(css)
-    palette = dict(_VARIABLE.findall(found[1])) if found else {}
+    match = _PALETTE.search(css)
+    palette = dict(_VARIABLE.findall(match[1])) if match else {}
     return re.sub(r'(?<=")var\(--([\w-]+)\)(?=")', lambda name: palette[name[1]], text)
 
 

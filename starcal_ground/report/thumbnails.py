@@ -170,7 +170,7 @@ def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
     """
     if folder.is_symlink() or not folder.is_dir():
         return ()
-    found = []
+    pictures = []
     for path in itertools.islice(sorted(folder.iterdir()), _MOST_FILES):
         name = _NAME.fullmatch(path.name)
         if name is None:
@@ -181,8 +181,8 @@ def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
             continue
         if encoded.startswith(_MAGIC[path.suffix]):
             time_ns = int(name['image_ns'] or name['star_ns'])
-            found.append(Thumbnail(time_ns, name['reason'] or '', int(name['n'] or 0), encoded))
-    return ordered(found)
+            pictures.append(Thumbnail(time_ns, name['reason'] or '', int(name['n'] or 0), encoded))
+    return ordered(pictures)
 
 
 def ordered(thumbnails: Iterable[Thumbnail]) -> tuple[Thumbnail, ...]:

@@ -29,6 +29,13 @@ _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of
 _SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
 
 
+_UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
+    'focal_temperature_1': ' /degC',
+    'focal_temperature_2': ' /degC²',
+    'tau_x': ' rad',
+    'tau_y': ' rad',
+}
+"""By parameter; the coefficients of the lens have none."""
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
@@ -38,15 +45,15 @@ def check_rows(
     """Checks, the failed ones first, each with its result, value, limit and note as text."""
     rows = []
     for check in sorted(gate, key=lambda check: check.passed is not False):
-        found, limit, note = check.found_text, '', check.note
-        if check.unit == 'sigma' and found and math.isfinite(check.found):
-            found = f'{check.found:.1f} sigma'
+        value, limit, note = check.found_text, '', check.note
+        if check.unit == 'sigma' and value and math.isfinite(check.found):
+            value = f'{check.found:.1f} sigma'
             note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
         if note == 'no limit is set':
             limit = 'none'
         elif check.option:
             limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
-        rows.append((check, _RESULTS[check.passed], found, limit, note))
+        rows.append((check, _RESULTS[check.passed], value, limit, note))
     return rows
 
 
@@ -137,13 +144,15 @@ class ModelRow:
 
 def model_rows(calibration: records.Calibration) -> list[ModelRow]:
     """Rows for the assumptions that a calibration tested; none of one that tested none."""
-    found = calibration.model_checks
-    if found is None:
+    checks = calibration.model_checks
+    if checks is None:
         return []
-    step, cost_px = found.step, calibration.zero_skew_cost_px
-    field = f'field of {_px(found.field_rms_px)} rms per axis, at most {_px(found.field_worst_px)}'
-    if found.field_worst_px < VISIBLE_PX:
-        field = f'field of {_px(found.field_worst_px)} everywhere'
+    step, cost_px = checks.step, calibration.zero_skew_cost_px
+    field = (
+        f'field of {_px(checks.field_rms_px)} rms per axis, at most {_px(checks.field_worst_px)}'
+    )
+    if checks.field_worst_px < VISIBLE_PX:
+        field = f'field of {_px(checks.field_worst_px)} everywhere'
     return [
         ModelRow(
             'The lens model describes the lens',
@@ -152,7 +161,7 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
             '',
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
-        *_held(found.held),
+        *_held(checks.held),
         ModelRow(
             'The detector has no step',
             f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
@@ -161,7 +170,7 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
         ),
         ModelRow(
             'The camera is the same in all images',
-            f'varies by {_px(found.image_variation_px)} in a corner',
+            f'varies by {_px(checks.image_variation_px)} in a corner',
             '',
             REMEDIES['change from image to image'],
         ),
@@ -303,3 +312,13 @@ def alignment_summary(one: records.StarTrackerAlignment) -> str:
 
 def _three(values: Floats) -> str:
     return ', '.join(f'{value:.1f}' for value in values)
+
+
+def sigma_text(name: str, sigma: float) -> str:
+    """1-sigma of a parameter with its unit."""
+    if not math.isfinite(sigma):
+        return 'unobservable'
+    if name.startswith('alignment'):
+        per = '/degC' if name.endswith('_temperature') else ''
+        return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
+    return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'

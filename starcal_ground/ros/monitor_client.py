@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.live import Live
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
-from starcal_ground.cli.monitor_view import Seen, view
+from starcal_ground.cli.monitor_view import Received, view
 from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     observations_from_message,
@@ -39,7 +39,7 @@ class Monitor(Node):
 
     def __init__(self, context: rclpy.Context | None = None) -> None:
         super().__init__('starcal_monitor', context=context)
-        self.seen = Seen()
+        self.received = Received()
         self._unread = 0
         for kind, topic, qos, callback in (
             (StarObservations, 'observations', 100, self._on_observations),
@@ -59,15 +59,15 @@ class Monitor(Node):
             except (AttributeError, ValueError) as error:
                 self._unread += 1
                 words = f'{self._unread} messages cannot be read, the last: {error}'
-                self._set(health={**self.seen.health, 'monitor': (1, words)})
+                self._set(health={**self.received.health, 'monitor': (1, words)})
 
         return run
 
     def _set(self, **changes: Any) -> None:
-        self.seen = dataclasses.replace(self.seen, **changes)
+        self.received = dataclasses.replace(self.received, **changes)
 
     def _on_observations(self, message: Any) -> None:
-        self.seen = self.seen.with_image(observations_from_message(message))
+        self.received = self.received.with_image(observations_from_message(message))
 
     def _on_status(self, message: Any) -> None:
         self._set(status=status_from_message(message))
@@ -77,12 +77,12 @@ class Monitor(Node):
         self._set(active=calibration_from_message(message), candidate=None)
 
     def _on_candidate(self, message: Any) -> None:
-        candidate, active = calibration_from_message(message), self.seen.active
+        candidate, active = calibration_from_message(message), self.received.active
         if active is None or candidate.time_ns >= active.time_ns:
             self._set(candidate=candidate)
 
     def _on_diagnostics(self, message: Any) -> None:
-        health = dict(self.seen.health)
+        health = dict(self.received.health)
         for status in message.status:
             if status.name.startswith(_PREFIX):
                 level = int.from_bytes(status.level, 'little')
@@ -96,14 +96,14 @@ def run(monitor: Monitor, once_after_s: float | None, console: Console) -> int:
         deadline_s = time.monotonic() + once_after_s
         while time.monotonic() < deadline_s:
             rclpy.spin_once(monitor, timeout_sec=max(deadline_s - time.monotonic(), 0.0))
-        console.print(view(monitor.seen))
+        console.print(view(monitor.received))
         return 0
-    with Live(view(monitor.seen), console=console, auto_refresh=False, screen=True) as live:
+    with Live(view(monitor.received), console=console, auto_refresh=False, screen=True) as live:
         while monitor.context.ok():
             deadline_s = time.monotonic() + _PERIOD_S
             while (left_s := deadline_s - time.monotonic()) > 0:
                 rclpy.spin_once(monitor, timeout_sec=left_s)
-            live.update(view(monitor.seen), refresh=True)
+            live.update(view(monitor.received), refresh=True)
     return 0
 
 

@@ -49,34 +49,35 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         record, counted, active = observations(), status(), calibration()
         sound = observations_to_message(record, 'camera', make_message)
         publish(StarObservations, 'observations', sound)
-        client.until(lambda: monitor.seen.images == 1)
-        assert monitor.seen.last is not None and len(monitor.seen.last) == len(record)
+        client.until(lambda: monitor.received.images == 1)
+        assert monitor.received.last is not None and len(monitor.received.last) == len(record)
         publish(
             EnsembleStatus,
             'ensemble_status',
             status_to_message(counted, 'camera', make_message),
             LATCHED,
         )
-        client.until(lambda: monitor.seen.status is not None)
-        assert monitor.seen.status is not None and monitor.seen.status.images == counted.images
+        client.until(lambda: monitor.received.status is not None)
+        ensemble = monitor.received.status
+        assert ensemble is not None and ensemble.images == counted.images
         message = calibration_to_message(active, make_message)
         publish(Calibration, 'candidate_calibration', message, LATCHED)
-        client.until(lambda: monitor.seen.candidate is not None)
+        client.until(lambda: monitor.received.candidate is not None)
         publish(Calibration, 'calibration', message, LATCHED)
-        client.until(lambda: monitor.seen.active is not None)
-        assert monitor.seen.candidate is None
+        client.until(lambda: monitor.received.active is not None)
+        assert monitor.received.candidate is None
         healthy = DiagnosticStatus(
             level=DiagnosticStatus.WARN, name='starcal: star_observer', message='late'
         )
         other = DiagnosticStatus(name='another node', message='no concern of ours')
         publish(DiagnosticArray, '/diagnostics', DiagnosticArray(status=[healthy, other]))
-        client.until(lambda: monitor.seen.health)
-        assert monitor.seen.health == {'star_observer': (1, 'late')}
+        client.until(lambda: monitor.received.health)
+        assert monitor.received.health == {'star_observer': (1, 'late')}
         sound.covariance_px2[0] = -1.0
         publish(StarObservations, 'observations', sound)
-        client.until(lambda: 'monitor' in monitor.seen.health)
-        assert 'not positive definite' in monitor.seen.health['monitor'][1]
-        assert monitor.seen.images == 1
+        client.until(lambda: 'monitor' in monitor.received.health)
+        assert 'not positive definite' in monitor.received.health['monitor'][1]
+        assert monitor.received.images == 1
     finally:
         client._executor.remove_node(monitor)
         monitor.destroy_node()

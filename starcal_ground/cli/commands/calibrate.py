@@ -118,24 +118,16 @@ def _source_by_stars(
     """Photographs, or bags without attitudes: those of their stars are written to a folder."""
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import night_sky
-    from starcal_ros.formats.bag import reader
     from starcal_ros.pipeline.campaign import source_of
 
-    bags = [] if photographs else args.bags
-    files = [] if photographs else reader.mcap_files(bags)
     params = list(filter(None, [args.params]))
-    check_folder(args.output, bags, (*photographs, *params))
+    check_folder(args.output, [] if photographs else args.bags, (*photographs, *params))
     make_folder(args.output)
+    lens = args.focal_length_mm, args.pixel_size_um
     with failure_recorded(args.output, args.bags, NotFromStars):
-        if photographs:
-            chosen, notes = night_sky.photographs_of(
-                photographs, args.focal_length_mm, args.pixel_size_um
-            )
-            arguments.print_notes(notes)
-            files = [photograph.path for photograph in chosen]
-            sky = night_sky.from_photographs(chosen, values, folder)
-        else:
-            sky = night_sky.from_bags(bags, arguments.topics(args), values, folder)
+        sky, files = night_sky.from_images(
+            args.bags, arguments.topics(args), values, folder, lens, arguments.print_notes
+        )
     arguments.print_notes(sky.notes)
     return source_of(sky.bags, sky.setup, sky.topics, sky.through_air), (*files, *params)
 

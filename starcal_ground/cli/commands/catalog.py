@@ -13,8 +13,7 @@ parallax, phot_g_mean_mag and bp_rp, or their VizieR names.
 import argparse
 from pathlib import Path
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli import arguments, terminal
 from starcal_ground.products import check_outputs
 
 
@@ -32,13 +31,13 @@ def run(args: argparse.Namespace) -> int:
     output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
     check_outputs([output], [args.table])
     made = write_deep_catalog(args.table, output)
-    print_text(
+    terminal.print_text(
         f'{made.added} stars of {args.table} to V = {made.faintest:.1f}, with the bundled ones'
         f' {len(made.columns["id"])}, written to {output}'
     )
     if made.refused:
-        print_text(refusals(made.refused))
-    print_text(
+        terminal.print_text(refusals(made.refused))
+    terminal.print_text(
         f'in the parameter file: catalog: {output.absolute()}, magnitude_limit:'
         f' {made.faintest:.1f}'
     )

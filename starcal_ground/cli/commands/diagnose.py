@@ -16,8 +16,7 @@ exit status: 0 the set-up is right; 3 it is wrong, or the cause is unknown; 2 ba
 
 import argparse
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli import arguments, terminal
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -35,5 +34,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         arguments.print_json(diagnosis)
     else:
-        print_text('\n'.join(diagnosis.in_lines()))
+        terminal.print_text('\n'.join(diagnosis.in_lines()))
     return arguments.EXIT_ACCEPTED if diagnosis.cause == 'none' else arguments.EXIT_REFUSED

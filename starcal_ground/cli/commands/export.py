@@ -28,8 +28,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli import arguments, terminal
 from starcal_ground.products import make_folder, OBSERVATIONS_FILE
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
@@ -78,14 +77,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = read_calibration(calibration_file(args.calibration))
     names = None
     if args.spacecraft_id is not None:
-        names = SpiceNames(
-            args.spacecraft_id,
-            args.instrument_id,
-            args.star_tracker_id,
-            args.camera_frame,
-            args.star_tracker_frame,
-            args.pixel_size_um,
-        )
+        names = arguments.record_of(SpiceNames, args)
     make_folder(args.output)
     observations: Iterable[StarObservations] = ()
     if args.to == 'ck':
@@ -94,19 +86,19 @@ def run(args: argparse.Namespace) -> int:
         *(calibration, args.to, args.output, names, args.image_topic, args.table),
         *(observations, args.kernels),
     )
-    print_text(f'written: {", ".join(map(str, done.files))}')
+    terminal.print_text(f'written: {", ".join(map(str, done.files))}')
     if not calibration.accepted:
         arguments.complain(
             f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}'
         )
     if not math.isfinite(done.worst_px):
-        print_text('the format cannot see the whole detector: use spice, opencv or csv')
+        terminal.print_text('the format cannot see the whole detector: use spice, opencv or csv')
     else:
-        print_text(
+        terminal.print_text(
             f'largest error of a pixel against the calibration: {significant(done.worst_px, 3)} px'
         )
     for loss in done.losses:
-        print_text(f'left out: {loss.part}, {significant(loss.cost_px, 3)} px alone')
+        terminal.print_text(f'left out: {loss.part}, {significant(loss.cost_px, 3)} px alone')
     return arguments.EXIT_ACCEPTED
 
 

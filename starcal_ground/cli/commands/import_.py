@@ -72,18 +72,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.images.image_series import ImageOptions
+    from starcal_ground.images.photographs import ImageOptions
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ground.mission.ingest.mission_records import Guard
 
-    options = ImageOptions(
-        time_key=args.time_key,
-        hdu=args.hdu,
-        channel=args.channel,
-        bayer=args.bayer,
-        value_range=None if args.value_range is None else tuple(args.value_range),
-        temperature_key=args.temperature_key,
-    )
+    options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=None)
     needed = 4 * (1 + len(args.more_star_trackers))
     given = len(args.alignment)
     if args.camera and given != needed and (given or args.more_star_trackers):
@@ -132,10 +125,10 @@ def _names(paths: Sequence[Path]) -> str:
 
 def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
     """Files of patterns, each once, in order of their names."""
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for pattern in patterns:
         names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
         if not names:
             raise OptionError(f'{option}: no file matches {pattern}')
-        found |= dict.fromkeys(map(Path, names))
-    return list(found)
+        files |= dict.fromkeys(map(Path, names))
+    return list(files)

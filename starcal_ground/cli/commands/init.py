@@ -15,8 +15,7 @@ that you have to state.
 import argparse
 import shlex
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli import arguments, terminal
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -49,11 +48,11 @@ def run(args: argparse.Namespace) -> int:
     write_camera_info(setup.camera, camera)
     write_atomically(params, setup.parameter_file())
     for line in setup.found:
-        print_text(f'found: {line}')
+        terminal.print_text(f'found: {line}')
     for line in setup.to_state:
-        print_text(f'left to state: {line}')
-    print_text(f'written: {params}, {camera}')
+        terminal.print_text(f'left to state: {line}')
+    terminal.print_text(f'written: {params}, {camera}')
     given = [f'--{kind}-topic={name}' for kind, name in vars(topics).items() if name]
     words = ['starcal', 'calibrate', *map(str, args.bags), '--params', str(params), *given]
-    print_text(f'next: {shlex.join(words)} -o out')
+    terminal.print_text(f'next: {shlex.join(words)} -o out')
     return arguments.EXIT_ACCEPTED

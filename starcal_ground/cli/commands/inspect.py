@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict, progress_bar
-from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.constants import utc_text
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -69,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _print(inspection: Inspection) -> None:
     """Print topics, images, attitudes and refused images."""
+    from starcal_ground.report import verdict
+
     print_table(
         ('topic', 'type', 'messages', 'rate', 'longest gap'),
         [
@@ -93,7 +95,7 @@ def _print(inspection: Inspection) -> None:
         print_table(
             ('predicted', '1-sigma'),
             [
-                (name, _predicted(name, value))
+                (name, verdict.sigma_text(name, value))
                 for name, value in zip(
                     inspection.status.parameter_names,
                     inspection.status.predicted_sigma,
@@ -143,14 +145,6 @@ def _print_images(inspection: Inspection) -> None:
 
 def _counted(counts: Mapping[str, int]) -> str:
     return ', '.join(f'{count} {reason}' for reason, count in counts.items()) or 'none'
-
-
-def _predicted(name: str, sigma: float) -> str:
-    if not math.isfinite(sigma):
-        return 'not observable yet'
-    return (
-        f'{sigma / ARCSECOND_RAD:.2f}"' if name.startswith('alignment') else significant(sigma, 2)
-    )
 
 
 def _topic_notes(topic: TopicContent) -> list[str]:

@@ -15,8 +15,7 @@ sight include the residual field if there is one.
 import argparse
 import math
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
 
@@ -56,5 +55,5 @@ def run(args: argparse.Namespace) -> int:
         pixels = pixels_every(camera, args.step)
     table = line_of_sight_table(camera, calibration.map_covariance, pixels)
     write_lookup_table(table, args.output)
-    print_text(f'{len(pixels)} lines of sight written to {args.output}')
+    terminal.print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return arguments.EXIT_ACCEPTED

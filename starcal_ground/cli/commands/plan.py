@@ -20,8 +20,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_table, print_text
+from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import errors_as, OptionError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.text import significant
@@ -85,14 +84,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         arguments.print_json(plan)
         return arguments.EXIT_ACCEPTED
-    print_table(*_table(plan), left=0)
+    terminal.print_table(*_table(plan), left=0)
     if plan.enough is not None:
-        print_text(f'after image {plan.enough} another lowers the sigma by less than 1 %')
-    print_text(plan.in_a_sentence())
+        terminal.print_text(f'after image {plan.enough} another lowers the sigma by less than 1 %')
+    terminal.print_text(plan.in_a_sentence())
     if len(plan.steps) < args.images:
-        print_text(f'no other pointing can be reached after image {len(plan.steps)}')
+        terminal.print_text(f'no other pointing can be reached after image {len(plan.steps)}')
     if args.output:
-        print_text(f'pointings written to {args.output}')
+        terminal.print_text(f'pointings written to {args.output}')
     return arguments.EXIT_ACCEPTED
 
 

@@ -14,8 +14,7 @@ for signatures (extra pdf).
 
 import argparse
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli import arguments, terminal
 from starcal_ground.products import check_outputs, REPORT_FILE
 
 
@@ -32,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     names = (REPORT_FILE, page.PDF_FILE) if args.pdf else (REPORT_FILE,)
     check_outputs(args.folder / name for name in names)
     written = page.write_report(args.folder)
-    print_text(f'report written to {written}')
+    terminal.print_text(f'report written to {written}')
     if args.pdf:
-        print_text(f'report written to {page.write_pdf(written)}')
+        terminal.print_text(f'report written to {page.write_pdf(written)}')
     return arguments.EXIT_ACCEPTED

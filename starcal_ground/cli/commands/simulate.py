@@ -21,14 +21,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
-
-if TYPE_CHECKING:
-    from starcal_ground.simulation.simulated_bag import Mistakes
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -47,16 +43,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     what = 'draw only the N brightest stars of each image'
     add('--stars-per-image', type=number(int, 1), metavar='N', help=what)
     add = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"').add_argument
-    what, sides = (
-        'mirror the images (default where no side is given: left-right)',
-        (
-            'left-right',
-            'top-bottom',
-        ),
-    )
-    add('--flip', nargs='?', const=sides[0], choices=sides, help=what)
+    what = 'mirror the images (default where no side is given: left-right)'
+    sides = ('left-right', 'top-bottom')
+    add('--flip', nargs='?', default='', const=sides[0], choices=sides, help=what)
     what = 'angle of a counterclockwise rotation of the images, degrees'
-    add('--rotate', type=int, choices=(0, 90, 180, 270), default=0, help=what)
+    angles = (0, 90, 180, 270)
+    add('--rotate', dest='rotate_deg', type=int, choices=angles, default=0, help=what)
     what = 'direction of the attitudes in the bag; the parameter file has st_to_inertial'
     directions = ('st_to_inertial', 'inertial_to_st')
     add('--attitude-direction', choices=directions, default=directions[0], help=what)
@@ -67,9 +59,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         ('focal-error', -90, 400, 'PERCENT', 'error of the prior focal length, percent'),
         ('clock-error', -1e9, 1e9, 'S', 'delay of the image stamps, s, over 0.75'),
     ):
-        add(f'--{name}', type=number(float, low, high), default=0.0, metavar=metavar, help=what)
+        add(f'--{name}', dest=f'{name.replace("-", "_")}_{metavar.lower()}',
+            type=number(float, low, high), default=0.0, metavar=metavar, help=what)  # fmt: skip
     what = 'length of the streak of a star, px'
-    add('--smear', type=number(int, 1, 200), default=1, metavar='PX', help=what)
+    length = number(int, 1, 200)
+    add('--smear', dest='smear_px', type=length, default=1, metavar='PX', help=what)
     what = 'tone curve: pixel values grow with light to the power 1/G'
     add('--gamma', type=number(float, 0.2, 5), default=1.0, metavar='G', help=what)
 
@@ -86,7 +80,13 @@ def run(args: argparse.Namespace) -> int:
         image_count=args.images or scenario.image_count,
         stars_per_image=args.stars_per_image,
     )
-    mistakes = _mistakes(args)
+    mistakes = arguments.record_of(simulated_bag.Mistakes, args)
+    still_s = max(synthetic.ATTITUDE_OFFSETS_S)
+    if 0 < abs(mistakes.clock_error_s) <= still_s:
+        raise OptionError(
+            f'--clock-error: {mistakes.clock_error_s:g} s changes no result: in the scenarios the'
+            f' camera is at rest, or turns evenly, within {still_s:g} s of an image; give more'
+        )
     with progress_bar(scenario.image_count, 'images') as advance:
         made = simulated_bag.write_bag(
             scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
@@ -95,26 +95,3 @@ def run(args: argparse.Namespace) -> int:
     print_text(f'truth {made.truth}')
     print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return arguments.EXIT_ACCEPTED
-
-
-def _mistakes(args: argparse.Namespace) -> Mistakes:
-    from starcal_ground.simulation.scenario import ATTITUDE_OFFSETS_S
-    from starcal_ground.simulation.simulated_bag import Mistakes
-
-    still_s = max(ATTITUDE_OFFSETS_S)
-    if 0 < abs(args.clock_error) <= still_s:
-        raise OptionError(
-            f'--clock-error: {args.clock_error:g} s changes no result: in the scenarios the camera'
-            f' is at rest, or turns evenly, within {still_s:g} s of an image; give more'
-        )
-    return Mistakes(
-        flip=args.flip or '',
-        rotate_deg=args.rotate,
-        attitude_direction=args.attitude_direction,
-        quaternion_order=args.quaternion_order,
-        alignment_error_deg=args.alignment_error,
-        focal_error_percent=args.focal_error,
-        clock_error_s=args.clock_error,
-        smear_px=args.smear,
-        gamma=args.gamma,
-    )

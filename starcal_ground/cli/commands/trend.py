@@ -23,8 +23,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.cli import arguments, terminal
 from starcal_ground.products import check_outputs, make_folder
 from starcal_ros.errors import OptionError
 
@@ -81,19 +80,19 @@ def run(args: argparse.Namespace) -> int:
     make_folder(folder)
     check_outputs([folder / trend_page.TREND_FILE])
     table = Table(folder)
-    with progress_bar(None, 'calibrations') as advance:
+    with terminal.progress_bar(None, 'calibrations') as advance:
         done = fleet.update(table, tasks(), args.workers, args.scheduler, advance)
     if done == fleet.Done():
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
         )
     page = trend_page.write_page(table.cameras(), len(table.names()), folder, args.root)
-    print_text(f'{done.computed} new, {done.known} known, {done.failed} failed')
+    terminal.print_text(f'{done.computed} new, {done.known} known, {done.failed} failed')
     for row in page.failures[:_FAILURES_SHOWN]:
-        print_text(f'failed: {row.path}: {row.error}')
+        terminal.print_text(f'failed: {row.path}: {row.error}')
     if args.parquet:
-        print_text(f'written to {table.write_parquet()}')
-    print_text(f'{page.years:.2f} years; look at {page.path}')
+        terminal.print_text(f'written to {table.write_parquet()}')
+    terminal.print_text(f'{page.years:.2f} years; look at {page.path}')
     if done.silent == fleet.MOST_SILENT:
         arguments.complain(
             f'{args.root}: no answer for {done.silent} files; run again when the store answers:'

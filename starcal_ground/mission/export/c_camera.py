@@ -161,8 +161,8 @@ def _vectors(calibration: Calibration, common: Floats) -> Iterator[Floats]:
             continue
         covariance = calibration.map_covariance
         of_pixel = covariance.unresolved_px**2 * there.by_pixel[0] @ there.by_pixel[0].T
-        found = [
+        covariances = [
             (J[0] @ covariance.matrix @ J[0].T + of_pixel).ravel()
             for J in (there.J, there.of_shape(camera, common))
         ]
-        yield np.concatenate([[degc], pixel, there.directions[0], *found])
+        yield np.concatenate([[degc], pixel, there.directions[0], *covariances])

@@ -283,8 +283,8 @@ def _radial(camera: CameraModel) -> tuple[Floats, Floats, float]:
 
     start = np.r_[camera.intrinsics, 0.0, 0.0]
     scale = np.r_[np.full(5, camera.intrinsics[0] * 1e-3), 1e-2, 1e-1]
-    found = least_squares(
+    fit = least_squares(
         lambda p: np.nan_to_num(error_px(p), nan=camera.width).ravel(), start, x_scale=scale
     )
-    worst_px = float(np.linalg.norm(error_px(found.x), axis=1).max())
-    return found.x[:5], found.x[5:], worst_px if np.isfinite(worst_px) else np.inf
+    worst_px = float(np.linalg.norm(error_px(fit.x), axis=1).max())
+    return fit.x[:5], fit.x[5:], worst_px if np.isfinite(worst_px) else np.inf

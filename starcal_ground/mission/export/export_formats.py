@@ -12,16 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground.mission.export import camera_models
+from starcal_ground.mission.export import camera_models, spice
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.camera_models import isd_files
 from starcal_ground.mission.export.exported import Content, Loss, temperature_losses
-from starcal_ground.mission.export.spice import (
-    check_names,
-    ck_of_images,
-    spice_kernels,
-    SpiceNames,
-)
 from starcal_ground.products import check_outputs
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table, LineOfSightTable
@@ -54,7 +47,7 @@ def export(
     calibration: Calibration,
     kind: str,
     folder: Path,
-    names: SpiceNames | None,
+    names: spice.SpiceNames | None,
     topic: str = '',
     table: bool = False,
     observations: Iterable[StarObservations] = (),
@@ -92,12 +85,12 @@ def export(
     if kind in _OF_SPICE:
         if names is None:
             raise OptionError(f'--to {kind}: give the NAIF ID of the spacecraft, --spacecraft-id')
-        check_names(names)
-    naif = names or SpiceNames(0)
+        spice.check_names(names)
+    naif = names or spice.SpiceNames(0)
     makers: Mapping[str, Callable[[], Content]] = {
-        'spice': lambda: spice_kernels(calibration, naif),
-        'ck': lambda: ck_of_images(calibration, observations, naif, kernels),
-        'isd': lambda: isd_files(calibration, naif),
+        'spice': lambda: spice.spice_kernels(calibration, naif),
+        'ck': lambda: spice.ck_of_images(calibration, observations, naif, kernels),
+        'isd': lambda: camera_models.isd_files(calibration, naif),
         'opencv': lambda: camera_models.opencv_yaml(calibration),
         'kalibr': lambda: camera_models.kalibr_yaml(calibration, topic),
         'ros': lambda: camera_models.ros_yaml(calibration),

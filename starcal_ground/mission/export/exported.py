@@ -65,7 +65,7 @@ def fitted(
     see the whole detector.
     """
     camera = calibration.geometry.camera
-    found, worst_px = nearest_camera(camera, model, zero)
+    nearest, worst_px = nearest_camera(camera, model, zero)
     losses = []
     lens = dataclasses.replace(camera, field=None)
     if camera.has_field:
@@ -80,7 +80,7 @@ def fitted(
         for name in zero
         if lens.parameters[lens.parameter_names.index(name)] != 0
     ]
-    return found, Content({}, worst_px, (*losses, *temperature_losses(calibration)))
+    return nearest, Content({}, worst_px, (*losses, *temperature_losses(calibration)))
 
 
 def _alone(camera: CameraModel, model: str, zero: tuple[str, ...]) -> float:

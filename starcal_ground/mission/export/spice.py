@@ -390,15 +390,15 @@ def ck_of_images(
     the camera; else of the camera itself, by its instrument ID.  Raises ProductError if no image
     has stars, or SPICE refuses the file.  Raises IngestError for a kernel that cannot be read.
     """
-    found = {
+    attitudes = {
         image.time_ns: one
         for image in observations
         if (one := attitude_by_stars(calibration, image)) is not None
     }
-    if not found:
+    if not attitudes:
         raise ProductError('--to ck: no image with stars among the observations')
-    times_ns = sorted(found)
-    icrf_from_frame = Rotation.concatenate([found[time_ns][0] for time_ns in times_ns])
+    times_ns = sorted(attitudes)
+    icrf_from_frame = Rotation.concatenate([attitudes[time_ns][0] for time_ns in times_ns])
     if names.star_tracker_id:
         icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
     structure = names.star_tracker_id or names.camera_id
@@ -412,7 +412,7 @@ def ck_of_images(
         except spice.SpiceyError as error:
             words = ' '.join(str(error).split())[:240]
             raise ProductError(f'{CK_FILE}: {words}') from error
-    sigma_px = float(np.median([sigma_px for _, sigma_px in found.values()]))
+    sigma_px = float(np.median([sigma_px for _, sigma_px in attitudes.values()]))
     loss = exported.Loss('1-sigma of the attitude of an image (median)', sigma_px)
     return exported.Content({CK_FILE: data}, losses=(loss,))
 

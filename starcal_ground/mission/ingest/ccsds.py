@@ -103,7 +103,7 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
     segments = read_segments(path, 'OEM')
     with mission_records.naming(path):
         at = np.array(at_ns, np.int64)
-        found = np.full((len(at), 3), np.nan)
+        velocities = np.full((len(at), 3), np.nan)
         notes: list[str] = []
         for segment in segments:
             notes += mission_records.frame_notes(_keyword(segment, 'REF_FRAME'))
@@ -118,26 +118,26 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
             orbit = CubicHermiteSpline(seconds, states[:, :3], states[:, 3:6])
             since_s = (at[inside] - stamps[0]) / NANOSECONDS_PER_SECOND
             center = _keyword(segment, 'CENTER_NAME')
-            found[inside] = orbit(since_s, 1) * _KM + _center_velocity(center, at[inside])
-        missing = ~np.isfinite(found[:, 0])
+            velocities[inside] = orbit(since_s, 1) * _KM + _center_velocity(center, at[inside])
+        missing = ~np.isfinite(velocities[:, 0])
         if missing.any():
             raise ValueError(
                 f'no velocity for {int(missing.sum())} of {len(at)} images, '
                 f'the first at {utc_text(int(at[missing][0]))}'
             )
-        return mission_records.Velocities(at, found, tuple(dict.fromkeys(notes)))
+        return mission_records.Velocities(at, velocities, tuple(dict.fromkeys(notes)))
 
 
 def _keyword(segment: Segment, key: str, *values: str) -> str:
     """Value of a required keyword; it must be one of ``values`` unless that is empty."""
-    found = segment.metadata.get(key, '').upper()
-    if not found or (values and found not in values):
+    value = segment.metadata.get(key, '').upper()
+    if not value or (values and value not in values):
         expected = f' {" or ".join(values)}' if values else ''
         raise ValueError(
-            f'keyword {key} is {found or "missing"}, but version {segment.version} requires'
+            f'keyword {key} is {value or "missing"}, but version {segment.version} requires'
             f' it{expected}: ask the producer of the file'
         )
-    return found
+    return value
 
 
 def _frames(segment: Segment) -> tuple[str, str, bool]:
@@ -347,8 +347,8 @@ def _kvn_segments(text: str, kind: str) -> list[Segment]:
     lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
     used = ((n, line) for n, line in lines if line and not line.startswith('COMMENT'))
     _, first = next(used, (0, ''))
-    found = _VERSION.fullmatch(first)
-    if not found or found[1] != kind:
+    version = _VERSION.fullmatch(first)
+    if not version or version[1] != kind:
         raise ValueError(f'it begins with {first[:60]!r}, not with CCSDS_{kind}_VERS')
     layout = _LAYOUTS[kind]
     segments: list[Segment] = []
@@ -358,7 +358,7 @@ def _kvn_segments(text: str, kind: str) -> list[Segment]:
         if after:
             section = after
             if line == 'META_START':
-                segments.append(Segment(found[2], is_xml=False))
+                segments.append(Segment(version[2], is_xml=False))
             continue
         try:
             _kvn_line(section, line, segments)

@@ -20,7 +20,7 @@ import yaml
 
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.images import image_series
+from starcal_ground.images import photographs
 from starcal_ground.images.from_stars import options_of
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
@@ -70,10 +70,10 @@ class Recorded:
 
 def look_at_all(
     paths: Sequence[Path],
-    options: image_series.ImageOptions,
+    options: photographs.ImageOptions,
     guard: Guard,
     on_image: Callable[[], None] = lambda: None,
-) -> tuple[list[image_series.ImageFile], list[str]]:
+) -> tuple[list[photographs.ImageFile], list[str]]:
     """
     The image files in order of time, and one line for each file that cannot be taken.
 
@@ -82,16 +82,16 @@ def look_at_all(
     files, problems = [], []
     for path in paths:
         try:
-            files.append(guard.call(path, image_series.look, path, _options_of(path, options)))
+            files.append(guard.call(path, photographs.look, path, _options_of(path, options)))
         except IngestError as error:
             problems.append(str(error))
         on_image()
     if files:
-        image_series.check_alike(files)
+        photographs.check_alike(files)
     return sorted(files, key=lambda file: file.time_ns), problems
 
 
-def _options_of(path: Path, options: image_series.ImageOptions) -> image_series.ImageOptions:
+def _options_of(path: Path, options: photographs.ImageOptions) -> photographs.ImageOptions:
     """Options without the times of the other images, which are not sent with each."""
     if options.times is None:
         return options
@@ -124,8 +124,8 @@ def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
 
 def write_bag(
     bag: Path,
-    files: Sequence[image_series.ImageFile],
-    options: image_series.ImageOptions,
+    files: Sequence[photographs.ImageFile],
+    options: photographs.ImageOptions,
     guard: Guard,
     attitudes: Attitudes,
     velocities: Velocities | None = None,
@@ -144,7 +144,7 @@ def write_bag(
     covered = [_gap_s(attitudes, file.time_ns) for file in files]
     notes = [*attitudes.notes, *(velocities.notes if velocities else ())]
     notes += _coverage_notes(files, attitudes, covered)
-    scale = image_series.common_scale(files, options)
+    scale = photographs.common_scale(files, options)
     notes += _scale_notes(files, scale)
     writer = BagWriter(bag)
     record, params, copied = _files_beside(bag)
@@ -172,7 +172,7 @@ def write_bag(
     return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 
-def _near(attitudes: Attitudes, files: Sequence[image_series.ImageFile]) -> Attitudes:
+def _near(attitudes: Attitudes, files: Sequence[photographs.ImageFile]) -> Attitudes:
     """Attitudes from a minute before the first image to a minute after the last."""
     stamps = attitudes.time_ns
     first_ns, last_ns = files[0].time_ns - _MARGIN_NS, files[-1].time_ns + _MARGIN_NS
@@ -196,7 +196,7 @@ def _span(first_ns: int, last_ns: int) -> str:
 
 
 def _coverage_notes(
-    files: Sequence[image_series.ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
+    files: Sequence[photographs.ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
 ) -> list[str]:
     longest_s = AttitudeOptions().max_attitude_gap_s
     outside = [file for file, gap_s in zip(files, gaps_s, strict=True) if math.isinf(gap_s)]
@@ -221,7 +221,7 @@ def _coverage_notes(
     return notes
 
 
-def _scale_notes(files: Sequence[image_series.ImageFile], scale: image_series.Scale) -> list[str]:
+def _scale_notes(files: Sequence[photographs.ImageFile], scale: photographs.Scale) -> list[str]:
     if scale.is_none:
         return []
     notes = [f'pixel values are {scale.offset:.9g} + {scale.step:.9g} DN']
@@ -236,9 +236,9 @@ def _scale_notes(files: Sequence[image_series.ImageFile], scale: image_series.Sc
 
 def _write_messages(
     writer: BagWriter,
-    files: Sequence[image_series.ImageFile],
-    options: image_series.ImageOptions,
-    scale: image_series.Scale,
+    files: Sequence[photographs.ImageFile],
+    options: photographs.ImageOptions,
+    scale: photographs.Scale,
     guard: Guard,
     trackers: Mapping[str, Attitudes],
     velocities: Velocities | None,
@@ -264,7 +264,7 @@ def _write_messages(
                     TEMPERATURE_TOPIC, time_ns, content.temperature_degc, 'camera'
                 )
             wanted = _options_of(content.path, options)
-            pixels = guard.call(content.path, image_series.pixels_of, content.path, wanted, scale)
+            pixels = guard.call(content.path, photographs.pixels_of, content.path, wanted, scale)
             if rows_upward and is_fits(content.path):
                 pixels = pixels[::-1]
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
@@ -277,8 +277,8 @@ def _prior_files(
     prior: Prior,
     params: Path,
     copied: Path,
-    files: Sequence[image_series.ImageFile],
-    scale: image_series.Scale,
+    files: Sequence[photographs.ImageFile],
+    scale: photographs.Scale,
     by_stars: bool,
     others: Sequence[str],
 ) -> dict[Path, str]:

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.from_stars import pinhole
-from starcal_ground.images.image_series import ImageFile
+from starcal_ground.images.photographs import ImageFile
 from starcal_ground.mission.ingest import ccsds, kernels, mission_records
 from starcal_ground.mission.ingest.mission_records import Attitudes, EME2000_NOTE, Velocities
 from starcal_ros.camera import line_of_sight, pixel_grid
@@ -130,10 +130,10 @@ def _attitude(path: Path, image: ImageFile) -> tuple[Rotation, bool]:
 
 def _directions(wcs: Any, pixels: Any, path: Path) -> Any:
     """Unit vectors (n, 3) of pixels (n, 2), the centre of the first one (0, 0)."""
-    found = erfa.s2c(*np.radians(np.asarray(wcs.all_pix2world(pixels, 0)).T))
-    if not np.isfinite(found).all():
+    directions = erfa.s2c(*np.radians(np.asarray(wcs.all_pix2world(pixels, 0)).T))
+    if not np.isfinite(directions).all():
         raise IngestError(f'{path}: the WCS does not reach the corners of the image')
-    return found
+    return directions
 
 
 def _celestial(path: Path) -> Any:
@@ -145,11 +145,11 @@ def _celestial(path: Path) -> Any:
         with warnings.catch_warnings(), regular_file(path) as file:
             warnings.simplefilter('ignore')  # warnings about keywords that astropy repairs
             with fits.open(file, memmap=False) as units:
-                found = [WCS(unit.header) for unit in units if 'CTYPE1' in unit.header]
+                systems = [WCS(unit.header) for unit in units if 'CTYPE1' in unit.header]
     except Exception as error:  # astropy raises any exception on a damaged file
         words = ' '.join(str(error).split())[:160]
         raise IngestError(f'{path}: no WCS can be read: {words}') from error
-    wcs = next((one.celestial for one in found if one.has_celestial), None)
+    wcs = next((one.celestial for one in systems if one.has_celestial), None)
     if wcs is None:
         raise IngestError(f'{path}: has no celestial WCS: solve the image first')
     # astropy adds a missing frame: FK5 if only an equinox is given, otherwise ICRS.

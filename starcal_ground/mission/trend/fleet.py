@@ -30,17 +30,7 @@ from typing import Any
 import numpy as np
 
 from starcal_ground import products
-from starcal_ground.mission.trend import places
-from starcal_ground.mission.trend.places import Entry
-from starcal_ground.mission.trend.trend_table import (
-    COMPUTED,
-    failure,
-    kept_name,
-    RECORDED,
-    Row,
-    row_of,
-    Table,
-)
+from starcal_ground.mission.trend import places, trend_table
 from starcal_ground.products import OBSERVATIONS_FILE
 from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, ProductError, StarcalError
@@ -132,7 +122,7 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
 
 def _tasks(
     root: str,
-    listed: dict[str, Entry],
+    listed: dict[str, places.Entry],
     cameras: Cameras,
     version: str,
     settings_of: Callable[[str], tuple[tuple[str, ...], str]],
@@ -164,25 +154,25 @@ def _settings(params: str) -> tuple[tuple[str, ...], str]:
 
 def digest(files: Sequence[str | Path], version: str = '') -> str:
     """Digest of the contents of files, those that do not exist left out; raises OSError."""
-    found = hashlib.sha256(version.encode())
+    sha256 = hashlib.sha256(version.encode())
     for file in files:
         if not os.path.lexists(file):
             continue  # metadata.yaml of a bag, which need not be there
         with untrusted.regular_file(Path(file)) as stream:
             while block := stream.read(1 << 20):
-                found.update(block)
-    return found.hexdigest()
+                sha256.update(block)
+    return sha256.hexdigest()
 
 
 def _task(
     root: str,
     name: str,
-    files: Sequence[Entry],
+    files: Sequence[places.Entry],
     cameras: Cameras,
     version: str = '',
     params: str = '',
     settings: tuple[tuple[str, ...], str] = ((), ''),
-    others: Sequence[Entry] = (),
+    others: Sequence[places.Entry] = (),
 ) -> Task:
     """A task; ``version`` is that which would calibrate a bag, ``others`` are read with it."""
     # A calibration is the same whatever is beside it, a bag is not.
@@ -203,9 +193,9 @@ def _task(
     )
 
 
-def _bags(listed: dict[str, Entry]) -> dict[str, list[Entry]]:
+def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
     """Bag folders with a metadata.yaml, and single files elsewhere; no files of an archive."""
-    found: dict[str, list[Entry]] = {}
+    bags: dict[str, list[places.Entry]] = {}
     for name, entry in listed.items():
         folder, file = posixpath.split(name)
         # One image each: the state of a calibrator, calibrated there.
@@ -213,10 +203,10 @@ def _bags(listed: dict[str, Entry]) -> dict[str, list[Entry]]:
             continue
         metadata = listed.get(posixpath.join(folder, _METADATA))
         if metadata and file != OBSERVATIONS_FILE:
-            found.setdefault(folder, [metadata]).append(entry)
+            bags.setdefault(folder, [metadata]).append(entry)
         else:
-            found[name] = [entry]
-    return found
+            bags[name] = [entry]
+    return bags
 
 
 @dataclass(frozen=True)
@@ -241,10 +231,10 @@ class Cameras:
 
     def of(self, name: str) -> tuple[str, str]:
         """Spacecraft and camera of a path below the root, empty if nothing names them."""
-        found = self._row(name)
+        names = self._row(name)
         if self.pattern and (match := self.pattern.match(name)):
-            found = {**match.groupdict(), **found}
-        return found.get(_KEYS[0], ''), found.get(_KEYS[1], '')
+            names = {**match.groupdict(), **names}
+        return names.get(_KEYS[0], ''), names.get(_KEYS[1], '')
 
     def params_of(self, name: str) -> str:
         """Absolute path of the parameters of a bag; empty if there are none."""
@@ -274,7 +264,7 @@ def _compiled(pattern: str) -> re.Pattern[str]:
     """Expression for the start of a path, up to the segment of the last name."""
     start = pattern[: pattern.rindex('}') + 1] if '}' in pattern else pattern
     start += pattern[len(start) :].partition('/')[0]
-    found, names = '', []
+    expression, names = '', []
     for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
         if other or (name and name not in _KEYS) or name in names:
             raise OptionError(
@@ -282,8 +272,8 @@ def _compiled(pattern: str) -> re.Pattern[str]:
                 ' {camera}'
             )
         names += [name] if name else []
-        found += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
-    return re.compile(f'{found}(?:/|$)')
+        expression += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
+    return re.compile(f'{expression}(?:/|$)')
 
 
 def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
@@ -291,7 +281,7 @@ def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
     rows = csv.DictReader(text.splitlines(), restval='')
     if 'path' not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= {*_COLUMNS}:
         raise OptionError(f'{path}: the first line does not name columns of {", ".join(_COLUMNS)}')
-    found = []
+    cameras = []
     for row in rows:
         if None in row:
             raise OptionError(f'{path}:{rows.line_num}: more values than columns')
@@ -300,8 +290,8 @@ def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
             raise OptionError(f'{path}:{rows.line_num}: no path')
         if 'params' in values:
             values['params'] = os.path.abspath(path.parent / values['params'])
-        found.append(values)
-    return tuple(found)
+        cameras.append(values)
+    return tuple(cameras)
 
 
 @dataclass(frozen=True)
@@ -322,7 +312,7 @@ class Answer:
     """
 
     key: str = ''
-    row: Row | None = None
+    row: trend_table.Row | None = None
     calibration: str = ''
     is_silence: bool = False
 
@@ -344,7 +334,7 @@ def compute(task: Task) -> Answer:
 
 def failed(task: Task, error: str, is_passing: bool = False, is_silence: bool = False) -> Answer:
     """Answer to a task that failed."""
-    row = dataclasses.replace(failure(task.url, error), is_passing=is_passing)
+    row = dataclasses.replace(trend_table.failure(task.url, error), is_passing=is_passing)
     return Answer(row=_of_task(row, task), is_silence=is_silence)
 
 
@@ -374,11 +364,19 @@ def _answer(task: Task, path: Path) -> Answer:
             return Answer(key)
         if not task.is_bag:
             made, temperature = _recorded(path)
-            return Answer(key, _of_task(row_of(made, key, task.url, RECORDED, temperature), task))
+            return Answer(
+                key,
+                _of_task(
+                    trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature),
+                    task,
+                ),
+            )
         setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
         campaign = calibrate_bags([path], setup, Topics())
         made, records = campaign.calibration, campaign.observations
-        row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
+        row = trend_table.row_of(
+            made, key, task.url, trend_table.COMPUTED, _mean_temperature(records)
+        )
         text = product_files.calibration_text(made)
         return Answer(key, _of_task(row, task, path), text)
     except (StarcalError, ValueError) as error:
@@ -388,7 +386,7 @@ def _answer(task: Task, path: Path) -> Answer:
         return failed(task, str(error).replace(str(path), task.url))
 
 
-def _of_task(row: Row, task: Task, bag: Path = Path()) -> Row:
+def _of_task(row: trend_table.Row, task: Task, bag: Path = Path()) -> trend_table.Row:
     """A row with what its task and the metadata of the bag add."""
     names = _custom_data(bag / 'metadata.yaml') if task.is_bag else {}
     return dataclasses.replace(
@@ -404,8 +402,8 @@ def _custom_data(metadata: Path) -> dict[str, str]:
     """Texts that the recorder of a bag was given; empty where there are none."""
     try:
         content = untrusted.yaml_value(untrusted.read_text(metadata, untrusted.METADATA_BYTES))
-        found = content['rosbag2_bagfile_information']['custom_data']
-        return {name: value for name, value in found.items() if isinstance(value, str)}
+        texts = content['rosbag2_bagfile_information']['custom_data']
+        return {name: value for name, value in texts.items() if isinstance(value, str)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
 
@@ -472,7 +470,7 @@ class Done:
     known: int = 0
     silent: int = 0
 
-    def count(self, table: Table, task: Task, answer: Answer) -> None:
+    def count(self, table: trend_table.Table, task: Task, answer: Answer) -> None:
         """Put an answer into the table, and count it."""
         row = answer.row
         if row is None or table.has(row):
@@ -480,7 +478,7 @@ class Done:
             self.known += bool(answer.key)
             return
         if answer.calibration:
-            folder = table.path.with_name(KEPT_FOLDER) / kept_name(row)
+            folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
             products.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
@@ -490,7 +488,7 @@ class Done:
 
 
 def update(
-    table: Table,
+    table: trend_table.Table,
     tasks: Iterable[Task],
     workers: int = 0,
     scheduler: str = '',
@@ -531,7 +529,7 @@ def update(
 
 
 def _not_known(
-    table: Table, tasks: Iterable[Task], done: Done, failures: dict[str, bool]
+    table: trend_table.Table, tasks: Iterable[Task], done: Done, failures: dict[str, bool]
 ) -> Iterator[Task]:
     """Tasks that the table has no row of, then failures to try again; others are counted."""
     again: list[Task] = []

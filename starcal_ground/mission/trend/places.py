@@ -128,19 +128,19 @@ def fetched(url: str, files: Sequence[str], size_bytes: int) -> Iterator[Path]:
 
 
 def _local_entries(root: str, folder: str, names: Sequence[str]) -> list[Entry]:
-    found = []
+    entries = []
     for path in (os.path.join(folder, name) for name in names):
         try:
             status = os.stat(path)
             size, identity = status.st_size, f'{status.st_size} {status.st_mtime_ns}'
         except OSError as error:
             size, identity = -1, f'error {error.errno}'
-        found.append(Entry(path, os.path.relpath(path, root), size, identity))
-    return found
+        entries.append(Entry(path, os.path.relpath(path, root), size, identity))
+    return entries
 
 
 def _remote_entries(
-    fs: AbstractFileSystem, base: str, found: Mapping[str, dict[str, Any]]
+    fs: AbstractFileSystem, base: str, infos: Mapping[str, dict[str, Any]]
 ) -> list[Entry]:
     return [
         Entry(
@@ -149,7 +149,7 @@ def _remote_entries(
             int(info['size']),
             _identity(info),
         )
-        for path, info in sorted(found.items())
+        for path, info in sorted(infos.items())
     ]
 
 

@@ -105,11 +105,11 @@ def _columns(time_s: Floats, temperature_degc: Floats) -> dict[str, Floats]:
 
 def _matrix(columns: dict[str, Floats], chosen: Sequence[str]) -> Floats:
     """Regressors (n, 1 + c) of the constant and the chosen terms; a step is named ``step 7``."""
-    measurement, found = np.arange(len(columns[''])), [columns['']]
+    measurement, matrix = np.arange(len(columns[''])), [columns['']]
     for name in chosen:
         kind, _, after = name.partition(' ')
-        found.append(np.asarray(measurement > int(after), np.float64) if after else columns[kind])
-    return np.stack(found, axis=1)
+        matrix.append(np.asarray(measurement > int(after), np.float64) if after else columns[kind])
+    return np.stack(matrix, axis=1)
 
 
 def _solve(
@@ -252,38 +252,38 @@ class Change:
 def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Series]:
     """Series of parameters, boresight and alignment of the calibrations of one lens model."""
     first = rows[0].geometry
-    found = []
+    series = []
     for k, name in enumerate(rows[0].names):
         values = np.array([row.values[k] for row in rows])
         sigmas = np.array([row.sigmas[k] for row in rows])
         unit = 'px' if name in INTRINSIC_NAMES else ''
-        found += _one(rows, name, unit, values, sigmas, max_p_value)
+        series += _one(rows, name, unit, values, sigmas, max_p_value)
     boresight = _boresight_arcsec([row.geometry for row in rows])
     of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
     for k, axis in enumerate('xy'):
         name = f'boresight about {axis}'
-        found += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
+        series += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
     alignment = np.array(
         [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
     )
     sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
     for k, axis in enumerate('xyz'):
         name = f'alignment_{axis}'
-        found += _one(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
-    return found
+        series += _one(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
+    return series
 
 
 def findings(shown: Sequence[Series]) -> list[tuple[Series, Term]]:
     """Terms of series, a drift of several that trade with each other where it is clearest."""
-    found = [(one, term) for one in shown for term in one.trend.terms]
+    terms = [(one, term) for one in shown for term in one.trend.terms]
     clearest: dict[object, tuple[float, str]] = {}
-    for one, term in found:
+    for one, term in terms:
         if term.kind == 'drift':
             group = _TRADING.get(one.name, one.name)
             best = (abs(term.size) / term.sigma, one.name)
             clearest[group] = max(best, clearest.get(group, best))
     names = {name for _, name in clearest.values()}
-    return [(one, term) for one, term in found if term.kind != 'drift' or one.name in names]
+    return [(one, term) for one, term in terms if term.kind != 'drift' or one.name in names]
 
 
 def _one(
@@ -337,12 +337,12 @@ def activations(rows: Sequence[Row]) -> list[Active]:
 
 def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
     """Change by each calibration against the one active at its last image."""
-    found = []
+    made = []
     for k, row in enumerate(rows):
         then = [one for one in active if one.since_ns <= row.last_ns and one.row != k]
         if then:
-            found.append(_change(rows, k, then[-1].row))
-    return found
+            made.append(_change(rows, k, then[-1].row))
+    return made
 
 
 def _change(rows: Sequence[Row], row: int, against: int) -> Change:
@@ -372,15 +372,15 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
     Of the same images the newest version counts, so that a series has each once.
     """
-    found: dict[str, list[Row]] = {}
+    by_name: dict[str, list[Row]] = {}
     for row in rows:
         if row.error:
             continue
         size = f'{row.width} x {row.height}'
         parts = (row.spacecraft, row.camera, row.child_frame, size, row.lens_model)
         name = ', '.join(filter(None, parts))
-        found.setdefault(name, []).append(row)
-    return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+        by_name.setdefault(name, []).append(row)
+    return dict(sorted(by_name.items(), key=lambda item: (-len(item[1]), item[0])))
 
 
 def newest_of_each(rows: Sequence[Row]) -> list[Row]:
@@ -391,11 +391,11 @@ def newest_of_each(rows: Sequence[Row]) -> list[Row]:
     state folder has a calibration once more for each activation.
     """
     again = {_images(row) for row in rows if row.kind == COMPUTED}
-    found: dict[object, Row] = {}
+    newest: dict[object, Row] = {}
     for row in rows:
         if row.kind == COMPUTED or _images(row) not in again:
-            found.setdefault((_images(row), row.kind, tuple(row.values)), row)
-    return list(found.values())
+            newest.setdefault((_images(row), row.kind, tuple(row.values)), row)
+    return list(newest.values())
 
 
 def _images(row: Row) -> tuple[int, int]:
@@ -447,21 +447,21 @@ class Overview:
     def verdict(self) -> str:
         """Stepped, drifting, changed since the active calibration; or sound."""
         words = {'step': 'stepped', 'drift': 'drifting'}
-        found = [words[kind] for kind in self.kinds if kind in words]
-        found += [] if self.is_stable else ['changed']
-        return ', '.join(found) or 'sound'
+        reasons = [words[kind] for kind in self.kinds if kind in words]
+        reasons += [] if self.is_stable else ['changed']
+        return ', '.join(reasons) or 'sound'
 
 
 def overview_of(
     name: str, rows: Sequence[Row], shown: Sequence[Series], is_stable: bool
 ) -> Overview:
     """Overview of the different calibrations of a camera, in order of time."""
-    found = findings(shown)
-    steps = [(abs(t.size) / t.sigma, one.row[t.after]) for one, t in found if t.kind == 'step']
+    terms = findings(shown)
+    steps = [(abs(t.size) / t.sigma, one.row[t.after]) for one, t in terms if t.kind == 'step']
     after = max(steps)[1] if steps else -1
     return Overview(
         name=name,
-        kinds=tuple(sorted({term.kind for _, term in found})),
+        kinds=tuple(sorted({term.kind for _, term in terms})),
         is_stable=is_stable,
         after=after,
         time_ns=np.array([row.time_ns for row in rows], np.int64),
@@ -482,9 +482,9 @@ def swapped_with(one: Overview, cameras: Sequence[Overview]) -> str:
         return ''
     before, after = one.values[one.after], one.values[one.after + 1]
     sigma = np.where(one.sigma > 0, one.sigma, np.inf)
-    found = [(max(_SIGMAS, _ALIKE * float(np.max(np.abs(after - before) / sigma))), '')]
+    distances = [(max(_SIGMAS, _ALIKE * float(np.max(np.abs(after - before) / sigma))), '')]
     for other in cameras:
         k = int(np.searchsorted(other.time_ns, one.time_ns[one.after], 'right')) - 1
         if other is not one and other.model == one.model and k >= 0:
-            found.append((float(np.max(np.abs(after - other.values[k]) / sigma)), other.name))
-    return min(found)[1]
+            distances.append((float(np.max(np.abs(after - other.values[k]) / sigma)), other.name))
+    return min(distances)[1]

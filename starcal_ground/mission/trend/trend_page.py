@@ -158,13 +158,13 @@ def verdict_of(
 ) -> tuple[bool, tuple[str, str]]:
     """True while the active calibration holds, with sentences on that and on the changes."""
     words = {'step': 'steps of', 'drift': 'drifts of', 'temperature': 'effects of temperature on'}
-    found = []
+    changes = []
     for kind, word in words.items():
         names = list(
             dict.fromkeys(one.name for one, t in trends.findings(shown) if t.kind == kind)
         )
-        found += [f'{word} {", ".join(names)}'] if names else []
-    text = f'Found: {"; ".join(found)}.' if found else 'No step or drift was found.'
+        changes += [f'{word} {", ".join(names)}'] if names else []
+    text = f'Found: {"; ".join(changes)}.' if changes else 'No step or drift was found.'
     later = [change for change in new if active and change.against == active[-1].row]
     if not later:
         return True, ('The active calibration is the newest one.' if active else '', text)

@@ -207,8 +207,11 @@ def _boresight_sigma(calibration: Calibration) -> Floats:
     """1-sigma (2,) of the line of sight of the middle, about the x and y axes, arcsec."""
     camera = calibration.geometry.camera
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    found = Derivatives.at(camera, middle)
-    J, of_pixel = found.J[0], found.by_pixel[0] * calibration.map_covariance.unresolved_px
+    derivatives = Derivatives.at(camera, middle)
+    J, of_pixel = (
+        derivatives.J[0],
+        derivatives.by_pixel[0] * calibration.map_covariance.unresolved_px,
+    )
     covariance = J @ calibration.map_covariance.matrix @ J.T + of_pixel @ of_pixel.T
     # A small rotation about x moves the direction along y, one about y along x.
     return np.asarray(np.sqrt(np.diag(covariance)[[1, 0]]) / ARCSECOND_RAD)
@@ -338,8 +341,8 @@ class Table:
                     'ORDER BY time_ns, key',
                     camera,
                 ).fetchall()
-                found = [_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
-            yield found
+                of_camera = [_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+            yield of_camera
 
     def rows(self) -> list[Row]:
         """All rows, in order of time."""

@@ -103,6 +103,14 @@ def test_help_is_there_at_once() -> None:
         assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
 
 
+def test_a_command_line_imports_its_command_alone() -> None:
+    show = 'import sys; from starcal_ground.cli.main import parser; parser(["lookup", "plan"])'
+    show += '; print(*sys.modules)'
+    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
+    assert re.findall(r'starcal_ground\.cli\.commands\.(\w+)', done.stdout) == ['lookup']
+    assert 'numpy' not in done.stdout.split()
+
+
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [

@@ -14,13 +14,13 @@ import pytest
 from rich.console import Console
 from sample_records import calibration, observations, status  # type: ignore[import-not-found]
 
-from starcal_ground.cli.monitor_view import coverage_text, Seen, share_of_limit, view
+from starcal_ground.cli.monitor_view import coverage_text, Received, share_of_limit, view
 from starcal_ros.records import GateCheck, refused_image
 
 
-def shown(seen: Seen, width: int = 80) -> str:
+def shown(received: Received, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO(), record=True)
-    console.print(view(seen))
+    console.print(view(received))
     return console.export_text()
 
 
@@ -29,21 +29,21 @@ def check(found: float, limit: float, option: str = 'max_x', passed: bool = True
 
 
 def test_nothing_received_is_said() -> None:
-    text = shown(Seen())
+    text = shown(Received())
     for words in ('no image since', 'no status received', 'none active', 'no diagnostics'):
         assert words in text
 
 
 def test_images_are_counted_by_reason() -> None:
-    seen = Seen()
+    received = Received()
     for refusal in ('', 'no_match', '', 'no_match', 'frozen'):
         one = refused_image(1_700_000_000_000_000_000, 640, 512, refusal, 'of a detail')
-        seen = seen.with_image(one)
-    text = shown(seen)
+        received = received.with_image(one)
+    text = shown(received)
     assert '5 since the start of this view, 2 used' in text
     assert '2 refused: no match' in text and '1 refused: frozen' in text
     assert 'refused, frozen: of a detail' in text
-    assert f'{len(observations())} stars' in shown(seen.with_image(observations()))
+    assert f'{len(observations())} stars' in shown(received.with_image(observations()))
 
 
 def test_forecast_sigmas_stand_beside_the_active_ones() -> None:
@@ -53,7 +53,7 @@ def test_forecast_sigmas_stand_beside_the_active_ones() -> None:
         parameter_names=('fx', 'alignment_x', 'k3'),
         predicted_sigma=np.array([0.25, 4.84813681e-06, np.inf]),
     )
-    lines = shown(Seen(status=collected, active=active)).splitlines()
+    lines = shown(Received(status=collected, active=active)).splitlines()
     (fx,) = (line for line in lines if ' fx ' in line)
     assert '0.25 px' in fx and f'{active.sigma[0]:.2g}' in fx
     (turn,) = (line for line in lines if ' alignment_x ' in line)
@@ -67,7 +67,9 @@ def test_a_refused_candidate_shows_the_failed_check_first() -> None:
     candidate = dataclasses.replace(
         calibration(), accepted=False, reasons=('residual over the limit',), gate=gate
     )
-    text = shown(Seen(active=calibration(), candidate=candidate, health={'calibrator': (2, 'x')}))
+    text = shown(
+        Received(active=calibration(), candidate=candidate, health={'calibrator': (2, 'x')})
+    )
     assert 'last candidate refused: residual over the limit' in text
     assert text.index('██████████') < text.index('█████·····')
     assert 'calibrator: error x' in text
@@ -94,10 +96,10 @@ def test_coverage_is_a_picture_of_the_detector() -> None:
 
 
 def test_it_fits_a_terminal_of_80_columns() -> None:
-    seen = Seen(
+    received = Received(
         last=observations(), status=status(), active=calibration(), candidate=calibration()
     )
-    assert max(map(len, shown(seen).splitlines())) <= 80
+    assert max(map(len, shown(received).splitlines())) <= 80
 
 
 def hostile(value: Any) -> Any:
@@ -118,7 +120,7 @@ def hostile(value: Any) -> Any:
 
 def test_no_text_of_a_message_acts_on_the_terminal() -> None:
     gate = (check(2.0, 1.0, passed=False), check(0.5, 1.0))
-    sound = Seen(
+    sound = Received(
         last=refused_image(1, 640, 512, 'frozen', 'of a detail'),
         refused={'frozen': 1},
         status=status(),

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.cli.main import main
 from starcal_ground.images.from_stars import pinhole
-from starcal_ground.images.image_series import ImageFile
+from starcal_ground.images.photographs import ImageFile
 from starcal_ground.mission.ingest.sources import read_wcs
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
