@@ -65,6 +65,7 @@ def observations_of(
     temperature_degc: float = float('nan'),
     star_tracker_rate_rad_s: ArrayLike = (float('nan'),) * 3,
     velocity_sigma_m_s: float = float('nan'),
+    star_tracker_rate_sigma_rad_s: ArrayLike = (float('nan'),) * 3,
 ) -> StarObservations:
     """
     Observations of the n stars of one image, from arrays.
@@ -95,6 +96,9 @@ def observations_of(
     velocity_sigma_m_s : float
         1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: of an
         orbit about the Earth.
+    star_tracker_rate_sigma_rad_s : (3,)
+        1-sigma of the rate about each axis; NaN: that of two samples of the star tracker, at most
+        the scatter of the rates over the images.
 
     Returns
     -------
@@ -132,6 +136,7 @@ def observations_of(
             'snr': unknown,
             'temperature_degc': temperature_degc,
             'star_tracker_rate_rad_s': np.asarray(star_tracker_rate_rad_s),
+            'star_tracker_rate_sigma_rad_s': np.asarray(star_tracker_rate_sigma_rad_s),
             'velocity_sigma_m_s': velocity_sigma_m_s,
         },
     )

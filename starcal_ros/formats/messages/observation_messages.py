@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from starcal_ros.records import StarObservations
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # of a measured star, smallest and largest
 _LONGEST_DETAIL = 500  # characters
+_EXACT_VELOCITY = -1.0  # in messages: 0 is that of a sender that leaves it out
 
 
 def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
@@ -28,6 +30,8 @@ def observations_to_message(record: StarObservations, frame_id: str, make: Make)
     values = plain_record(record)
     # The message has kept the two arrays of version 0.1 for this mapping.
     refused = values.pop('refused_stars')
+    if values['velocity_sigma_m_s'] == 0:
+        values['velocity_sigma_m_s'] = _EXACT_VELOCITY
     return make(
         OBSERVATIONS_TYPE,
         **message_fields(StarObservations, values, make, frame_id),
@@ -41,7 +45,7 @@ def observations_from_message(message: Message) -> StarObservations:
     Observations of a starcal/StarObservations.
 
     Recordings of version 0.1 are read: an attitude gap of -1 is NaN, and missing fields have their
-    defaults.
+    defaults.  So have those that a sender leaves at ROS's zeros.
 
     Raises ValueError when the arrays of the message do not fit each other or hold values that no
     star can have.
@@ -54,9 +58,27 @@ def observations_from_message(message: Message) -> StarObservations:
     values['detail'] = values['detail'][:_LONGEST_DETAIL]
     if values['attitude_gap_s'] < 0:
         values['attitude_gap_s'] = math.nan
+    _forget_zeros(values)
     record = read_record(StarObservations, values)
     _check_stars(record)
     return record
+
+
+def _forget_zeros(values: dict[str, Any]) -> None:
+    """Replace zeros that no sender means, as ROS fills them in, by numbers that are not known."""
+    nowhere = np.full(3, math.nan)
+    if not np.any(values['first_from_star_tracker']):
+        del values['first_from_star_tracker']
+    sigma = values.get('star_tracker_rate_sigma_rad_s', nowhere)
+    values['star_tracker_rate_sigma_rad_s'] = np.where(sigma == 0, math.nan, sigma)
+    is_stated = bool((sigma > 0).any())
+    if not is_stated and not np.any(values.get('star_tracker_rate_rad_s', nowhere)):
+        values['star_tracker_rate_rad_s'] = nowhere
+    if not np.any(values.get('zenith_icrf', nowhere)):
+        values['zenith_icrf'] = nowhere
+    stated = {0.0: math.nan, _EXACT_VELOCITY: 0.0}
+    velocity = values.get('velocity_sigma_m_s', math.nan)
+    values['velocity_sigma_m_s'] = stated.get(velocity, velocity)
 
 
 def checked_observations(message: Message) -> StarObservations:
