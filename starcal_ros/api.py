@@ -63,6 +63,7 @@ def observations_of(
     temperature_degc: float = float('nan'),
     star_tracker_rate_rad_s: ArrayLike = (float('nan'),) * 3,
     velocity_sigma_m_s: float = float('nan'),
+    star_tracker_rate_sigma_rad_s: ArrayLike = (float('nan'),) * 3,
 ) -> StarObservations:
     """
     Observations of the n stars of one image, from arrays.
@@ -87,9 +88,9 @@ def observations_of(
         found.  Without it, stars of exactly equal directions are taken as the same.
     temperature_degc : float
         Temperature of the camera; NaN if not measured.
-    star_tracker_rate_rad_s : (3,)
-        Angular rate at that time about the axes of the star tracker; NaN if not known.  A time of
-        read-out or an offset of the stamps is estimated only with it.
+    star_tracker_rate_rad_s, star_tracker_rate_sigma_rad_s : (3,)
+        Angular rate at that time about the axes of the star tracker, and its 1-sigma; NaN if not
+        known.  A time of read-out or an offset of the stamps is estimated only with a rate.
     velocity_sigma_m_s : float
         1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: of an
         orbit about the Earth.
@@ -141,6 +142,7 @@ def observations_of(
             'snr': unknown,
             'temperature_degc': temperature_degc,
             'star_tracker_rate_rad_s': np.asarray(star_tracker_rate_rad_s),
+            'star_tracker_rate_sigma_rad_s': np.asarray(star_tracker_rate_sigma_rad_s),
             'velocity_sigma_m_s': velocity_sigma_m_s,
         },
     )

@@ -24,15 +24,16 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.simulation import scenario as synthetic
-from starcal_ground.simulation.centroids import observations
+from starcal_ground.simulation.centroids import observations, with_rate
 from starcal_ground.simulation.scenario import Detector, Scenario, Scene
+from starcal_ground.simulation.scenario import scenario as synthetic
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import AttitudeSample, Ensemble, StarObservations
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
+from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.sky.catalog import cone, load_catalog
 
 Lens = Callable[[Generator, Floats], Floats]
@@ -53,6 +54,8 @@ _PIXEL_STEPS = 4  # displacements change by 0.01 px per px at most
 _SMOOTH_RAD = math.radians(60.0)  # correlation length of errors that depend on the attitude
 # Random streams (seed, purpose)
 _POINTING, _NOISE, _TRACKER, _CHANGE, _STARS, _LENS, _VELOCITY, _RATE, _OUTLIERS = range(80, 89)
+_SAMPLES = 89
+_GAP_S = 2.0  # the default of the package
 _HALF_WIDTH_PX = 648.0
 _HALF_HEIGHT = 1024 / 1296  # half widths
 _CORNER = math.hypot(1.0, _HALF_HEIGHT)
@@ -148,6 +151,8 @@ class World:
     magnitude_limit: float = 8.39  # sigma of a centroid 0.3 px
     zero_point_dn: float = 3.98e6
     tracker_arcsec: float = 20.0
+    tracker_hz: float = 0.0  # of samples with errors of their own; 0: one error, an exact rate
+    filter_s: float = 0.0  # correlation time of the errors of samples
     velocity_m_s: float = 0.0  # that the observer does not take into account
     rate_deg_s: float = 0.0  # about an axis across the line of sight
     row_s: float = 0.0  # time between the read-outs of two rows
@@ -233,7 +238,32 @@ def simulate(world: World, seed: int, images: int | None = None) -> Campaign:
             for k in range(world.images)
         )
     )
+    if world.tracker_hz:
+        ensemble = Ensemble(tuple(_sampled(made, *item) for item in enumerate(ensemble.images)))
     return dataclasses.replace(made, ensemble=ensemble)
+
+
+def _sampled(made: Campaign, k: int, image: StarObservations) -> StarObservations:
+    """Observations with attitude and rate by samples of the star tracker, each with its error."""
+    world, rng = made.world, _stream(made.scenario.seed, _SAMPLES, k)
+    half = math.ceil(1.5 * world.tracker_hz)
+    late_s = (np.arange(-half, half) + rng.uniform()) / world.tracker_hz
+    memory = math.exp(-1.0 / (world.tracker_hz * world.filter_s)) if world.filter_s else 0.0
+    errors_rad = world.tracker_arcsec * ARCSECOND_RAD * _walk(rng, 2 * half, 3, memory)
+    from_icrf = Rotation.from_rotvec(-np.outer(late_s, made.rate_rad_s[k]))
+    from_icrf *= made.camera_from_icrf[k]
+    camera_from_tracker = made.scenario.truth.star_tracker_from_camera.inv()
+    reported = from_icrf.inv() * camera_from_tracker * Rotation.from_rotvec(errors_rad)
+    history = AttitudeHistory()
+    # What is stamped as this image is of the time of the exposure.
+    stamps_ns = image.time_ns + np.rint((late_s - world.stamp_s) * 1e9).astype(np.int64)
+    for stamp_ns, xyzw in zip(stamps_ns.tolist(), reported.as_quat(), strict=True):
+        history.add(stamp_ns, AttitudeSample(stamp_ns, xyzw))
+    xyzw, gap_s = history.at(image.time_ns, _GAP_S)
+    sigma_rad = np.full(3, world.tracker_arcsec * ARCSECOND_RAD)
+    rate = history.rate_at(image.time_ns, _GAP_S, sigma_rad)
+    image = dataclasses.replace(image, icrf_from_star_tracker_xyzw=xyzw, attitude_gap_s=gap_s)
+    return with_rate(image, *rate)
 
 
 def _scenario(world: World, seed: int) -> Scenario:
@@ -434,6 +464,15 @@ WORLDS = {
     'vel_30_level': World(pointing='side_level', velocity_m_s=30000.0),
     'rolling_slow': World(rate_deg_s=_SLOW_DEG_S, row_s=20e-6),
     'rolling_fast': World(rate_deg_s=_FAST_DEG_S, row_s=20e-6),
+    **{
+        f'noisy_rate_{hz}hz': World(
+            rate_deg_s=0.1, row_s=20e-6, tracker_arcsec=10.0, tracker_hz=hz
+        )
+        for hz in (4, 10)
+    },
+    'filtered_rate': World(
+        rate_deg_s=0.1, row_s=20e-6, tracker_arcsec=10.0, tracker_hz=10.0, filter_s=0.5
+    ),
     'stamp_50ms': World(rate_deg_s=0.1, stamp_s=0.05),
     **{f'breath{n}': World(images=n, breathing=_BREATH) for n in (3, 6, 18)},
     'flex6': World(images=6, flexing=5e-4),

@@ -23,6 +23,7 @@ from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.problem import Problem, State
+from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.star_equations import arrange, Measurements, StarTable
 from starcal_ros.estimation.unknowns import Assumptions, Layout, unknowns_of
 
@@ -35,7 +36,8 @@ CAMERA = CameraModel(
     WIDTH, HEIGHT, np.r_[5000.0, 1.5, 5010.0, 603.0, 396.0, -0.3, 0.5, 0.0, 4e-4, -3e-4]
 )
 HELD = ('skew', 'k3')
-OWN = 8  # unknowns of an image
+OWN = 11  # unknowns of an image: its rotation, its shape, the error of its rate
+TURN_S = 0.02  # rms time of read-out
 SHAPE = np.array([0.2, 0.3, 0.4, 0.5, 0.6])
 # 1-sigma of one image's scale, stretch, shear and decentring, px
 
@@ -47,7 +49,7 @@ class Small:
     problem: Problem
     state: State
     table: StarTable
-    rates_rad_s: Floats
+    rates: Rates
     layout: Layout
     keep: Mask  # (n,) of stars that are used: images have 20, 18, 16 and 13
 
@@ -77,7 +79,7 @@ class Small:
         return {entry.name: x[self.layout.places[entry.name]] for entry in self.layout.shared}
 
     def pixels(self, x: Floats, y: Floats, with_field: bool = True) -> Floats:
-        """Predicted pixels (n, 2) at shared unknowns (P,) and those of the images (m, 8)."""
+        """Predicted pixels (n, 2) at shared unknowns (P,) and those of the images (m, 11)."""
         value, state = self.named(x), self.state
         result = np.empty((len(self.table), 2))
         parameters = state.parameters + value['camera']
@@ -87,7 +89,7 @@ class Small:
             above_k = self.problem.above_reference_k[k]
             own = parameters.copy()
             own[:3] *= 1.0 + sum(a * above_k ** (i + 1) for i, a in enumerate(focal))
-            scale, stretch, shear, *decentring_px = y[k, 3:]
+            scale, stretch, shear, *decentring_px = y[k, 3:8]
             own[0] += scale + stretch
             own[1] += shear
             own[2] += scale - stretch
@@ -99,13 +101,12 @@ class Small:
                 beta = value['velocity'] / LIGHT_M_S
                 e = erfa.ab(e, beta, np.inf, np.sqrt(1.0 - beta @ beta))
             e = state.camera_from_icrf[k].apply(e)
-            if 'readout' in value and value['readout'][0]:
+            if value.get('readout', np.zeros(1))[0] or y[k, 8:].any():
                 # The camera turns by its rate from the middle row's time to that of the row.
-                after_s = value['readout'][0] * (
-                    (self.predicted_px[here, 1] - (HEIGHT - 1) / 2.0) / HEIGHT
-                )
-                turned = Rotation.from_rotvec(-after_s[:, None] * self.rates_rad_s[k])
-                e = turned.apply(e)
+                rows = (self.predicted_px[here, 1] - (HEIGHT - 1) / 2.0) / HEIGHT
+                turn = value.get('readout', np.zeros(1))[0] * self.rates.rad_s[k]
+                turn = turn + TURN_S * self.rates.root_rad_s[k] @ y[k, 8:]
+                e = Rotation.from_rotvec(-rows[:, None] * turn).apply(e)
             e = Rotation.from_rotvec(-y[k, :3]).apply(e)
             result[here] = project(dataclasses.replace(CAMERA, parameters=own), e)
         if with_field:
@@ -139,7 +140,7 @@ class Small:
                     alignment = Rotation.from_rotvec(-mountings) * alignment
                 alignment = alignment * problem.first_from_star_tracker[k]
             if 'stamps' in value:
-                late = Rotation.from_rotvec(-value['stamps'][0] * self.rates_rad_s[k])
+                late = Rotation.from_rotvec(-value['stamps'][0] * self.rates.rad_s[k])
                 alignment = late * alignment
             camera = Rotation.from_rotvec(-y[k, :3]) * state.camera_from_icrf[k]
             predicted = alignment * problem.star_tracker_from_icrf[k]
@@ -214,6 +215,9 @@ def small(
         mountings=np.array([2e-5, -1e-5, 3e-5]) if two_trackers else np.zeros(0),
     )
     rates = np.radians(0.1) * rng.normal(size=(IMAGES, 3))
+    of_rates = np.random.default_rng(seed + 1000)  # errors of 10 arcsec within an image
+    root = 2e-3 * of_rates.uniform(-1.0, 1.0, (IMAGES, 3, 3))
+    given_rates = Rates(rates, root, TURN_S)
     star = np.arange(len(image)) % 50
     table = StarTable(
         image,
@@ -225,13 +229,13 @@ def small(
         covariance,
         IMAGES,
     )
-    layout = unknowns_of(problem, state, rates, (WIDTH, HEIGHT), assumed)
+    layout = unknowns_of(problem, state, given_rates, (WIDTH, HEIGHT), assumed)
     keep = np.arange(len(image)) % STARS < np.array([20, 18, 16, 13])[image]
-    made = Small(problem, state, table, rates, layout, keep)
+    made = Small(problem, state, table, given_rates, layout, keep)
     if shapes_px is None and not field_px:
         return made
     own = np.zeros((IMAGES, OWN))
-    own[:, 3:] = 0.0 if shapes_px is None else shapes_px
+    own[:, 3:8] = 0.0 if shapes_px is None else shapes_px
     moved = made.pixels(np.zeros(layout.count), own, with_field=False) - made.predicted_px
     moved += made.field_px(field_px * rng.normal(size=len(layout['field'])) / octave_size(made))
     table = dataclasses.replace(table, measured_px=table.measured_px + moved)
@@ -251,7 +255,7 @@ _STEPS = {
 }
 _CAMERA_STEPS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-2, 1e-1, 1.0, 1e-3, 1e-3])
 _FOCAL_STEPS = np.array([1e-5, 1e-6])
-IMAGE_STEPS = np.array([1e-4, 1e-4, 1e-4, 1.0, 1.0, 1.0, 1.0, 1.0])
+IMAGE_STEPS = np.array([1e-4, 1e-4, 1e-4, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 
 def shared_steps(given: Small) -> Floats:
@@ -277,7 +281,7 @@ class Dense:
     """
     The whole problem without any elimination.
 
-    ``stars`` (2 n, P + 8 m) and ``trackers`` (3 m, P + 8 m) are whitened derivatives of the
+    ``stars`` (2 n, P + 11 m) and ``trackers`` (3 m, P + 11 m) are whitened derivatives of the
     predicted pixels, zero for stars that are not used, and of the star-tracker errors;
     ``residual`` (2 n,), ``error`` (3 m,).
     """
@@ -336,7 +340,7 @@ def whitener(covariance_px2: Floats) -> Floats:
 
 def prior_precision(given: Small, shape_px: Floats, field_px: Floats | None) -> Floats:
     """
-    Return the prior's precision (P + 8 m,) of all unknowns; infinite: held.
+    Return the prior's precision (P + 11 m,) of all unknowns; infinite: held.
 
     ``field_px`` (3,) are the amplitudes of the octaves; None: no field.
     """
@@ -357,7 +361,7 @@ def prior_precision(given: Small, shape_px: Floats, field_px: Floats | None) -> 
             if field_px is not None:
                 precision[:] = (octave_size(given) / field_px[octaves(given)]) ** 2
         parts.append(precision)
-    of_image = np.r_[np.zeros(3), shape_px**-2.0]
+    of_image = np.r_[np.zeros(3), shape_px**-2.0, np.ones(3)]
     return np.concatenate([*parts, np.tile(of_image, IMAGES)])
 
 
@@ -378,7 +382,7 @@ def octave_size(given: Small) -> Floats:
 
 
 def prior_offset(given: Small) -> Floats:
-    """Values (P + 8 m,) at the state less the prior means; used where there is a prior."""
+    """Values (P + 11 m,) at the state less the prior means; used where there is a prior."""
     offset = {
         'camera': given.state.parameters - given.problem.prior_parameters,
         'mountings': given.state.mountings,
@@ -389,7 +393,7 @@ def prior_offset(given: Small) -> Floats:
 
 
 def lens_term(given: Small, amplitude_px: float) -> Floats:
-    """Return the next term of the lens as values (P + 8 m,) of the unknowns."""
+    """Return the next term of the lens as values (P + 11 m,) of the unknowns."""
     term = given.layout['field'].term
     assert term is not None
     values = np.zeros(given.layout.count + OWN * IMAGES)
@@ -403,8 +407,8 @@ def solution(
     """
     Mean, covariance and log evidence of all unknowns; held ones are zero.
 
-    The evidence is that of the priors that are proper, up to a constant.  ``term`` (P + 8 m,): its
-    outer product is in the prior covariance besides.
+    The evidence is that of the priors that are proper, up to a constant.  ``term`` (P + 11 m,):
+    its outer product is in the prior covariance besides.
     """
     free = np.isfinite(precision)
     X = np.concatenate([problem.stars, problem.trackers])[:, free]

@@ -54,6 +54,7 @@ def observations(n: int = 5) -> StarObservations:
         catalog_digest='abc',
         temperature_degc=-12.3,
         star_tracker_rate_rad_s=np.array([1e-3, -2e-3, 5e-4]),
+        star_tracker_rate_sigma_rad_s=np.array([1e-5, 2e-5, 3e-5]),
         velocity_sigma_m_s=10.0,
         zenith_icrf=np.array([0.36, 0.48, 0.8]),
         refraction_arcsec=np.array([54.0, 6.0]),

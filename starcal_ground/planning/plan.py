@@ -31,6 +31,7 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import Problem, State, whitened_attitude_errors
+from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
@@ -193,7 +194,7 @@ def _information(
     # The columns of what is in the list.
     velocity_m_s = float('velocity' in estimate.linear.layout)
     assumed = Assumptions(velocity_m_s, (0.0, 0.0), 0.0)
-    at_rest = np.zeros((len(candidates), 3))
+    at_rest = Rates(np.zeros((len(candidates), 3)), np.zeros((len(candidates), 3, 3)))
     layout = unknowns_of(problem, state, at_rest, (camera.width, camera.height), assumed)
     place = [estimate.linear.layout.labels.index(label) for label in layout.labels]
     table = star_table(candidates)

@@ -26,9 +26,10 @@ from starcal_ground.simulation.scenario import (
 )
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project_jacobians
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
-from starcal_ros.sky.attitude import rate_between
+from starcal_ros.sky.attitude import rate_of
 
 BOUND_SNR = 5.0
 
@@ -64,14 +65,23 @@ def true_observations(
         error = rng.normal(size=shown.pixel_px.shape) * centroid_noise
         root = np.linalg.cholesky(covariance)
         measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
-        # All samples about an image have one error.
-        _, before, after, _ = attitude_samples(scenario, index)
-        observed = observations(scenario, shown, measured, covariance, snr)
-        rate_rad_s = rate_between(before, after)
-        images.append(
-            dataclasses.replace(observed.select(keep), star_tracker_rate_rad_s=rate_rad_s)
-        )
+        observed = observations(scenario, shown, measured, covariance, snr).select(keep)
+        # A rate is exact where all samples have one error.
+        has_own = scenario.star_tracker_hz > 0
+        tracker_sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD * has_own
+        samples = attitude_samples(scenario, index)
+        rate = rate_of(samples, shown.time_ns, tracker_sigma_rad)
+        images.append(with_rate(observed, *rate))
     return Ensemble(tuple(images))
+
+
+def with_rate(
+    observed: StarObservations, rate_rad_s: Floats, sigma_rad_s: Floats
+) -> StarObservations:
+    """Return observations with the rate of the star tracker."""
+    return dataclasses.replace(
+        observed, star_tracker_rate_rad_s=rate_rad_s, star_tracker_rate_sigma_rad_s=sigma_rad_s
+    )
 
 
 def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:

@@ -6,7 +6,8 @@ A `Scenario` is a campaign whose truth is drawn from a seed; a `Scene` holds the
 its images, without noise.  `images` renders pixels, `centroids` draws noisy centroids without
 pixels.
 
-Modelled: proper motion and aberration of the catalog, and one star-tracker error per image.
+Modelled: proper motion and aberration of the catalog, and star-tracker errors: one for an image,
+or one of each sample.
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ from starcal_ros.camera.lens import fold_radius2, ideal_points
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
+from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
 # Random streams (seed, purpose, image): an image does not depend on the previous ones.
 TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
 _STAMP_SIGMAS = 6.0  # half width of a stamp: 2e-9 of the light of a star is outside
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
-ATTITUDE_OFFSETS_S = (-0.75, -0.25, 0.25, 0.75)
+ATTITUDE_OFFSETS_S: tuple[float, ...] = (-0.75, -0.25, 0.25, 0.75)
 """Times of the star-tracker samples relative to an image: 2 Hz, none at the image itself."""
+SAMPLES_S = 1.5
+"""Time before and after an image with samples that have errors of their own."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,7 @@ class Scenario:
     magnitude_limit: float = 9.0
     stars_per_image: int | None = None  # the brightest on the detector; None: all
     sky: StarCatalog | None = None  # sorted by magnitude; None: the bundled catalog
+    star_tracker_hz: float = 0.0  # of samples with errors of their own; 0: at ATTITUDE_OFFSETS_S
 
     def time_ns(self, index: int) -> int:
         """Middle of the exposure of an image."""
@@ -127,7 +132,7 @@ class Scene:
     camera_from_icrf : (3, 3)
         True attitude.
     icrf_from_star_tracker_xyzw : (4,)
-        Reported attitude, with the star-tracker error of this image.
+        Reported attitude, with the star-tracker errors of this image.
     catalog_id, magnitude, direction_icrf, pixel_px, flux_electrons : (n,) or (n, 2 or 3)
         Stars on the detector, and those outside with light on it.
     """
@@ -250,28 +255,42 @@ def camera_from_icrf(scenario: Scenario, index: int, offset_s: float = 0.0) -> F
 
 
 def _icrf_from_star_tracker_xyzw(
-    scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True
+    scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True, sample: int = 0
 ) -> Floats:
-    """Reported star-tracker attitude (4,): the truth with one error for the whole image."""
+    """Reported star-tracker attitude (4,): the truth with the error of a sample of the image."""
     camera_from_star_tracker = scenario.truth.star_tracker_from_camera.inv()
     icrf_from_camera = Rotation.from_matrix(camera_from_icrf(scenario, index, offset_s)).inv()
     # The tracker's frame is off by small passive angles about its own axes.
     sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD
     rng = random_stream(scenario.seed, ATTITUDE_STREAM, index)
-    error_rad = noise * sigma_rad * rng.normal(size=3)
+    error_rad = noise * sigma_rad * rng.normal(size=(sample + 1, 3))[sample]
     reported = icrf_from_camera * camera_from_star_tracker * Rotation.from_rotvec(error_rad)
     return np.asarray(reported.as_quat())
 
 
 def attitude_samples(scenario: Scenario, index: int) -> tuple[AttitudeSample, ...]:
-    """Star-tracker samples around an image, at `ATTITUDE_OFFSETS_S`."""
+    """Star-tracker samples around an image: none at the image itself."""
+    hz, offsets_s = scenario.star_tracker_hz, ATTITUDE_OFFSETS_S
+    if hz:
+        half = int(SAMPLES_S * hz)
+        offsets_s = tuple((k + 0.5) / hz for k in range(-half, half))
     return tuple(
         AttitudeSample(
             scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND),
-            _icrf_from_star_tracker_xyzw(scenario, index, offset_s),
+            _icrf_from_star_tracker_xyzw(scenario, index, offset_s, sample=k if hz else 0),
         )
-        for offset_s in ATTITUDE_OFFSETS_S
+        for k, offset_s in enumerate(offsets_s)
     )
+
+
+def _at_image_xyzw(scenario: Scenario, index: int, noise: bool) -> Floats:
+    """Reported attitude (4,) at an image; between its samples, if each has its own error."""
+    if not (scenario.star_tracker_hz and noise):
+        return _icrf_from_star_tracker_xyzw(scenario, index, noise=noise)
+    history = AttitudeHistory()
+    for sample in attitude_samples(scenario, index):
+        history.add(sample.time_ns, sample)
+    return history.at(scenario.time_ns(index), 2.0 * SAMPLES_S)[0]
 
 
 def stamp_half_px(psf_sigma_px: float) -> int:
@@ -308,9 +327,7 @@ def scene(scenario: Scenario, index: int, attitude_noise: bool = True) -> Scene:
     return Scene(
         time_ns=time_ns,
         camera_from_icrf=R,
-        icrf_from_star_tracker_xyzw=_icrf_from_star_tracker_xyzw(
-            scenario, index, noise=attitude_noise
-        ),
+        icrf_from_star_tracker_xyzw=_at_image_xyzw(scenario, index, attitude_noise),
         catalog_id=stars.id[near],
         magnitude=magnitude,
         direction_icrf=directions[near],

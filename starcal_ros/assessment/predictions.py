@@ -83,8 +83,7 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     follow = _followed(estimate, part)
     part, covariance = part[follow], covariance[np.ix_(follow, follow)]
     information = inverse(covariance)
-    of_image = np.zeros(estimate.posterior.own.shape[1])
-    of_image[estimate.linear.layout.places['shape']] = estimate.posterior.shape_sigma_px**-2
+    of_image = estimate.linear.layout.image_precision(estimate.posterior.shape_sigma_px)
     for rows, columns, own, residual in _images(estimate, part):
         predicted = _predicted(columns, own, residual, information, np.diag(of_image))
         if predicted is not None:

@@ -39,6 +39,7 @@ from starcal_ros.estimation.problem import (
     star_tracker_names,
     State,
 )
+from starcal_ros.estimation.rates import measured_rates
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.shared_errors import (
     observation_groups,
@@ -216,13 +217,14 @@ def estimate_calibration(
     )
     if note:
         order, with_rate = 0, False
+    stated_rad = assumed_tracker_sigma_rad(options)
     data = Data(
         table,
         np.array([image.time_ns for image in ensemble.images], np.int64),
-        assumed_tracker_sigma_rad(options),
+        stated_rad,
         prior,
         options,
-        np.array([image.star_tracker_rate_rad_s for image in ensemble.images]),
+        measured_rates(ensemble.images, stated_rad),
         np.array([image.velocity_sigma_m_s for image in ensemble.images]),
         _refraction(ensemble),
         observation_groups(table.measured_px, table.star, prior.camera.width),
@@ -254,17 +256,16 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     from_sky = sky_rotations(state, table, camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
     shape_px: Floats | float = _FIRST_SHAPE_PX
-    near: Posterior | None = None
+    before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
     before_sigma: Floats = np.empty(0)
     for k in range(_ROUNDS):
-        last = _round(data, problem, state, judged, residual_px, shape_px, near, share)
+        last = _round(data, problem, state, judged, residual_px, shape_px, before, share)
         after = judge(
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
-        near = last.posterior
-        residual_px = last.residual_px
+        residual_px, before = last.residual_px, last
         shape_px = np.maximum(last.posterior.shape_sigma_px, _FIRST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.linear.layout, last.posterior)
@@ -309,19 +310,23 @@ def _round(
     judged: Judged,
     residual_px: Floats,
     shape_px: Floats | float,
-    near: Posterior | None,
+    before: _Round | None,
     share: float,
 ) -> _Round:
     """Return a share of a step from a state of residuals (n, 2), with the weights judged."""
     table, camera = data.table, data.prior.camera
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
-    rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
-    size = camera.width, camera.height
-    layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data))
+    assumed, size = _assumed(data), (camera.width, camera.height)
+    readout_s = math.hypot(*assumed.readout_s)
+    if before and 'rates' in before.linear.layout and 'readout' in before.linear.layout:
+        at = before.linear.layout.places['readout'].start
+        readout_s = math.hypot(before.posterior.mean[at], before.posterior.working[at, at] ** 0.5)
+    rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
+    layout = unknowns_of(problem, state, rates, size, assumed)
     measurements = arrange(table, judged.kept, judged.working_px2(table))
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
-    found = posterior(sums, linear, shape_px, near)
+    found = posterior(sums, linear, shape_px, before.posterior if before else None)
     own = share * found.of_images[:, IMAGE_ROTATION]
     after = moved(problem, state, layout, share * found.mean, own)
     left_px = _residuals_px(problem, after, table, layout, found, camera)
@@ -402,10 +407,14 @@ def _residuals_px(
         size = camera.width, camera.height
         measured = measured - field_of(layout, found, size).displacement_px(measured)
         turned = np.zeros((3, len(table)))
-        for entry in layout.shared:
+        for entry in layout.entries:
             if entry.turn is not None:
                 by = entry.turn(table.measured_px.T, e.T, table.image)
-                turned += np.einsum('aqn,q->an', by, found.mean[layout.places[entry.name]])
+                at = layout.places[entry.name]
+                if entry.of_image:
+                    turned += (by * found.of_images[table.image, at].T).sum(axis=1)
+                else:
+                    turned += np.einsum('aqn,q->an', by, found.mean[at])
         e = e - np.cross(turned.T, e)
     own_of_star = own if own.ndim == 1 else own[table.image].T
     return np.asarray(measured - project_parameters(problem.model, own_of_star, e))

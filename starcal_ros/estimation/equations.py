@@ -109,8 +109,9 @@ def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     """
     Yield each chunk with its whitened columns (2, c, m n).
 
-    They are the camera parameters, the turns (velocity of the observer and others), the rotation
-    of the image, and the residual: that of the camera parameters and the rotations of the state.
+    They are the camera parameters, the turns (velocity of the observer and others, then those of
+    an image), the rotation of the image, and the residual: that of the camera parameters and the
+    rotations of the state.
 
     Raises
     ------
@@ -121,7 +122,8 @@ def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     p = problem.camera_count
     own = image_parameters(problem, state)
     rotations = state.camera_from_icrf.as_matrix()
-    turning = [entry for entry in linear.layout.shared if entry.turn is not None]
+    turning = [entry for entry in linear.layout.entries if entry.turn is not None]
+    turning.sort(key=lambda entry: entry.of_image)
     for chunk, J in whitened_chunks(linear.measurements, problem.model, own, rotations):
         if J is None:
             raise NotObservable('a star has no image')
@@ -251,10 +253,7 @@ def eliminated(
     """Return the same; ``shape_sigma_px`` (s,) is the prior of the shapes of the images."""
     m, b, P = normal.B.shape
     C = normal.C
-    if 'shape' in layout:
-        shape = np.arange(b)[layout.places['shape']]
-        C = C.copy()
-        C[:, shape, shape] += 1.0 / shape_sigma_px**2
+    C = C + np.diag(layout.image_precision(shape_sigma_px))
     covariance = inverse(C)
     back = covariance @ normal.B
     flat = normal.B.reshape(m * b, P)
@@ -299,32 +298,41 @@ def seen_by_stars(layout: Layout) -> Indices:
 
 
 def _columns(layout: Layout) -> tuple[list[Unknown], list[Unknown], list[Unknown]]:
-    """Return the shared entries by camera, those by turn, and the image entries by camera."""
+    """Return the shared entries by camera, those by turn, and those of an image."""
     by_camera = [e for e in layout.shared if e.camera is not None]
     by_turn = [e for e in layout.shared if e.turn is not None]
-    return by_camera, by_turn, [e for e in layout.of_image if e.camera is not None]
+    return by_camera, by_turn, list(layout.of_image)
 
 
 def chain(problem: Problem, layout: Layout, m: int) -> Floats:
     """
     Return the derivatives (m, c, d) of the columns of `star_columns` by the unknowns.
 
-    In the order: shared ones by camera, by turn; the rotation of the image, its shape; residual.
+    In the order: shared ones by camera, by turn; the rotation of the image, its other unknowns;
+    residual.
     """
     by_camera, by_turn, of_image = _columns(layout)
     p = problem.camera_count
     turns = sum(map(len, by_turn))
     first = sum(map(len, by_camera))
     own = sum(map(len, of_image))
-    E = np.zeros((m, p + turns + 4, first + turns + 3 + own + 1))
+    own_turns = sum(len(entry) for entry in of_image if entry.turn is not None)
+    E = np.zeros((m, p + turns + own_turns + 4, first + turns + 3 + own + 1))
     at = 0
     for entry in by_camera:
         E[:, :p, at : at + len(entry)] = entry.camera
         at += len(entry)
-    E[:, p:-1, at : at + turns + 3] = np.eye(turns + 3)
-    at += turns + 3
+    E[:, p : p + turns, at : at + turns] = np.eye(turns)
+    at, row = at + turns, p + turns
+    E[:, -4:-1, at : at + 3] = np.eye(3)
+    at += 3
     for entry in of_image:
-        E[:, :p, at : at + len(entry)] = entry.camera
+        here = slice(at, at + len(entry))
+        if entry.camera is not None:
+            E[:, :p, here] = entry.camera
+        else:
+            E[:, row : row + len(entry), here] = np.eye(len(entry))
+            row += len(entry)
         at += len(entry)
     E[:, -1, -1] = 1.0
     return E

@@ -297,19 +297,25 @@ def _shape_sums(sums: StarSums, layout: Layout, solver: _Solver, field_px: Float
 def _without_rotation(
     sums: StarSums, layout: Layout, field_px: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the sums of shapes and shared unknowns, the rotations free."""
+    """Return the sums of shapes and shared unknowns, the images' other unknowns eliminated."""
     blocks = sums.blocks.copy()
     blocks[:, :-1, -1] -= (field_px @ sums.field_cross)[:, :-1]
     stars, own, rotation = chain_columns(layout)
-    C = blocks[:, rotation, rotation].copy()
-    size = np.einsum('mii->mi', C).max(axis=1)
-    C += np.eye(3) * np.where(size > 0, 1e-9 * size, 1.0)[:, None, None]
-    back = np.linalg.solve(C, blocks[:, rotation])
-    left = blocks - blocks[:, rotation].transpose(0, 2, 1) @ back
-    shape = slice(rotation.stop, own.stop)
+    size = np.einsum('mii->mi', blocks[:, rotation, rotation]).max(axis=1)
+    columns = np.arange(blocks.shape[1])
+    others = columns[rotation]
+    weak = np.where(size > 0, 1e-9 * size, 1.0)[:, None] * np.ones(3)
+    if 'rates' in layout:
+        rates = columns[own][layout.places['rates']]
+        others = np.concatenate([others, rates])
+        weak = np.concatenate([weak, np.ones((len(weak), len(rates)))], axis=1)
+    C = blocks[:, others[:, None], others] + weak[:, :, None] * np.eye(len(others))
+    back = np.linalg.solve(C, blocks[:, others])
+    left = blocks - blocks[:, others].transpose(0, 2, 1) @ back
+    shape = columns[own][layout.places['shape']]
     total = left.sum(axis=0)
     return (
-        left[:, shape, shape],
+        left[:, shape[:, None], shape],
         left[:, shape, -1],
         left[:, shape, stars],
         total[stars, stars],

@@ -44,6 +44,7 @@ from starcal_ros.estimation.problem import (
     State,
     turn_derivatives,
 )
+from starcal_ros.estimation.rates import Rates, UNKNOWN_RATE_RAD_S
 from starcal_ros.estimation.temperature import parameters_chain, turns_chain
 from starcal_ros.records import ALIGNMENT_NAMES
 from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
@@ -63,7 +64,7 @@ _FOCAL_MODES = {
 }
 """Changes of fx, skew and fy."""
 _DECENTRING = ('p1', 'p2')  # of the lens models that have them
-_UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit
+_NO_TURN_RAD = 1e-8  # within an image: 2 milliarcseconds
 _FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
 FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
 _SHOWN = 1e-2  # least singular value over the largest: none that only a border shows
@@ -155,6 +156,13 @@ class Layout:
     def labels(self) -> tuple[str, ...]:
         """Labels of the shared unknowns."""
         return tuple(label for entry in self.shared for label in entry.labels)
+
+    def image_precision(self, shape_sigma_px: Floats | float) -> Floats:
+        """Prior precisions (b,) of the unknowns of an image; ``shape_sigma_px`` (s,)."""
+        precision = np.concatenate([np.zeros(3), *(entry.sigma**-2.0 for entry in self.of_image)])
+        if 'shape' in self:
+            precision[self.places['shape']] = np.asarray(shape_sigma_px, np.float64) ** -2.0
+        return precision
 
     def __getitem__(self, name: str) -> Unknown:
         """Return the entry of a name."""
@@ -321,7 +329,7 @@ def moved(
 def unknowns_of(
     problem: Problem,
     state: State,
-    rates_rad_s: Floats,
+    rates: Rates,
     size: tuple[int, int],
     assumed: Assumptions,
 ) -> Layout:
@@ -330,8 +338,8 @@ def unknowns_of(
 
     Parameters
     ----------
-    rates_rad_s : (m, 3)
-        Angular rate of the camera in its frame; NaN where it is not known.
+    rates : Rates
+        In the frame of the camera.
     size : (width, height)
         Of the detector, px.
     """
@@ -350,9 +358,10 @@ def unknowns_of(
         )
     if assumed.refraction is not None:
         entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
-    entries += _of_timing(rates_rad_s, height, assumed)
+    entries += _of_timing(rates, height, assumed)
     entries.append(_field(width, height))
     entries.append(_shape(problem, state, size))
+    entries += _errors_of_rates(rates, height)
     return Layout(tuple(entry for entry in entries if len(entry)))
 
 
@@ -387,12 +396,13 @@ def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:
     ]
 
 
-def _of_timing(rates_rad_s: Floats, height: int, assumed: Assumptions) -> list[Unknown]:
+def _of_timing(rates: Rates, height: int, assumed: Assumptions) -> list[Unknown]:
     """Return the entries of the read-out and of the stamps: what a camera that turns shows."""
     mean_s, sigma_s = assumed.readout_s
+    rates_rad_s = rates.rad_s
     if not np.isfinite(rates_rad_s).all():
-        # A rolling shutter by its data sheet, at a rate that is not known.
-        turn_rad = abs(mean_s) * _UNKNOWN_RATE_RAD_S
+        # A rolling shutter by its data sheet, at a rate that no image has.
+        turn_rad = abs(mean_s) * UNKNOWN_RATE_RAD_S
         axes: Floats = np.broadcast_to(np.eye(3), (len(rates_rad_s), 3, 3))
         labels = ('readout_x_rad', 'readout_y_rad', 'readout_z_rad')
         readout = Unknown('readout', labels, np.full(3, turn_rad), np.zeros(3))
@@ -401,15 +411,29 @@ def _of_timing(rates_rad_s: Floats, height: int, assumed: Assumptions) -> list[U
     if not rates_rad_s.any():
         return []
     entries = []
-    rates = rates_rad_s[:, :, None]
+    by_time = rates_rad_s[:, :, None]
     if sigma_s > 0:
-        turn = functools.partial(_by_readout, rates, height)
+        turn = functools.partial(_by_readout, by_time, height)
         value = np.array([-mean_s])
         entries.append(Unknown('readout', ('readout_s',), np.array([sigma_s]), value, turn=turn))
     if assumed.stamp_s > 0:
         sigma = np.array([assumed.stamp_s])
-        entries.append(Unknown('stamps', ('stamp_offset_s',), sigma, np.zeros(1), tracker=rates))
+        entries.append(Unknown('stamps', ('stamp_offset_s',), sigma, np.zeros(1), tracker=by_time))
     return entries
+
+
+def _errors_of_rates(rates: Rates, height: int) -> list[Unknown]:
+    """
+    Return the entry of the errors of the rates: three turns of each image over its read-out.
+
+    In units of their priors.
+    """
+    turns = rates.readout_s * rates.root_rad_s
+    if np.abs(turns).max() < _NO_TURN_RAD:
+        return []
+    turn = functools.partial(_by_readout, turns, height)
+    labels = ('rate_error_x', 'rate_error_y', 'rate_error_z')
+    return [Unknown('rates', labels, np.ones(3), np.zeros(3), of_image=True, turn=turn)]
 
 
 def _by_velocity(

@@ -41,6 +41,7 @@ from starcal_ros.estimation.problem import (
     Problem,
     State,
 )
+from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import (
     coarsest_cells,
     Groups,
@@ -79,7 +80,7 @@ class Data:
     stated_rad: Floats  # (3,)
     prior: CameraGeometry
     options: CalibrationOptions
-    rates_rad_s: Floats  # (m, 3) of the first star tracker in its frame
+    rates: Rates  # of the first star tracker in its frame
     velocity_sigma_m_s: Floats  # (m,)
     refraction: Refraction | None
     groups: tuple[Groups, ...]

@@ -118,6 +118,7 @@ def observe_next(
             setup.mountings[: len(more_attitudes)],
             setup.attitude.max_attitude_gap_s,
             track.taken,
+            assumed_tracker_sigma_rad(setup.calibration),
         )
         known |= _known_of(found[0]) | {'catalog_digest': setup.catalog.digest}
         saturation_dn = setup.centroid.saturation_dn
@@ -149,6 +150,7 @@ def _known_of(attitude: Attitude) -> dict[str, Any]:
         'star_tracker': attitude.star_tracker,
         'first_from_star_tracker_xyzw': attitude.first_from_star_tracker_xyzw,
         'star_tracker_rate_rad_s': attitude.rate_rad_s,
+        'star_tracker_rate_sigma_rad_s': attitude.rate_sigma_rad_s,
     }
 
 

@@ -186,6 +186,8 @@ class StarObservations:
     star_tracker_rate_rad_s : (3,)
         Angular rate at ``time_ns`` by the attitude samples, in the frame of the first star
         tracker; NaN if unknown.
+    star_tracker_rate_sigma_rad_s : (3,)
+        1-sigma of that about the axes of that frame; NaN if unknown.
     velocity_sigma_m_s : float
         1-sigma of each component of the observer's velocity in ``direction_icrf``; 0 for a site on
         the ground, NaN if no velocity was given and that of the Earth was used.
@@ -236,6 +238,9 @@ class StarObservations:
         dataclasses.field(default_factory=lambda: np.empty(0, np.uint8))
     )
     star_tracker_rate_rad_s: Annotated[Floats, Within(), Shape((3,))] = dataclasses.field(
+        default_factory=lambda: np.full(3, math.nan)
+    )
+    star_tracker_rate_sigma_rad_s: Annotated[Floats, Within(0), Shape((3,))] = dataclasses.field(
         default_factory=lambda: np.full(3, math.nan)
     )
     velocity_sigma_m_s: Annotated[float, Within(0)] = math.nan

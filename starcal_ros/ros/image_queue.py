@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 import dataclasses
 from dataclasses import dataclass
+import math
 import os
 import threading
 import time
@@ -33,6 +34,7 @@ from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 _WRONG_NS = 10 * NANOSECONDS_PER_SECOND
 WINDOW_S = 60.0
 _MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messages
+_SILENT_S = 2.0  # without a sample: no image waits for more of them for its rate
 _LAGS = 100  # samples from which the delay of a star tracker is learned
 _MORE = 2  # times the longest of them: it has fallen silent
 KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
@@ -127,7 +129,7 @@ class ImageQueue:
                         self._images.popleft()
                         self._held -= first.message is not None
                         return first
-                self._changed.wait(left_s)
+                self._changed.wait(left_s and min(left_s, _SILENT_S))
             return None
 
     def _is_due(self, first: Waiting) -> bool:
@@ -214,15 +216,17 @@ class StarTrackers:
         self._max_gap_s, self._max_gap_ns = max_gap_s, int(max_gap_s * NANOSECONDS_PER_SECOND)
         self._most_ns = int(patience_s * NANOSECONDS_PER_SECOND)
         self._lags_ns: tuple[deque[int], ...] = tuple(deque(maxlen=_LAGS) for _ in range(count))
-        self._lock = threading.Lock()  # of the lags
+        self._heard_s = [-math.inf] * count  # wall clock of the last sample of each
+        self._lock = threading.Lock()  # of the lags and of these
 
     def add(self, which: int, time_ns: int, sample: AttitudeSample | None) -> None:
         """Add a sample of a star tracker; None marks an invalid one."""
         before_ns = self.histories[which].latest_ns
         self.histories[which].add(time_ns, sample)
         newest_ns = self._newest_ns()
-        if before_ns is not None and newest_ns is not None:
-            with self._lock:
+        with self._lock:
+            self._heard_s[which] = time.monotonic()
+            if before_ns is not None and newest_ns is not None:
                 self._lags_ns[which].append(newest_ns - before_ns)
 
     def has_come(self, time_ns: int) -> bool:
@@ -233,8 +237,9 @@ class StarTrackers:
         trackers than twice as far as it was before any of its last samples: that holds for any
         rate, delay or burst of telemetry, and at any speed of a replay.
         """
-        return any(self._is_settled(history, time_ns) for history in self.histories) and not any(
-            self._may_follow(which, time_ns) for which in range(len(self.histories))
+        each = range(len(self.histories))
+        return any(self._is_settled(which, time_ns) for which in each) and not any(
+            self._may_follow(which, time_ns) for which in each
         )
 
     def awaited(self, time_ns: int) -> frozenset[int]:
@@ -246,8 +251,9 @@ class StarTrackers:
         latest = (history.latest_ns for history in self.histories)
         return frozenset(k for k, ns in enumerate(latest) if ns is None or ns < time_ns)
 
-    def _is_settled(self, history: AttitudeHistory, time_ns: int) -> bool:
-        """True if the samples about a time are there, or can no longer arrive."""
+    def _is_settled(self, which: int, time_ns: int) -> bool:
+        """True if the samples about a time, for its rate too, are there or no longer come."""
+        history = self.histories[which]
         latest_ns = history.latest_ns
         if latest_ns is None or latest_ns < time_ns:
             return False
@@ -257,7 +263,9 @@ class StarTrackers:
             history.at(time_ns, self._max_gap_s)
         except ImageRefused:
             return False
-        return True
+        with self._lock:
+            silent_s = time.monotonic() - self._heard_s[which]
+        return silent_s > _SILENT_S or not history.expects(time_ns)
 
     def _may_follow(self, which: int, time_ns: int) -> bool:
         """True if a star tracker is alive and has sent nothing after a time."""

@@ -22,6 +22,10 @@ from starcal_ros.records import AttitudeSample
 _NORM_TOLERANCE = 1e-3
 _INVALID = [math.nan] * 4
 _RUNS = 3  # the present clock, the previous one, and a wrong stamp between
+ARC_S = 1.0
+"""Half of the time over which samples give the rate at an image."""
+# Correlation lengths of the errors of samples: the slope over two seconds is worst for the last.
+_MEMORIES_S = (1e-6, 0.1, 0.5)
 
 
 @dataclass(frozen=True)
@@ -165,23 +169,32 @@ class AttitudeHistory:
 
         Raises ImageRefused ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
         """
-        return self._in_a_run(lambda run: run.around(time_ns, max_gap_s))
+        before, after = self._in_a_run(lambda run: run.around(time_ns, max_gap_s))
+        return before, after
 
-    def rate_at(self, time_ns: int, max_gap_s: float) -> Floats:
+    def rate_at(
+        self, time_ns: int, max_gap_s: float, sample_sigma_rad: Floats
+    ) -> tuple[Floats, Floats]:
         """
-        Angular rate (3,) at a time in the star tracker frame, rad/s; NaN if unknown.
+        Angular rate (3,) in the star tracker frame and its 1-sigma, rad/s; NaN if unknown.
 
-        Uses the samples on both sides of the time, or a sample with exactly this stamp and the
-        previous one.
+        The slope of the samples within `ARC_S` (`rate_of`), at least of those on both sides of the
+        time, or of a sample with exactly this stamp and the previous one.
         """
         try:
-            return rate_between(*self._in_a_run(lambda run: run.step_to(time_ns, max_gap_s)))
+            samples = self._in_a_run(lambda run: run.arc(time_ns, max_gap_s))
         except ImageRefused:
-            return np.full(3, math.nan)
+            return np.full(3, math.nan), np.full(3, math.nan)
+        return rate_of(samples, time_ns, sample_sigma_rad)
+
+    def expects(self, time_ns: int) -> bool:
+        """True if a further sample within `ARC_S` after a time is due, by the last step."""
+        with self._lock:
+            return bool(self._runs) and self._runs[-1].expects(time_ns)
 
     def _in_a_run(
-        self, look_up: Callable[[_Run], tuple[AttitudeSample, AttitudeSample]]
-    ) -> tuple[AttitudeSample, AttitudeSample]:
+        self, look_up: Callable[[_Run], tuple[AttitudeSample, ...]]
+    ) -> tuple[AttitudeSample, ...]:
         """Samples of the most recently extended run that has them."""
         refusals = []
         with self._lock:
@@ -273,32 +286,64 @@ class _Run:
         gap_s = (self._times_ns[k] - self._times_ns[k - 1]) / NANOSECONDS_PER_SECOND
         raise ImageRefused('attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s')
 
-    def step_to(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, AttitudeSample]:
+    def arc(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, ...]:
         """
-        Return two adjacent samples, the second one at or after a time.
+        Return the samples about a time that its rate is taken from: two or more.
 
-        If a sample has exactly this stamp, no later one is needed: a node may not have it yet.
+        A sample with exactly this stamp that has no other in the arc is taken with the one before
+        it: a node may not have a later one yet.
         """
         before, after = self.around(time_ns, max_gap_s)
-        if before is not after:
-            return before, after
-        low, k = self._index(time_ns - _nanoseconds(max_gap_s)), self._index(time_ns)
-        valid = self._valid(low, k).nonzero()[0]
-        if not len(valid):
+        arc_ns = _nanoseconds(ARC_S)
+        low = self._index(min(before.time_ns, time_ns - arc_ns))
+        high = self._index(max(after.time_ns, time_ns + arc_ns) + 1)
+        places = low + self._valid(low, high).nonzero()[0]
+        if len(places) < 2:
+            low = self._index(time_ns - _nanoseconds(max_gap_s))
+            places = low + self._valid(low, high).nonzero()[0][-2:]
+        if len(places) < 2:
             raise ImageRefused('no_attitude', 'no attitude sample before that of the image')
-        return self._sample(low + int(valid[-1])), after
+        return tuple(self._sample(int(k)) for k in places)
+
+    def expects(self, time_ns: int) -> bool:
+        """See `AttitudeHistory.expects`."""
+        if len(self) < 2:
+            return False
+        due_ns = 2 * self._times_ns[-1] - self._times_ns[-2]
+        return due_ns <= time_ns + _nanoseconds(ARC_S)
 
     def _sample(self, k: int) -> AttitudeSample:
         return AttitudeSample(self._times_ns[k], np.array(self._xyzw[4 * k : 4 * k + 4]))
 
 
-def rate_between(before: AttitudeSample, after: AttitudeSample) -> Floats:
-    """Angular rate (3,) between two samples in the star tracker frame, rad/s."""
+def rate_of(
+    samples: Sequence[AttitudeSample], time_ns: int, sample_sigma_rad: Floats
+) -> tuple[Floats, Floats]:
+    """
+    Angular rate (3,) in the star tracker frame by two or more samples, and its 1-sigma, rad/s.
+
+    The slope of a parabola by least squares, since a camera that speeds up bends the arc; of a
+    line through two or three samples.  The errors of the samples have the scatter about it, at
+    least ``sample_sigma_rad`` (3,), and the correlation that the slope takes most of: the samples
+    of a star tracker that filters them scatter less about a slope than it is off.
+    """
     from scipy.spatial.transform import Rotation  # half of the start of a short command
 
-    first, last = (Rotation.from_quat(s.icrf_from_star_tracker_xyzw) for s in (before, after))
-    step_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
-    return np.asarray((first.inv() * last).as_rotvec() / step_s)
+    late_s = np.array([s.time_ns - time_ns for s in samples]) / NANOSECONDS_PER_SECOND
+    rotations = Rotation.from_quat([s.icrf_from_star_tracker_xyzw for s in samples])
+    turned = (rotations[int(np.argmin(np.abs(late_s)))].inv() * rotations).as_rotvec()
+    degree = 2 if len(samples) > 3 else 1
+    powers = np.vander(late_s, degree + 1, increasing=True)
+    fit = np.linalg.pinv(powers)
+    rate: Floats = fit[1] @ turned
+    left = len(samples) - degree - 1
+    scatter2 = ((turned - powers @ (fit @ turned)) ** 2).sum(axis=0) / max(left, 1)
+    apart_s = np.abs(np.subtract.outer(late_s, late_s))
+    factor2 = max(
+        fit[1] @ np.exp(-0.5 * (apart_s / memory_s) ** 2) @ fit[1] for memory_s in _MEMORIES_S
+    )
+    variance = np.maximum(scatter2 if left else 0.0, np.square(sample_sigma_rad))
+    return rate, np.sqrt(factor2 * variance)
 
 
 def _between(before: AttitudeSample, after: AttitudeSample, time_ns: int) -> Floats:
@@ -335,8 +380,9 @@ class Attitude:
         Orientation of the first star tracker.
     gap_s : float
         Gap between the two samples around the image.
-    rate_rad_s : (3,)
-        Angular rate of the first star tracker in its frame; NaN where it is not known.
+    rate_rad_s, rate_sigma_rad_s : (3,)
+        Angular rate of the first star tracker in its frame, and its 1-sigma; NaN where it is not
+        known.
     star_tracker : str
         Frame of the star tracker that measured the attitude; empty: the first.
     first_from_star_tracker_xyzw : (4,)
@@ -346,6 +392,7 @@ class Attitude:
     icrf_from_star_tracker_xyzw: Floats
     gap_s: float
     rate_rad_s: Floats
+    rate_sigma_rad_s: Floats
     star_tracker: str = ''
     first_from_star_tracker_xyzw: Floats = field(default_factory=lambda: IDENTITY_XYZW)
 
@@ -357,9 +404,12 @@ def attitudes_at(
     mountings: Sequence[Mounting],
     max_gap_s: float,
     taken: Mapping[str, int],
+    sample_sigma_rad: Floats,
 ) -> list[Attitude]:
     """
     Attitudes at a time, starting with the star tracker that has the fewest images ``taken``.
+
+    ``sample_sigma_rad`` (3,) is the noise of a sample about the axes of a star tracker.
 
     In this order every star tracker is calibrated, and each can replace a silent one.  Raises
     ImageRefused if no star tracker has an attitude, with the reason of the first.
@@ -369,7 +419,8 @@ def attitudes_at(
     usable: list[Attitude] = []
     refusal: ImageRefused | None = None
     try:
-        usable.append(Attitude(*first.at(time_ns, max_gap_s), first.rate_at(time_ns, max_gap_s)))
+        rate = first.rate_at(time_ns, max_gap_s, sample_sigma_rad)
+        usable.append(Attitude(*first.at(time_ns, max_gap_s), *rate))
     except ImageRefused as refused:
         refusal = refused
     for history, mounting in zip(others, mountings, strict=True):
@@ -379,12 +430,15 @@ def attitudes_at(
             continue
         mounted = Rotation.from_quat(mounting.first_from_star_tracker_xyzw)
         first_xyzw = (Rotation.from_quat(quaternion) * mounted.inv()).as_quat()
-        rate_rad_s = mounted.apply(history.rate_at(time_ns, max_gap_s))
+        rate_rad_s, sigma_rad_s = history.rate_at(time_ns, max_gap_s, sample_sigma_rad)
+        # The axes of a star tracker lie across those of the first one: each takes its part.
+        sigma_rad_s = np.sqrt(mounted.as_matrix() ** 2 @ sigma_rad_s**2)
         usable.append(
             Attitude(
                 first_xyzw,
                 gap_s,
-                rate_rad_s,
+                mounted.apply(rate_rad_s),
+                sigma_rad_s,
                 mounting.frame,
                 mounting.first_from_star_tracker_xyzw,
             )

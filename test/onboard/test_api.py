@@ -35,6 +35,7 @@ def arrays(image: StarObservations) -> dict[str, Any]:
         'icrf_from_star_tracker_xyzw': image.icrf_from_star_tracker_xyzw,
         'catalog_id': image.catalog_id,
         'star_tracker_rate_rad_s': image.star_tracker_rate_rad_s,
+        'star_tracker_rate_sigma_rad_s': image.star_tracker_rate_sigma_rad_s,
         'velocity_sigma_m_s': image.velocity_sigma_m_s,
     }
 

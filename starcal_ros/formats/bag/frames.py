@@ -3,9 +3,9 @@
 Images of bags, each with the telemetry of its time, from one pass over the files.
 
 Another thread reads and decompresses while the images before are measured.  An image waits until
-an attitude a second after it has been read.  Where that is not enough - telemetry recorded in
-another file, far out of order or not at all - a second pass reads all telemetry first, so that the
-order of recording changes no result.
+an attitude two seconds after it has been read: its rate takes those of the first of them.  Where
+that is not enough - telemetry recorded in another file, far out of order or not at all - a second
+pass reads all telemetry first, so that the order of recording changes no result.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ from starcal_ros.formats.messages.sensor_messages import (
     velocity_from_message,
 )
 from starcal_ros.records import Image, StarObservations
-from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.sky.attitude import ARC_S, attitude_sample, AttitudeHistory, AttitudeOptions
 
 _LATE_NS = NANOSECONDS_PER_SECOND  # a sample is recorded at most so long after later ones
+_ARC_NS = round(ARC_S * NANOSECONDS_PER_SECOND)
 _WAITING_BYTES = 64 << 20  # images that wait for telemetry; two may always wait
 _BATCH_BYTES = 8 << 20  # read ahead: an image, or the telemetry of an hour
 
@@ -114,7 +115,7 @@ class Telemetry:
     def covers(self, time_ns: int) -> bool:
         """True if no further sample changes the telemetry of a time, but for very late ones."""
         newest_ns = self._newest_ns.get(self._topics.attitude)
-        if newest_ns is None or newest_ns < time_ns + _LATE_NS:
+        if newest_ns is None or newest_ns < time_ns + _ARC_NS + _LATE_NS:
             return False
         for topic, samples in (
             (self._topics.velocity, self.velocities),
@@ -134,7 +135,7 @@ class Telemetry:
         return velocity_m_s, latest_at(self.temperatures, time_ns, math.nan)
 
     def numbers_at(self, time_ns: int) -> Floats:
-        """All that a measurement takes from the samples, (14,); NaN where there is none."""
+        """All that a measurement takes from the samples, (17,); NaN where there is none."""
         try:
             samples = self.attitudes.around(time_ns, self._options.max_attitude_gap_s)
             attitudes = [
@@ -143,9 +144,11 @@ class Telemetry:
             ]
         except ImageRefused:
             attitudes = [np.full(10, np.nan)]
+        max_gap_s = self._options.max_attitude_gap_s
+        rate_rad_s, _ = self.attitudes.rate_at(time_ns, max_gap_s, np.zeros(3))
         velocity_m_s, temperature_degc = self.at(time_ns)
         velocity_m_s = np.full(3, np.nan) if velocity_m_s is None else velocity_m_s
-        return np.concatenate([*attitudes, velocity_m_s, [temperature_degc]])
+        return np.concatenate([*attitudes, velocity_m_s, [temperature_degc], rate_rad_s])
 
 
 def read_telemetry(

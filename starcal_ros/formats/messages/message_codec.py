@@ -244,6 +244,8 @@ def _shaped(
         shape[shape.index(-1)] = flat.size // known if known else 0
     elif -1 in shape:  # both sides have the same name: a square
         shape = [math.isqrt(flat.size) if size == -1 else size for size in shape]
+    if not flat.size and kind.low is not None and not kind.is_finite:
+        return np.full(shape, math.nan, flat.dtype)  # left out: numbers that are not known
     if flat.size != math.prod(shape):
         raise ValueError(f'{field}: {flat.size} numbers, not {" x ".join(map(str, shape))}')
     return flat.reshape(shape)

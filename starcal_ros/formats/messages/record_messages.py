@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+import math
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -42,6 +43,7 @@ from starcal_ros.records import (
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # smallest and largest that a measured star has
 _LONGEST_DETAIL = 500  # characters
+_EXACT_VELOCITY = -1.0  # in messages: 0 is that of a sender that leaves it out
 # No software on board reads them: they are in calibration.json alone.
 _NOT_SENT = ('model_checks', 'statements')
 
@@ -56,14 +58,34 @@ def observations_from_message(message: Message) -> StarObservations:
     """
     Observations of a starcal/StarObservations.
 
+    Fields that a sender leaves at ROS's zeros have their defaults.
+
     Raises ValueError when the arrays of the message do not fit each other or hold values that no
     star can have.
     """
     values = plain_message(StarObservations, message)
     values['detail'] = values['detail'][:_LONGEST_DETAIL]
+    _forget_zeros(values)
     record = read_record(StarObservations, values)
     _check_stars(record)
     return record
+
+
+def _forget_zeros(values: dict[str, Any]) -> None:
+    """Replace zeros that no sender means, as ROS fills them in, by numbers that are not known."""
+    nowhere = np.full(3, math.nan)
+    if not np.any(values['first_from_star_tracker']):
+        del values['first_from_star_tracker']
+    sigma = values.get('star_tracker_rate_sigma_rad_s', nowhere)
+    values['star_tracker_rate_sigma_rad_s'] = np.where(sigma == 0, math.nan, sigma)
+    is_stated = bool((sigma > 0).any())
+    if not is_stated and not np.any(values.get('star_tracker_rate_rad_s', nowhere)):
+        values['star_tracker_rate_rad_s'] = nowhere
+    if not np.any(values.get('zenith_icrf', nowhere)):
+        values['zenith_icrf'] = nowhere
+    stated = {0.0: math.nan, _EXACT_VELOCITY: 0.0}
+    velocity = values.get('velocity_sigma_m_s', math.nan)
+    values['velocity_sigma_m_s'] = stated.get(velocity, velocity)
 
 
 def checked_observations(message: Message) -> StarObservations:

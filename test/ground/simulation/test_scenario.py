@@ -90,3 +90,28 @@ def test_only_the_brightest_stars() -> None:
     size = np.array([few.truth.camera.width, few.truth.camera.height])
     inside = ((every.pixel_px >= 0) & (every.pixel_px <= size - 1)).all(axis=1)
     assert sorted(nine.magnitude) == sorted(every.magnitude[inside])[:9]
+
+
+def test_samples_may_have_errors_of_their_own() -> None:
+    """The attitude at the image is between two of them: their errors average to sqrt(2)."""
+    own = dataclasses.replace(
+        scenario('small'), star_tracker_hz=10.0, star_tracker_sigma_arcsec=(20.0,) * 3
+    )
+    camera_from_tracker = own.truth.star_tracker_from_camera.inv()
+    errors, at_image = [], []
+    for index in range(own.image_count):
+        samples = attitude_samples(own, index)
+        late_s = np.array([sample.time_ns - own.time_ns(index) for sample in samples]) / 1e9
+        assert np.allclose(np.diff(late_s), 0.1) and late_s.max() == pytest.approx(1.45)
+        for sample, offset_s in zip(samples, late_s, strict=True):
+            true = Rotation.from_matrix(camera_from_icrf(own, index, float(offset_s)))
+            reported = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
+            errors.append((camera_from_tracker.inv() * true * reported).as_rotvec())
+        true = Rotation.from_matrix(camera_from_icrf(own, index))
+        reported = Rotation.from_quat(scene(own, index).icrf_from_star_tracker_xyzw)
+        at_image.append((camera_from_tracker.inv() * true * reported).as_rotvec())
+    sigma = np.array(errors) / ARCSECOND_RAD
+    assert sigma.std() == pytest.approx(20.0, rel=0.1)  # of 2160 numbers, 6 standard errors
+    assert np.abs(np.corrcoef(sigma[:-1].ravel(), sigma[1:].ravel())[0, 1]) < 0.1
+    expected = 20.0 / math.sqrt(2.0)
+    assert np.std(at_image) / ARCSECOND_RAD == pytest.approx(expected, rel=0.35)  # of 72

@@ -113,7 +113,7 @@ def test_an_image_that_nothing_holds_stays_and_adds_nothing(given: Small) -> Non
     linear = dataclasses.replace(without.linear(), problem=problem)
     arrow = equations(without.sums(), linear, SHAPE)
     assert not arrow.own[2].any() and not arrow.back[2].any()
-    assert arrow.covariance[2] == pytest.approx(np.diag(np.r_[1.0, 1.0, 1.0, SHAPE**2]))
+    assert arrow.covariance[2] == pytest.approx(np.diag(np.r_[np.ones(3), SHAPE**2, np.ones(3)]))
     assert arrow.back[1].any()
     # The images are independent: the others give what they give together with it, less its part.
     whole = dense(without)
@@ -178,9 +178,11 @@ def test_the_chain_turns_camera_columns_into_unknowns(given: Small) -> None:
         assert np.diag(E[k])[:3] == pytest.approx(factor)
         assert E[k][:3, p] == pytest.approx(given.state.parameters[:3] * above_k)
         assert E[k][:3, p + 1] == pytest.approx(given.state.parameters[:3] * above_k**2)
-        # Rows: camera, velocity and read-out, rotation, residual.
-        assert E[k][p:-1, p + 2 : p + 9] == pytest.approx(np.eye(7))
-        scale, stretch, shear, *decentring = E[k][:p, -6:-1].T
+        # Rows: camera, velocity and read-out, errors of rates, rotation, residual.
+        of_stars = np.r_[np.arange(p + 2, p + 6), E.shape[2] - 4 + np.arange(3)]
+        of_stars = np.r_[of_stars, np.arange(p + 6, p + 9)]
+        assert E[k][p:-1][:, of_stars] == pytest.approx(np.eye(10))
+        scale, stretch, shear, *decentring = E[k][:p, -9:-4].T
         assert scale[:3] == pytest.approx([1.0, 0.0, 1.0]) and not scale[3:].any()
         assert stretch[:3] == pytest.approx([1.0, 0.0, -1.0]) and not stretch[3:].any()
         assert shear[:3] == pytest.approx([0.0, 1.0, 0.0]) and not shear[3:].any()

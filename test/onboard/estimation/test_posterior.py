@@ -247,9 +247,9 @@ def test_sums_of_the_shapes_have_the_likelihood_of_contrasts_free_of_everything_
     # The stars alone: rotations are free, star trackers show no shape.
     common = made.layout.of(['camera', 'focal', 'velocity', 'readout'])
     common = common[np.isfinite(precision[common])]
-    proper = common[precision[common] > 0]
     own = P + np.arange(OWN * IMAGES).reshape(IMAGES, OWN)
-    shape = own[:, 3:].ravel()
+    shape, rates = own[:, 3:8].ravel(), own[:, 8:].ravel()
+    proper = np.concatenate([common[precision[common] > 0], rates])
     # Unknowns without a prior are removed by contrasts, those with one are random.
     improper = np.concatenate([common[precision[common] == 0], own[:, :3].ravel()])
     rows = np.flatnonzero(np.repeat(made.keep, 2))

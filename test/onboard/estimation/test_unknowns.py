@@ -19,6 +19,7 @@ from four_images import (  # type: ignore[import-not-found]
     shared_steps,
     Small,
     small,
+    TURN_S,
     usual,
     whitener,
     WIDTH,
@@ -31,7 +32,14 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import rotation_jacobian
 from starcal_ros.estimation.equations import star_columns, tracker_turns
 from starcal_ros.estimation.problem import attitude_errors
-from starcal_ros.estimation.unknowns import Assumptions, moved, unknowns_in_state, unknowns_of
+from starcal_ros.estimation.rates import Rates
+from starcal_ros.estimation.unknowns import (
+    Assumptions,
+    Layout,
+    moved,
+    unknowns_in_state,
+    unknowns_of,
+)
 
 # Finite differences are exact to 1e-10 of a column; attitude errors of 20 arcsec enter the
 # derivatives of the star trackers to first order, which leaves their square: 1e-8.
@@ -83,7 +91,7 @@ def star_matrix(given: Small) -> tuple[Floats, Floats]:
             X[row, :, count + OWN * image[row] : count + OWN * image[row] + 3] = value
         r[rows] = plain[:, :, -1]
     # The turns again, with the documented rotation jacobian of the camera.
-    for entry in given.layout.shared:
+    for entry in given.layout.entries:
         at = given.layout.places[entry.name]
         if entry.turn is not None:
             turned = entry.turn(given.predicted_px.T, e.T, image)
@@ -95,7 +103,11 @@ def star_matrix(given: Small) -> tuple[Floats, Floats]:
                     a * above_k ** (i + 1) for i, a in enumerate(given.state.focal)
                 )
                 J = rotation_jacobian(dataclasses.replace(CAMERA, parameters=own), e[here])
-                X[here, :, at] = np.einsum('nab,bqn->naq', J, turned[:, :, here])
+                first = count + OWN * k if entry.of_image else 0
+                columns = np.arange(first + at.start, first + at.stop)
+                X[np.ix_(here, np.arange(2), columns)] = np.einsum(
+                    'nab,bqn->naq', J, turned[:, :, here]
+                )
         if entry.functions is not None:
             t = len(entry) // 2
             values = entry.functions(given.predicted_px.T).T
@@ -107,14 +119,16 @@ def star_matrix(given: Small) -> tuple[Floats, Floats]:
 def places(given: Small, name: str) -> np.ndarray:
     """Columns of an entry in the dense matrices."""
     at = given.layout.places[name]
-    if name == 'shape':
+    if given.layout[name].of_image:
         return np.concatenate(
             [given.layout.count + OWN * k + np.arange(at.start, at.stop) for k in range(IMAGES)]
         )
     return np.arange(at.start, at.stop)
 
 
-@pytest.mark.parametrize('name', ['camera', 'focal', 'velocity', 'readout', 'field', 'shape'])
+@pytest.mark.parametrize(
+    'name', ['camera', 'focal', 'velocity', 'readout', 'field', 'shape', 'rates']
+)
 def test_a_derivative_by_pixels_is_that_of_the_projection(
     given: Small, truth: Dense, name: str
 ) -> None:
@@ -160,8 +174,9 @@ def test_labels_have_a_name_and_a_unit_for_each_unknown(given: Small) -> None:
         'focal_temperature_2',
     )
     assert layout.labels[layout.places['stamps']] == ('stamp_offset_s',)
-    assert [e.name for e in layout.of_image] == ['shape']
-    assert layout.places['shape'] == slice(3, 3 + len(layout['shape'])) == slice(3, OWN)
+    assert [e.name for e in layout.of_image] == ['shape', 'rates']
+    assert layout.places['shape'] == slice(3, 3 + len(layout['shape'])) == slice(3, 8)
+    assert layout.places['rates'] == slice(8, OWN)
     assert layout.places['field'].stop == layout.count
     for entry in layout.entries:
         assert len(entry.sigma) == len(entry.offset) == len(entry) > 0
@@ -244,37 +259,37 @@ def test_the_field_has_the_next_radial_term_of_a_lens_free_of_lower_ones(given: 
 
 def test_what_is_not_assumed_or_not_known_is_no_unknown() -> None:
     given = small(terms=False, two_trackers=False)
-    size = WIDTH, HEIGHT
+    size, rates_rad_s = (WIDTH, HEIGHT), given.rates.rad_s
 
-    def names(rates: Floats, assumed: Assumptions) -> list[str]:
-        layout = unknowns_of(given.problem, given.state, rates, size, assumed)
-        return [e.name for e in layout.entries]
+    def layout_of(rates_rad_s: Floats, assumed: Assumptions) -> Layout:
+        rates = Rates(rates_rad_s, np.zeros((IMAGES, 3, 3)), TURN_S)
+        return unknowns_of(given.problem, given.state, rates, size, assumed)
+
+    def names(rates_rad_s: Floats, assumed: Assumptions) -> list[str]:
+        return [e.name for e in layout_of(rates_rad_s, assumed).entries]
 
     basic = ['camera', 'alignment', 'field', 'shape']
     none = Assumptions(0.0, (0.004, 0.0), 0.0)
     still, unknown = np.zeros((IMAGES, 3)), np.full((IMAGES, 3), np.nan)
-    half = np.where(np.arange(IMAGES)[:, None] == 1, np.nan, given.rates_rad_s)
-    assert names(given.rates_rad_s, none) == basic
+    assert names(rates_rad_s, none) == basic
     assert names(still, ASSUMED) == ['camera', 'alignment', 'velocity', 'field', 'shape']
     # A rolling shutter turns by an unknown constant rate over its read-out; any other is left out.
-    for rates in (unknown, half):
-        assert names(rates, ASSUMED)[2:4] == ['velocity', 'readout']
-        assert names(rates, Assumptions(0.0, (0.0, 0.02), 0.005)) == basic
-    layout = unknowns_of(given.problem, given.state, unknown, size, ASSUMED)
-    readout = layout['readout']
+    assert names(unknown, ASSUMED)[2:4] == ['velocity', 'readout']
+    assert names(unknown, Assumptions(0.0, (0.0, 0.02), 0.005)) == basic
+    readout = layout_of(unknown, ASSUMED)['readout']
     assert readout.sigma == pytest.approx(np.full(3, 0.004 * 1e-3))
     assert not readout.offset.any() and readout.turn is not None
     pixels = np.array([[3.0, 3.0], [-0.5, HEIGHT - 0.5]])
     turns = readout.turn(pixels, np.zeros((3, 2)), np.array([0, 2]))
     assert turns.transpose(2, 0, 1) == pytest.approx(np.stack([-0.5 * np.eye(3), 0.5 * np.eye(3)]))
-    assert names(given.rates_rad_s, Assumptions(0.0, (0.0, 0.0), 0.1)) == [
+    assert names(rates_rad_s, Assumptions(0.0, (0.0, 0.0), 0.1)) == [
         'camera',
         'alignment',
         'stamps',
         'field',
         'shape',
     ]
-    assert names(given.rates_rad_s, Assumptions(0.0, (0.0, 0.1), 0.0))[2] == 'readout'
+    assert names(rates_rad_s, Assumptions(0.0, (0.0, 0.1), 0.0))[2] == 'readout'
     one = np.zeros((IMAGES, 3))
     one[2, 1] = 1e-5
     assert 'readout' in names(one, ASSUMED) and 'stamps' in names(one, ASSUMED)

@@ -9,6 +9,7 @@ import pytest
 
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import observation_groups
 from starcal_ros.estimation.weights import CentroidVariance, Data, judge, Judged
 from starcal_ros.records import CameraGeometry
@@ -26,7 +27,7 @@ def test_residuals_that_no_star_is_left_of_say_so(off_px: float, words: str) -> 
         np.ones(3),
         CameraGeometry(CAMERA, np.array([0.0, 0.0, 0.0, 1.0])),
         CalibrationOptions(variance_components=False),
-        np.zeros((IMAGES, 3)),
+        Rates(np.zeros((IMAGES, 3)), np.zeros((IMAGES, 3, 3))),
         np.zeros(IMAGES),
         None,
         observation_groups(table.measured_px, table.star, CAMERA.width),

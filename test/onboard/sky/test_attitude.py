@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
@@ -290,6 +291,9 @@ def test_memory_of_a_fast_tracker_is_bounded() -> None:
     assert peak_bytes < 2000 * 40 * 4
 
 
+SIGMA_RAD = np.full(3, 10.0 * ARCSECOND_RAD)
+
+
 def turning(rate_rad_s: np.ndarray, at_s: tuple[float, ...]) -> AttitudeHistory:
     """Samples of a star tracker that turns at a constant rate about axes of its own."""
     start = Rotation.from_quat(random_quaternions(3, 1)[0])
@@ -304,16 +308,65 @@ def turning(rate_rad_s: np.ndarray, at_s: tuple[float, ...]) -> AttitudeHistory:
 def test_the_rate_is_that_about_the_own_axes() -> None:
     """Also at a sample's own stamp, where a node has no later one yet."""
     rate_rad_s = np.array([0.01, -0.03, 0.02])
-    held = turning(rate_rad_s, (0.0, 0.5, 1.0))
-    for t in (0.1, 0.5, 0.9, 1.0):
-        found = held.rate_at(START_NS + round(t * S), 2.0)
+    held = turning(rate_rad_s, (0.0, 0.5, 1.0, 2.5))
+    for t in (0.1, 0.5, 0.9, 1.0, 1.8, 2.5):
+        found, sigma = held.rate_at(START_NS + round(t * S), 2.0, SIGMA_RAD)
         np.testing.assert_allclose(found, rate_rad_s, atol=1e-9)
+        # Of two samples, a line through three: nothing shows how they scatter.
+        assert (sigma >= SIGMA_RAD / np.sqrt(2.0)).all()
+
+
+ARC_10_HZ = tuple(np.arange(-0.95, 1.0, 0.1))
+
+
+@pytest.mark.parametrize(
+    ('at_s', 'memory_s', 'low', 'high'),
+    [
+        (ARC_10_HZ, 0.0, 0.3, 0.6),
+        ((-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0), 0.0, 0.5, 0.9),
+        (ARC_10_HZ, 0.5, 0.7, 1.15),  # filtered: they scatter less about a slope than it is off
+        (tuple(t for t in ARC_10_HZ if not -0.5 < t < 0.2), 0.0, 0.3, 0.6),  # a dropout
+        (tuple(t for t in ARC_10_HZ if t < 0.2), 0.0, 0.5, 1.0),  # the last image
+        ((-0.93, -0.9, -0.41, 0.02, 0.11, 0.6, 0.97), 0.0, 0.5, 0.9),  # at no fixed rate
+        ((-0.05, 0.05), 0.0, 0.8, 1.2),
+        ((-1.0, 1.0), 0.0, 0.8, 1.2),
+        ((-0.3, 0.1, 0.9), 0.0, 0.6, 1.2),
+    ],
+)
+def test_the_sigma_of_a_rate_is_its_scatter(
+    at_s: tuple[float, ...], memory_s: float, low: float, high: float
+) -> None:
+    """Error over sigma, rms; the errors of samples may be correlated, and here mostly are not."""
+    rng = np.random.default_rng(7)
+    apart_s = np.abs(np.subtract.outer(at_s, at_s))
+    K = np.exp(-apart_s / memory_s) if memory_s else np.eye(len(at_s))
+    root = SIGMA_RAD[0] * np.linalg.cholesky(K)
+    rate_rad_s = np.radians([0.1, -0.05, 0.3])
+    true = Rotation.from_rotvec(np.outer(at_s, rate_rad_s))
+    in_sigma = []
+    for _ in range(200):
+        errors = Rotation.from_rotvec(root @ rng.normal(size=(len(at_s), 3)))
+        stamps_ns = (START_NS + round(t * S) for t in at_s)
+        held = history(list(zip(stamps_ns, (true * errors).as_quat(), strict=True)))
+        rate, sigma = held.rate_at(START_NS, 2.0, SIGMA_RAD)
+        in_sigma.append((rate - rate_rad_s) / sigma)
+    assert low < np.sqrt(np.mean(np.square(in_sigma))) < high
+
+
+def test_a_camera_that_speeds_up_has_the_rate_of_the_image() -> None:
+    """Samples up to 0.2 s after the image: their mean rate is that of 0.4 s before."""
+    at_s = np.arange(-0.95, 0.2, 0.1)
+    angle = 0.01 * at_s + 0.5 * 0.02 * at_s**2
+    turned = Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])).as_quat()
+    held = history([(START_NS + round(t * S), q) for t, q in zip(at_s, turned, strict=True)])
+    rate, _ = held.rate_at(START_NS, 2.0, SIGMA_RAD)
+    np.testing.assert_allclose(rate, [0.0, 0.01, 0.0], atol=1e-5)
 
 
 def test_a_rate_that_no_two_samples_show_is_not_known() -> None:
     held = turning(np.array([0.0, 0.0, 0.1]), (0.0, 3.0))
     for t, why in ((0.0, 'no sample before'), (1.0, 'too far apart'), (3.0, 'too far before')):
-        assert np.isnan(held.rate_at(START_NS + round(t * S), 2.0)).all(), why
+        assert np.isnan(held.rate_at(START_NS + round(t * S), 2.0, SIGMA_RAD)).all(), why
     held.add(START_NS + 2 * S, None)
-    assert np.isnan(held.rate_at(START_NS + 2 * S, 2.0)).all()
-    assert np.isnan(AttitudeHistory().rate_at(START_NS, 2.0)).all()
+    assert np.isnan(held.rate_at(START_NS + 2 * S, 2.0, SIGMA_RAD)).all()
+    assert np.isnan(AttitudeHistory().rate_at(START_NS, 2.0, SIGMA_RAD)).all()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
-from starcal_ros.records import refused_image
+from starcal_ros.records import refused_image, StarObservations
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
@@ -61,7 +62,7 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
         ('attitude.w', 0.0, 'attitude: length 0.714143 is not 1'),
         ('attitude.w', 1e300, 'attitude: length inf is not 1'),
         ('temperature_degc', 1e300, r'temperature_degc: 1e\+300 is not within -273.15 to 1000'),
-        ('velocity_sigma_m_s', -1.0, 'velocity_sigma_m_s: -1.0 is not at least 0'),
+        ('velocity_sigma_m_s', -2.0, 'velocity_sigma_m_s: -2.0 is not at least 0'),
         ('velocity_sigma_m_s', np.inf, 'velocity_sigma_m_s: inf is not a finite number'),
         (
             'star_tracker_rate_rad_s',
@@ -126,3 +127,62 @@ def test_refused_stars_are_found_by_reason() -> None:
     assert list(places) == ['blend', 'saturated']
     np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
+
+
+STAR_FIELDS = ('catalog_id', 'direction_icrf', 'measured_px', 'covariance_px2')
+NEEDED = (*STAR_FIELDS, 'header', 'width', 'height', 'attitude')
+
+
+def zeroed(value: Any) -> Any:
+    """Return what ROS has in a field that a sender leaves out."""
+    if isinstance(value, np.ndarray):
+        is_vector = value.dtype == np.float64  # all others are sequences
+        return np.zeros_like(value) if is_vector else value[:0]
+    if isinstance(value, (str, list)):
+        return type(value)()
+    if hasattr(value, 'w'):
+        return plain('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=0.0)
+    return type(value)(0)
+
+
+def test_a_message_with_everything_but_the_stars_at_zero_says_nothing_else() -> None:
+    """A velocity was exact, a camera did not turn, and the zenith refused the image."""
+    sent = observations()
+    message = observations_to_message(sent, 'cam', plain)
+    others = [name for name in vars(message) if name not in NEEDED]
+    assert {'zenith_icrf', 'star_tracker_rate_sigma_rad_s', 'first_from_star_tracker'} <= {*others}
+    for name in others:
+        setattr(message, name, zeroed(getattr(message, name)))
+    record = checked_observations(message)
+    # Zero degrees Celsius is a temperature; if all images have it, it does not change.
+    unknown = np.full(len(sent), np.nan, np.float32)
+    stated = {name: getattr(sent, name) for name in STAR_FIELDS}
+    stated |= dict.fromkeys(('magnitude', 'flux_dn', 'snr'), unknown)
+    stated |= {'attitude_gap_s': 0.0, 'temperature_degc': 0.0}
+    stated['icrf_from_star_tracker_xyzw'] = sent.icrf_from_star_tracker_xyzw
+    expected = StarObservations.of_image(sent.time_ns, (sent.width, sent.height), **stated)
+    assert not record.refusal, record.detail
+    assert_same(record, expected)
+
+
+@pytest.mark.parametrize(('sigma_m_s', 'sent'), [(0.0, -1.0), (10.0, 10.0), (np.nan, np.nan)])
+def test_an_exact_velocity_is_not_sent_as_zero(sigma_m_s: float, sent: float) -> None:
+    record = dataclasses.replace(observations(), velocity_sigma_m_s=sigma_m_s)
+    message = observations_to_message(record, 'cam', plain)
+    np.testing.assert_equal(message.velocity_sigma_m_s, sent)
+    assert_same(record, observations_from_message(message))
+
+
+@pytest.mark.parametrize(
+    ('rate', 'sigma', 'is_known'),
+    [(0.0, 0.0, False), (0.0, np.nan, False), (0.0, 1e-5, True), (1e-3, 0.0, True)],
+)
+def test_a_camera_at_rest_has_a_rate_with_a_sigma(
+    rate: float, sigma: float, is_known: bool
+) -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    message.star_tracker_rate_rad_s = np.full(3, rate)
+    message.star_tracker_rate_sigma_rad_s = np.full(3, sigma)
+    record = observations_from_message(message)
+    assert np.isfinite(record.star_tracker_rate_rad_s).all() == is_known
+    assert np.isfinite(record.star_tracker_rate_sigma_rad_s).all() == (sigma > 0)
