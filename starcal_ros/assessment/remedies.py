@@ -32,11 +32,10 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'the velocity or the clock is wrong, or air bends the light: check the '
-    'velocity topic, the stamps and the site',
+    'assumed velocity': 'check the velocity topic, the stamps and the site',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
-    'assumed mounting': 'check more_alignments, or widen star_tracker_mounting_sigma_arcsec',
+    'assumed mounting': 'check more_alignments',
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
     # Causes of the sigma of a line of sight (`SigmaPart.cause`).
     'stars': 'take more images',
@@ -46,7 +45,7 @@ REMEDIES: Mapping[str, str] = {
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'estimate with temperature, or calibrate each state separately',
+    'change from image to image': 'estimate with temperature, or calibrate each state alone',
     'star places': 'take more images of other star fields',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',

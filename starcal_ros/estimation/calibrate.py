@@ -28,7 +28,6 @@ from starcal_ros.estimation.options import (
     CalibrationOptions,
     check_enough,
     check_options,
-    estimated_parameters,
 )
 from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
 from starcal_ros.estimation.problem import (
@@ -235,10 +234,9 @@ def estimate_calibration(
         start = moved_to_stars(problem, start, table, prior.camera)
         result = _estimate(data, problem, start, ensemble)
     except (NotObservable, np.linalg.LinAlgError) as error:
-        asked = ', '.join(estimated_parameters(options, problem.model))
         raise TooFewObservations(
-            f'the stars do not determine all of {asked} and the alignment: {error}; more images, '
-            'or stars over more of the detector, or fewer parameters are needed'
+            f'the stars do not determine {", ".join(options.estimate)} and the alignment: {error};'
+            ' more images, stars over more of the detector or fewer parameters are needed'
         ) from error
     if result.thermal is None or not note:
         return result

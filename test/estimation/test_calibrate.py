@@ -416,7 +416,7 @@ def test_too_few_are_counted_for_a_person() -> None:
 def test_one_star_many_times_determines_nothing(method: str) -> None:
     first = clean().images[0]
     star = first.select(np.arange(len(first)) == 0)
-    with pytest.raises(TooFewObservations, match='do not determine all of fx, skew, fy, k1'):
+    with pytest.raises(TooFewObservations, match='do not determine fx, skew, fy, ' + '.{,166}$'):
         estimate_calibration(Ensemble((star,) * 70), PRIOR, options(method))
 
 

@@ -109,7 +109,7 @@ def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
 def _worth_stating(
     bags: Sequence[Path], asked: Topics, camera: CameraModel, options: Mapping[str, object]
 ) -> tuple[str, ...]:
-    """What to state to lower the sigma of a calibration of the first images; none without one."""
+    """Sentences on what to state, by a calibration of the first images; none without one."""
     prior = CameraGeometry(camera, np.array(options['prior_alignment']))
     others = {name: value for name, value in options.items() if name != 'prior_alignment'}
     setup = dataclasses.replace(load_setup(others, prior=prior), is_aligned=True)
