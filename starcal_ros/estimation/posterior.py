@@ -155,7 +155,7 @@ def posterior(
     found, last = Shapes(before, none, np.zeros(len(before))), start
     if len(sums.blocks) > 1:
         field_px = solver.solve(start, base)[0][layout.places['field']]
-        by_image = _shape_sums(sums, layout, solver, field_px)
+        by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
         last = eliminated(normal, layout, found.sigma_px)
     mean, covariance, last_octave, term = solver.solve(last, base)
@@ -275,12 +275,15 @@ class _Solver:
         return float(np.einsum('ij,ji->', arrow.information[part], covariance[part]))
 
 
-def _shape_sums(sums: StarSums, layout: Layout, solver: _Solver, field_px: Floats) -> ShapeSums:
+def _shape_sums(
+    sums: StarSums, linear: Linearisation, solver: _Solver, field_px: Floats
+) -> ShapeSums:
     """
     Return what each image shows of its shape, the field known.
 
     The images are alike in the field; each has stars in other parts of it.
     """
+    layout = linear.layout
     information, gradient, cross, shared, right = _without_rotation(sums, layout, field_px)
     at = seen_by_stars(layout)
     precision = solver.precision[at]
@@ -291,6 +294,7 @@ def _shape_sums(sums: StarSums, layout: Layout, solver: _Solver, field_px: Float
         cross[:, :, free],
         shared[np.ix_(free, free)] + np.diag(precision[free]),
         right[free] - precision[free] * layout.prior_offset[at][free],
+        linear.problem.time_s,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
 from starcal_ros.text import p_value_text, significant
 
@@ -135,6 +136,7 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     if found is None:
         return []
     step, cost_px = found.step, calibration.zero_skew_cost_px
+    minutes = (calibration.time_ns - calibration.first_image_ns) / NANOSECONDS_PER_SECOND / 60
     field = f'field of {_px(found.field_rms_px)} rms per axis, at most {_px(found.field_worst_px)}'
     if found.field_worst_px < VISIBLE_PX:
         field = f'field of {_px(found.field_worst_px)} everywhere'
@@ -155,7 +157,8 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
         ),
         ModelRow(
             'The camera is the same in all images',
-            f'varies by {_px(found.image_variation_px)} in a corner',
+            f'varies by {_px(found.image_variation_px)} in a corner; the calibration is that of'
+            f' the mean over the {significant(minutes, 2)} minutes of the images',
             '',
             REMEDIES['change from image to image'],
         ),
