@@ -68,7 +68,7 @@ class GateOptions:
         high=180.0,
     )
     max_line_of_sight_sigma_arcsec: float = option(
-        120.0,
+        300.0,
         'largest 1-sigma of a line of sight on the detector in the star tracker frame, arcsec',
         low=0.0,
         high=3600.0,

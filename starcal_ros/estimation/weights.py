@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
+from scipy.special import chdtri, stdtrit
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, rotation_jacobian
@@ -224,7 +224,10 @@ def tracker_attitudes(
             for i in images
         )
         return Attitudes(error, covariance, seen, np.zeros(m, bool), trackers, images)
-    misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, data.time_ns)
+    is_stated = tracker_sigma_is_given(data.options)
+    misfit = misfit_images(
+        error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
+    )
     found_images, found_trackers, found_correlations = [], [], []
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
@@ -240,7 +243,7 @@ def tracker_attitudes(
                 error[here] / stated,
                 variance[here],
                 correlations,
-                tracker_sigma_is_given(data.options),
+                is_stated,
                 data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(stated.mean()),
             )
         )
@@ -525,6 +528,8 @@ _STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
 _FEWEST_ATTITUDES = 3  # whose scatter shows that one of them does not fit
 _MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
 _MOST_OF_A_LINE = 200  # attitudes: their 20,000 pairs give a slope to a hundredth of a sigma
+_EFFICIENCY = 0.37  # of the median of squares against their mean
+_CHANCE = 1e-5  # that the attitude of an image lies beyond the limit
 _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
 
 
@@ -598,7 +603,12 @@ def dropped_stars(table: StarTable, kept: Mask) -> NDArray[np.int64]:
 
 
 def misfit_images(
-    error: Floats, variance: Floats, seen: Mask, star_tracker: Indices, time_ns: Indices
+    error: Floats,
+    variance: Floats,
+    seen: Mask,
+    star_tracker: Indices,
+    time_ns: Indices,
+    is_stated: bool,
 ) -> Mask:
     """
     Return (m,) the images whose attitude does not fit the others of its star tracker.
@@ -610,12 +620,15 @@ def misfit_images(
         variances by the centroids.
     seen : (m,) bool
         Images with stars enough.
+    is_stated : bool
+        False where the stated sigma is a guess.
 
     Notes
     -----
     Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
-    line in time (Theil 1950): a star tracker that drifts has no misfits.  With more misfits than a
-    third there is no majority that they could fail to fit.
+    line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
+    guess, a scatter of few images determines none: the limit is that of Student's t.  With more
+    misfits than a third there is no majority that they could fail to fit.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):
@@ -626,7 +639,9 @@ def misfit_images(
         spread2 = np.median(left**2, axis=0) / _MEDIAN_OF_SQUARE
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
-        found = (left**2 > _MISFIT_SIGMA**2 * usual).any(axis=1)
+        freedom = _EFFICIENCY * (np.count_nonzero(here) - 1)
+        limit = max(_MISFIT_SIGMA, 0.0 if is_stated else float(stdtrit(freedom, 1.0 - _CHANCE)))
+        found = (left**2 > limit**2 * usual).any(axis=1)
         if 3 * np.count_nonzero(found) <= np.count_nonzero(here):
             misfit[here] = found
     return misfit
