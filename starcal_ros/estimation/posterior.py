@@ -349,17 +349,17 @@ class Weights:
         Variance per axis that the working weights have beyond that of each observation.
     from_sky : (n, 2, 2)
     errors : tuple of SharedError
-    attitudes : tuple of (images, groups, covariance, independent)
-        Images (k,) of each star tracker, their groups (k,) and the covariance (g, g) of errors of
-        images of these groups in working sigmas, with the part of its diagonal that images do not
-        share.
+    attitudes : tuple of (images, axes, groups, covariance, independent)
+        Images (k,) of each star tracker, some of its axes, the groups (k,) of the images and the
+        covariance (g, g) of errors of images of these groups about each axis in working sigmas,
+        with the part of its diagonal that images do not share.
     """
 
     variance_px2: Floats
     inflation_px2: Floats
     from_sky: Floats
     errors: tuple[SharedError, ...]
-    attitudes: tuple[tuple[Indices, Indices, Floats, float], ...]
+    attitudes: tuple[tuple[Indices, tuple[int, ...], Indices, Floats, float], ...]
 
 
 def with_shared_errors(
@@ -448,10 +448,10 @@ def _of_attitudes(
     rows = J @ (-(turns @ root[at]) - found.back[:, IMAGE_ROTATION] @ root)
     r = root.shape[1]
     working, noise, slow = np.zeros((3, r, r))
-    for images, group, covariance, independent in weights.attitudes:
+    for images, axes, group, covariance, independent in weights.attitudes:
         shared = covariance - independent * np.eye(len(covariance))
         member = csr_array((np.ones(len(group)), (group, np.arange(len(group)))))
-        for axis in range(3):
+        for axis in axes:
             part = rows[images, axis]
             square = part.T @ part
             working += square

@@ -93,7 +93,7 @@ class Attitudes:
     covariance_rad2: Floats
     seen: Mask
     misfit: Mask
-    trackers: tuple[TrackerErrors, ...]
+    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
     images: tuple[NDArray[np.int64], ...]  # of each of them, those that fit
     correlations: tuple[Correlations, ...] = ()  # of these images
 
@@ -138,28 +138,30 @@ def weighted_attitudes(
     m = data.table.image_count
     if data.options.method == 'single':
         return dataclasses.replace(problem, star_tracker_sigma_rad=np.full((m, 3), EXACT_RAD))
-    factor = np.ones(m)
+    factor = np.ones((m, 3))
     if attitudes is None:
         error = attitude_errors(problem, state, state.camera_from_icrf) / data.stated_rad
         factor *= max(1.0, _SIGMA_PER_MEDIAN * float(np.median(np.abs(error))))
     else:
         for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
-            factor[images] = tracker.working
+            factor[images[:, None], tracker.axes] = tracker.working
         factor[attitudes.misfit] = np.inf
     if data.options.method == 'per_image':
         factor *= FREE_FACTOR
-    return dataclasses.replace(problem, star_tracker_sigma_rad=factor[:, None] * data.stated_rad)
+    return dataclasses.replace(problem, star_tracker_sigma_rad=factor * data.stated_rad)
 
 
 def tracker_covariances(
     problem: Problem, data: Data, attitudes: Attitudes
-) -> tuple[tuple[Indices, Indices, Floats, float], ...]:
+) -> tuple[tuple[Indices, tuple[int, ...], Indices, Floats, float], ...]:
     """Return `Weights.attitudes`."""
     found = []
     for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
-        working2 = (problem.star_tracker_sigma_rad[images[0], 0] / data.stated_rad[0]) ** 2
+        axis = tracker.axes[0]
+        working2 = (problem.star_tracker_sigma_rad[images[0], axis] / data.stated_rad[axis]) ** 2
         independent = tracker.independent / working2
-        found.append((images, tracker.group, tracker.covariance / working2, independent))
+        covariance = tracker.covariance / working2
+        found.append((images, tracker.axes, tracker.group, covariance, independent))
     return tuple(found)
 
 
@@ -236,17 +238,21 @@ def tracker_attitudes(
         correlations = _known_correlations(here, before)
         if correlations is None:
             correlations = correlations_of(data.time_ns[here], after.camera_from_icrf[here])
-        found_images.append(here)
-        found_correlations.append(correlations)
-        found_trackers.append(
-            tracker_errors(
-                error[here] / stated,
-                variance[here],
+        for size in np.unique(stated):
+            # Noise about the boresight is that of few photons: slow errors are those of the
+            # best axis, or as stated.
+            axes = np.flatnonzero(stated == size)
+            tracker = tracker_errors(
+                error[np.ix_(here, axes)] / size,
+                variance[np.ix_(here, axes)],
                 correlations,
                 is_stated,
-                data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(stated.mean()),
+                data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(size),
+                float(stated.min() / size),
             )
-        )
+            found_images.append(here)
+            found_correlations.append(correlations)
+            found_trackers.append(dataclasses.replace(tracker, axes=tuple(axes.tolist())))
     return Attitudes(
         error,
         covariance,
