@@ -24,9 +24,9 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.centroids import observations, with_rate
 from starcal_ground.simulation.scenario import Detector, Scenario, Scene
-from starcal_ground.simulation.scenario import scenario as synthetic
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project

@@ -15,7 +15,7 @@ from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.camera import INTRINSIC_NAMES
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
@@ -148,6 +148,7 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
     if checks is None:
         return []
     step, cost_px = checks.step, calibration.zero_skew_cost_px
+    minutes = (calibration.time_ns - calibration.first_image_ns) / NANOSECONDS_PER_SECOND / 60
     field = (
         f'field of {_px(checks.field_rms_px)} rms per axis, at most {_px(checks.field_worst_px)}'
     )
@@ -170,7 +171,8 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
         ),
         ModelRow(
             'The camera is the same in all images',
-            f'varies by {_px(checks.image_variation_px)} in a corner',
+            f'varies by {_px(checks.image_variation_px)} in a corner; the calibration is that of'
+            f' the mean over the {significant(minutes, 2)} minutes of the images',
             '',
             REMEDIES['change from image to image'],
         ),

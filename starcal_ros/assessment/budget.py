@@ -364,9 +364,9 @@ def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
 
 def _slow(estimate: Estimate) -> float:
     """Return the 1-sigma of the slow error of the star trackers, arcsec."""
-    noise = float(np.mean([one.noise for one in estimate.tracker_errors]))
-    slow = float(np.mean([one.slow for one in estimate.tracker_errors]))
-    return slow * float(estimate.star_tracker_sigma_rad.mean()) / max(noise, 1e-12) / ARCSECOND_RAD
+    noise = estimate.star_tracker_sigma_rad / ARCSECOND_RAD
+    trackers = estimate.tracker_errors
+    return float(np.mean([t.slow / t.noise * noise[t.axes[0]] for t in trackers]))
 
 
 def _of_held(estimate: Estimate) -> str:

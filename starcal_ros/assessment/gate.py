@@ -69,7 +69,7 @@ class GateOptions:
         high=180.0,
     )
     max_line_of_sight_sigma_arcsec: float = option(
-        120.0,
+        300.0,
         'largest 1-sigma of a line of sight on the detector in the star tracker frame, arcsec',
         low=0.0,
         high=3600.0,
@@ -334,7 +334,7 @@ def star_tracker_gate(
                 one.drift_arcsec,
                 'arcsec',
                 one.drift_p_value,
-                'leave it out of more_star_trackers, or take images over a shorter time',
+                'leave it out of more_star_trackers, or use a shorter time',
                 _DRIFT_P_VALUE,
             )
 
@@ -349,7 +349,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'change of the camera from image to image in a corner',
         found.image_variation_px,
         'px',
-        f'focal length or lens changes: {REMEDIES["change from image to image"]}',
+        f'lens or focus changes: {REMEDIES["change from image to image"]}',
     )
     step = found.step
     yield _significant(

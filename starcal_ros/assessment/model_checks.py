@@ -45,7 +45,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
 
 def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
     """Return the estimated amplitudes, each with twice its log likelihood against none."""
-    found = estimate.posterior
+    found, parts = estimate.posterior, len({t.axes for t in estimate.tracker_errors})
     octaves = float(np.sqrt((np.exp(found.field.log_px) ** 2).sum()))
     shape = float(np.sqrt((np.exp(found.shape.log_px) ** 2).sum()))
     return (
@@ -63,7 +63,8 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
         ),
         *(
             Amplitude(
-                f'slow error of star tracker {k + 1}, {one.correlation}',
+                f'slow error of star tracker {k // parts + 1} about'
+                f' {", ".join("xyz"[axis] for axis in one.axes)}, {one.correlation}',
                 one.slow,
                 'sigma',
                 one.likelihood_ratio,

@@ -18,7 +18,7 @@ is never a decision.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
@@ -228,7 +228,8 @@ class ShapeSums:
     Sums of each image for its shape, its rotation eliminated.
 
     ``information`` (m, s, s), ``gradient`` (m, s), ``cross`` (m, s, P) with the shared unknowns;
-    ``shared_information`` (P, P) with their priors and ``shared_gradient`` (P,).
+    ``shared_information`` (P, P) with their priors and ``shared_gradient`` (P,); ``time_s`` (m,)
+    of the images, or (0,).
     """
 
     information: Floats
@@ -236,16 +237,18 @@ class ShapeSums:
     cross: Floats
     shared_information: Floats
     shared_gradient: Floats
+    time_s: Floats = field(default_factory=lambda: np.empty(0))
 
 
 # Correlations of the shapes of images k steps apart, with their weights before the data: none; one
-# that decays, as heat does; and one that lasts, as the air flattens every image, which no scatter
-# shows.
+# that decays, as heat does, in ten images or a quarter of an orbit about the Earth if that is
+# shorter; and one that lasts, as the air flattens every image, which no scatter shows.
 _CORRELATIONS: tuple[tuple[float, Callable[[Floats], Floats]], ...] = (
     (0.50, lambda k: np.equal(k, 0).astype(np.float64)),
     (0.45, lambda k: 0.9**k),
     (0.05, lambda k: 0.5 + 0.5 * np.equal(k, 0)),
 )
+_STEP_S = 100.0  # over which heat loses a tenth
 _MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
 _AT_ONCE = 8192  # images times amplitudes
 _SHAPE_STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
@@ -419,7 +422,10 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
         return np.zeros(len(sigma_px))
     left = sums.gradient[used] - sums.cross[used] @ _shared_mean(sums, sigma_px)
     root = np.sqrt(information[used])
-    steps = np.abs(np.subtract.outer(used, used))
+    steps = np.abs(np.subtract.outer(used, used)).astype(np.float64)
+    if len(sums.time_s):
+        late_s = sums.time_s[used]
+        steps = np.maximum(steps, np.abs(np.subtract.outer(late_s, late_s)) / _STEP_S)
     variance = np.exp(2.0 * _LOG_SHAPE)
     prior = -0.5 * ((_LOG_SHAPE - LOG_CENTRE) / LOG_SIGMA) ** 2
     evidence = np.empty((len(sigma_px), len(_CORRELATIONS)))

@@ -448,7 +448,9 @@ def _result(
     asked = np.intersect1d(shared, found.estimated)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
     trackers = attitudes.trackers
-    noise = math.sqrt(np.mean([t.noise**2 for t in trackers])) if trackers else 1.0
+    noise = np.ones(3)
+    for axis in range(3 if trackers else 0):
+        noise[axis] = math.sqrt(np.mean([t.noise**2 for t in trackers if axis in t.axes]))
     shown = attitudes.seen & ~attitudes.misfit
     scatter_rad = (
         float(np.sqrt(attitudes.error_rad[shown].var(axis=0).mean())) if shown.any() else 0.0

@@ -155,7 +155,7 @@ def posterior(
     found, last = Shapes(before, none, np.zeros(len(before))), start
     if len(sums.blocks) > 1:
         field_px = solver.solve(start, base)[0][layout.places['field']]
-        by_image = _shape_sums(sums, layout, solver, field_px)
+        by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
         last = eliminated(normal, layout, found.sigma_px)
     mean, covariance, last_octave, term = solver.solve(last, base)
@@ -275,12 +275,15 @@ class _Solver:
         return float(np.einsum('ij,ji->', arrow.information[part], covariance[part]))
 
 
-def _shape_sums(sums: StarSums, layout: Layout, solver: _Solver, field_px: Floats) -> ShapeSums:
+def _shape_sums(
+    sums: StarSums, linear: Linearisation, solver: _Solver, field_px: Floats
+) -> ShapeSums:
     """
     Return what each image shows of its shape, the field known.
 
     The images are alike in the field; each has stars in other parts of it.
     """
+    layout = linear.layout
     information, gradient, cross, shared, right = _without_rotation(sums, layout, field_px)
     at = seen_by_stars(layout)
     precision = solver.precision[at]
@@ -291,6 +294,7 @@ def _shape_sums(sums: StarSums, layout: Layout, solver: _Solver, field_px: Float
         cross[:, :, free],
         shared[np.ix_(free, free)] + np.diag(precision[free]),
         right[free] - precision[free] * layout.prior_offset[at][free],
+        linear.problem.time_s,
     )
 
 
@@ -351,17 +355,17 @@ class Weights:
         Variance per axis that the working weights have beyond that of each observation.
     from_sky : (n, 2, 2)
     errors : tuple of SharedError
-    attitudes : tuple of (images, groups, covariance, independent)
-        Images (k,) of each star tracker, their groups (k,) and the covariance (g, g) of errors of
-        images of these groups in working sigmas, with the part of its diagonal that images do not
-        share.
+    attitudes : tuple of (images, axes, groups, covariance, independent)
+        Images (k,) of each star tracker, some of its axes, the groups (k,) of the images and the
+        covariance (g, g) of errors of images of these groups about each axis in working sigmas,
+        with the part of its diagonal that images do not share.
     """
 
     variance_px2: Floats
     inflation_px2: Floats
     from_sky: Floats
     errors: tuple[SharedError, ...]
-    attitudes: tuple[tuple[Indices, Indices, Floats, float], ...]
+    attitudes: tuple[tuple[Indices, tuple[int, ...], Indices, Floats, float], ...]
 
 
 def with_shared_errors(
@@ -450,10 +454,10 @@ def _of_attitudes(
     rows = J @ (-(turns @ root[at]) - found.back[:, IMAGE_ROTATION] @ root)
     r = root.shape[1]
     working, noise, slow = np.zeros((3, r, r))
-    for images, group, covariance, independent in weights.attitudes:
+    for images, axes, group, covariance, independent in weights.attitudes:
         shared = covariance - independent * np.eye(len(covariance))
         member = csr_array((np.ones(len(group)), (group, np.arange(len(group)))))
-        for axis in range(3):
+        for axis in axes:
             part = rows[images, axis]
             square = part.T @ part
             working += square

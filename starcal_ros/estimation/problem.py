@@ -69,6 +69,8 @@ class Problem:
         Gaussian prior of the camera parameters; infinite sigma: none.
     is_weak : (p,) bool, or False
         True where the prior is that of any lens: no data sheet states it.
+    time_s : (m,)
+        Times of the images; (0,): not known.
     star_tracker_from_icrf : Rotation (m,)
         As measured.
     star_tracker_sigma_rad : (m, 3)
@@ -95,6 +97,7 @@ class Problem:
     first_from_star_tracker: Rotation | None = None
     mounting_sigma_rad: float = np.inf
     is_weak: Mask | bool = False
+    time_s: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

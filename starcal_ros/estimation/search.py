@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.lens import coefficient_jacobian, COEFFICIENTS
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.equations import arrow, stars_alone
 from starcal_ros.estimation.levenberg_marquardt import (
@@ -148,6 +148,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
     free = {names.index(name) for name in estimated_parameters(options, model)}
     is_default = (prior_sigma == 0) & np.isin(np.arange(len(names)), list(free))
     prior_sigma = np.where(is_default, _default_sigma(prior.camera, options), prior_sigma)
+    stamps_ns = np.array([image.time_ns for image in ensemble.images], np.int64)
     attitudes = Rotation.from_quat(
         np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
     )
@@ -177,6 +178,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
         star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
         first_from_star_tracker=mountings,
         mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
+        time_s=(stamps_ns - stamps_ns[0]) / NANOSECONDS_PER_SECOND,
         is_weak=is_default & np.isin(camera.parameter_names, COEFFICIENTS[model]),
     )
 

@@ -57,7 +57,7 @@ class Correlations:
 @dataclass(frozen=True)
 class TrackerErrors:
     """
-    Posterior of the errors of one star tracker over m images.
+    Posterior of the errors of one star tracker over m images, about axes of one stated sigma.
 
     Attributes
     ----------
@@ -75,6 +75,8 @@ class TrackerErrors:
         The most likely K.
     independent : float
         Part of the diagonal of ``covariance`` that images do not share.
+    axes : tuple of int
+        Those of the star tracker.
     """
 
     noise: float
@@ -85,6 +87,7 @@ class TrackerErrors:
     likelihood_ratio: float
     correlation: str
     independent: float
+    axes: tuple[int, ...] = (0, 1, 2)
 
 
 def tracker_errors(
@@ -93,31 +96,35 @@ def tracker_errors(
     correlations: Correlations,
     is_stated: bool,
     stated_slow: float,
+    usual_slow: float = 1.0,
 ) -> TrackerErrors:
     """
     Return the posterior of the errors of a star tracker.
 
     Parameters
     ----------
-    error, variance : (m, 3)
-        As the stars show them about the three axes, in the stated sigma of each axis, and their
-        variances by the centroids.
+    error, variance : (m, a)
+        As the stars show them about axes of one sigma, in that sigma, and their variances by the
+        centroids.
     is_stated : bool
         False where the stated sigma is a guess.
     stated_slow : float
-        Slow error by the data sheet, in stated sigmas; 0: not stated, of the size of the noise.
+        Slow error by the data sheet, in stated sigmas; 0: not stated.
+    usual_slow : float
+        Slow error that is not stated, in noise.
 
     Notes
     -----
     The stated sigma is a prior of the noise: log-normal, with a tail of wrong data sheets.
     """
-    m, group = len(error), correlations.group
+    (m, count), group = error.shape, correlations.group
     size = np.bincount(group)
     slow_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
     of_stars = float(np.median(variance))
     log_noise, centre, noise_prior = _noise_grid(error, is_stated)
     if stated_slow:
-        centre = np.full(len(centre), math.log(stated_slow))
+        centre = np.zeros(len(centre))
+    centre = centre + math.log(stated_slow or usual_slow)
     slow2, noise2 = np.exp(2.0 * (centre + _LOG_SLOW[:, None])), np.exp(2.0 * log_noise)
     prior = noise_prior - 0.5 * (_LOG_SLOW[:, None] / slow_sigma) ** 2
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
@@ -130,7 +137,7 @@ def tracker_errors(
         if m > len(K):
             apart = m / (m - len(K)) * (1.0 - float(size @ np.diag(K)) / m)
             alone = slow2 * max(apart, 0.0) + noise2 + of_stars
-            likelihood = likelihood - 0.5 * (3.0 * (m - len(K)) * np.log(alone) + within / alone)
+            likelihood = likelihood - 0.5 * (count * (m - len(K)) * np.log(alone) + within / alone)
         log_weight.append(likelihood + prior)
         mean_information.append(information)
         plain = max(plain, float(likelihood[0].max()))
@@ -245,4 +252,4 @@ def _restricted(
     squared = np.einsum('snm,ma->sn', 1.0 / total, along**2)
     squared -= information * (mean**2).sum(axis=2)
     log_det = np.log(total).sum(axis=2) + np.log(information)
-    return -0.5 * (3.0 * log_det + squared), (ones**2 / alone).sum(axis=2)
+    return -0.5 * (error.shape[1] * log_det + squared), (ones**2 / alone).sum(axis=2)

@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
+from scipy.special import chdtri, stdtrit
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, rotation_jacobian
@@ -94,7 +94,7 @@ class Attitudes:
     covariance_rad2: Floats
     seen: Mask
     misfit: Mask
-    trackers: tuple[TrackerErrors, ...]
+    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
     images: tuple[NDArray[np.int64], ...]  # of each of them, those that fit
     correlations: tuple[Correlations, ...] = ()  # of these images
 
@@ -139,28 +139,30 @@ def weighted_attitudes(
     m = data.table.image_count
     if data.options.method == 'single':
         return dataclasses.replace(problem, star_tracker_sigma_rad=np.full((m, 3), EXACT_RAD))
-    factor = np.ones(m)
+    factor = np.ones((m, 3))
     if attitudes is None:
         error = attitude_errors(problem, state, state.camera_from_icrf) / data.stated_rad
         factor *= max(1.0, _SIGMA_PER_MEDIAN * float(np.median(np.abs(error))))
     else:
         for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
-            factor[images] = tracker.working
+            factor[images[:, None], tracker.axes] = tracker.working
         factor[attitudes.misfit] = np.inf
     if data.options.method == 'per_image':
         factor *= FREE_FACTOR
-    return dataclasses.replace(problem, star_tracker_sigma_rad=factor[:, None] * data.stated_rad)
+    return dataclasses.replace(problem, star_tracker_sigma_rad=factor * data.stated_rad)
 
 
 def tracker_covariances(
     problem: Problem, data: Data, attitudes: Attitudes
-) -> tuple[tuple[Indices, Indices, Floats, float], ...]:
+) -> tuple[tuple[Indices, tuple[int, ...], Indices, Floats, float], ...]:
     """Return `Weights.attitudes`."""
     found = []
     for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
-        working2 = (problem.star_tracker_sigma_rad[images[0], 0] / data.stated_rad[0]) ** 2
+        axis = tracker.axes[0]
+        working2 = (problem.star_tracker_sigma_rad[images[0], axis] / data.stated_rad[axis]) ** 2
         independent = tracker.independent / working2
-        found.append((images, tracker.group, tracker.covariance / working2, independent))
+        covariance = tracker.covariance / working2
+        found.append((images, tracker.axes, tracker.group, covariance, independent))
     return tuple(found)
 
 
@@ -225,7 +227,10 @@ def tracker_attitudes(
             for i in images
         )
         return Attitudes(error, covariance, seen, np.zeros(m, bool), trackers, images)
-    misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, data.time_ns)
+    is_stated = tracker_sigma_is_given(data.options)
+    misfit = misfit_images(
+        error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
+    )
     found_images, found_trackers, found_correlations = [], [], []
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
@@ -234,17 +239,21 @@ def tracker_attitudes(
         correlations = _known_correlations(here, before)
         if correlations is None:
             correlations = correlations_of(data.time_ns[here], after.camera_from_icrf[here])
-        found_images.append(here)
-        found_correlations.append(correlations)
-        found_trackers.append(
-            tracker_errors(
-                error[here] / stated,
-                variance[here],
+        for size in np.unique(stated):
+            # Noise about the boresight is that of few photons: slow errors are those of the
+            # best axis, or as stated.
+            axes = np.flatnonzero(stated == size)
+            tracker = tracker_errors(
+                error[np.ix_(here, axes)] / size,
+                variance[np.ix_(here, axes)],
                 correlations,
-                tracker_sigma_is_given(data.options),
-                data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(stated.mean()),
+                is_stated,
+                data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(size),
+                float(stated.min() / size),
             )
-        )
+            found_images.append(here)
+            found_correlations.append(correlations)
+            found_trackers.append(dataclasses.replace(tracker, axes=tuple(axes.tolist())))
     return Attitudes(
         error,
         covariance,
@@ -526,6 +535,8 @@ _STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
 _FEWEST_ATTITUDES = 3  # whose scatter shows that one of them does not fit
 _MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
 _MOST_OF_A_LINE = 200  # attitudes: their 20,000 pairs give a slope to a hundredth of a sigma
+_EFFICIENCY = 0.37  # of the median of squares against their mean
+_CHANCE = 1e-5  # that the attitude of an image lies beyond the limit
 _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
 
 
@@ -599,7 +610,12 @@ def dropped_stars(table: StarTable, kept: Mask) -> NDArray[np.int64]:
 
 
 def misfit_images(
-    error: Floats, variance: Floats, seen: Mask, star_tracker: Indices, time_ns: Indices
+    error: Floats,
+    variance: Floats,
+    seen: Mask,
+    star_tracker: Indices,
+    time_ns: Indices,
+    is_stated: bool,
 ) -> Mask:
     """
     Return (m,) the images whose attitude does not fit the others of its star tracker.
@@ -611,12 +627,15 @@ def misfit_images(
         variances by the centroids.
     seen : (m,) bool
         Images with stars enough.
+    is_stated : bool
+        False where the stated sigma is a guess.
 
     Notes
     -----
     Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
-    line in time (Theil 1950): a star tracker that drifts has no misfits.  With more misfits than a
-    third there is no majority that they could fail to fit.
+    line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
+    guess, a scatter of few images determines none: the limit is that of Student's t.  With more
+    misfits than a third there is no majority that they could fail to fit.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):
@@ -627,7 +646,9 @@ def misfit_images(
         spread2 = np.median(left**2, axis=0) / _MEDIAN_OF_SQUARE
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
-        found = (left**2 > _MISFIT_SIGMA**2 * usual).any(axis=1)
+        freedom = _EFFICIENCY * (np.count_nonzero(here) - 1)
+        limit = max(_MISFIT_SIGMA, 0.0 if is_stated else float(stdtrit(freedom, 1.0 - _CHANCE)))
+        found = (left**2 > limit**2 * usual).any(axis=1)
         if 3 * np.count_nonzero(found) <= np.count_nonzero(here):
             misfit[here] = found
     return misfit

@@ -214,7 +214,7 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); focal length or lens changes: '
+                'of 0.2 px (max_image_variation_px); lens or focus changes: '
                 'estimate with temperature, or calibrate each state alone'
             ),
         ),
@@ -459,7 +459,7 @@ def test_the_cause_comes_before_the_statistics() -> None:
         ),
     )
     given = reasons(found, GateOptions())
-    assert 'focal length or lens changes: ' in given[0]
+    assert 'lens or focus changes: ' in given[0]
     assert limits_in(given)[-1] == 'max_cross_validated_residual'
     # One part of the data and what to do, not a list of eighteen.
     assert len(given[-1]) < 200

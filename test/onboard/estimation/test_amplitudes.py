@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import math
 
@@ -364,7 +365,7 @@ def without_shared(made: Images, sigma_px: Floats) -> Floats:
     return np.asarray(sums.gradient - sums.cross @ x)
 
 
-def common_px2(made: Images, sigma_px: Floats, k: int) -> float:
+def common_px2(made: Images, sigma_px: Floats, k: int, step: float) -> float:
     """Variance that all images share, by dense contrasts."""
     m, sums = len(made.D), made.sums
     shown = without_shared(made, sigma_px)[:, k] / sums.information[:, k, k]
@@ -375,7 +376,7 @@ def common_px2(made: Images, sigma_px: Floats, k: int) -> float:
     # No correlation, one that decays and one that lasts.
     for R, before in (
         (np.eye(m), 0.5),
-        (0.9**apart, 0.45),
+        (0.9 ** (step * apart), 0.45),
         (0.5 * np.eye(m) + 0.5 * np.ones((m, m)), 0.05),
     ):
         found = 0.0
@@ -389,14 +390,25 @@ def common_px2(made: Images, sigma_px: Floats, k: int) -> float:
     return float(np.dot(evidence, ratio) / sum(evidence) * sigma_px[k] ** 2)
 
 
-@pytest.mark.parametrize('memory', [0.0, 0.95])
-def test_the_common_part_follows_from_the_correlation_in_time(memory: float) -> None:
+@pytest.mark.parametrize(
+    ('memory', 'spacing_s', 'step', 'low', 'high'),
+    [
+        (0.0, 1.0, 1.0, 0.0, 0.2),
+        (0.95, 1.0, 1.0, 0.5, 1.5),
+        # Five minutes apart, images know the mean of what heat does within an orbit.
+        (0.95, 300.0, 3.0, 0.05, 0.3),
+    ],
+)
+def test_the_common_part_follows_from_the_correlation_in_time(
+    memory: float, spacing_s: float, step: float, low: float, high: float
+) -> None:
     made = images(np.random.default_rng(9), (3.0, 0.5, 0.3), 30, 40, memory, common=0.0)
-    found = shapes(made.sums)
-    expected = [common_px2(made, found.sigma_px, k) for k in range(3)]
+    found = shapes(
+        dataclasses.replace(made.sums, time_s=np.asarray(spacing_s * np.arange(30.0), np.float64))
+    )
+    expected = [common_px2(made, found.sigma_px, k, step) for k in range(3)]
     assert found.common_px2 == pytest.approx(expected, rel=1e-3)
-    share = found.common_px2[0] / found.sigma_px[0] ** 2
-    assert share > 0.5 if memory else share < 0.2
+    assert low <= found.common_px2[0] / found.sigma_px[0] ** 2 < high
 
 
 def test_images_without_stars_have_no_common_part() -> None:

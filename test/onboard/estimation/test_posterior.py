@@ -310,7 +310,7 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
         (np.array([1, 3]), np.zeros(2, int)),
     ):
         half = rng.normal(size=(group.max() + 1, 2))
-        trackers.append((rows, group, half @ half.T + 0.2 * np.eye(len(half)), 0.15))
+        trackers.append((rows, (0, 1, 2), group, half @ half.T + 0.2 * np.eye(len(half)), 0.15))
     several = np.bincount(star[used], minlength=50)[star] > 1
     total = cell_px**2 + place_px**2 * several
     share = np.sqrt(np.minimum(variance / total, 1.0))
@@ -340,9 +340,9 @@ def propagated(
     A = gain[:, :count] @ white
     parts = {name: A @ one @ A.T for name, one in V.items()}
     noise, slow, working = np.zeros((3, len(gain), len(gain)))
-    for images, group, covariance, independent in weights.attitudes:
+    for images, axes, group, covariance, independent in weights.attitudes:
         of_groups = covariance - independent * np.eye(len(covariance))
-        for axis in range(3):
+        for axis in axes:
             B = gain[:, count + 3 * images + axis]
             noise += independent * B @ B.T
             slow += B @ of_groups[np.ix_(group, group)] @ B.T
@@ -434,7 +434,7 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
         (SharedError('alone', np.arange(n), 1.0, 0.0, False, 1.0),),
-        ((np.arange(IMAGES), np.arange(IMAGES), np.eye(IMAGES), 1.0),),
+        ((np.arange(IMAGES), (0, 1, 2), np.arange(IMAGES), np.eye(IMAGES), 1.0),),
     )
     found = solved(given)
     after = widened(given, found, weights)
@@ -455,7 +455,7 @@ def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
         (),
-        ((np.arange(IMAGES), np.arange(IMAGES), shared_all, 1.0),),
+        ((np.arange(IMAGES), (0, 1, 2), np.arange(IMAGES), shared_all, 1.0),),
     )
     found = solved(plain)
     after = widened(plain, found, weights)

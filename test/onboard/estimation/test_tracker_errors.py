@@ -15,7 +15,10 @@ from scipy.stats import multivariate_normal
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation import tracker_errors as module
 from starcal_ros.estimation.amplitudes import interval_factor
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.tracker_errors import correlations_of, tracker_errors, TrackerErrors
+from studies.worlds import simulate, World
 
 CADENCE_NS = 60 * 10**9
 
@@ -281,3 +284,21 @@ def test_groups_are_neighbours_in_time_in_any_order_of_the_images() -> None:
     group = module.groups_of(time_ns)
     assert np.array_equal(group, time_ns // 5)
     assert np.array_equal(module.groups_of(time_ns[:100]), np.arange(100))
+
+
+@pytest.mark.parametrize('stated_arcsec', [0.0, 5.0])
+def test_a_slow_error_is_as_large_about_an_axis_of_more_noise(stated_arcsec: float) -> None:
+    """Noise about the boresight is that of few photons, and says nothing of slow errors."""
+    made = simulate(World(12), 1)
+    sigma_arcsec = np.array([20.0, 20.0, 160.0])
+    options = CalibrationOptions(
+        star_tracker_sigma_arcsec=tuple(sigma_arcsec), star_tracker_slow_arcsec=stated_arcsec
+    )
+    found = estimate_calibration(made.ensemble, made.scenario.prior, options)
+    assert [tracker.axes for tracker in found.tracker_errors] == [(0, 1), (2,)]
+    across, about = (
+        tracker.slow * sigma_arcsec[tracker.axes[0]] for tracker in found.tracker_errors
+    )
+    assert 0.4 < about / across < 2.5
+    if stated_arcsec:
+        assert across == pytest.approx(stated_arcsec, rel=0.3)

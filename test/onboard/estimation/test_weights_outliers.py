@@ -186,6 +186,7 @@ def judged(
     time_ns: NDArray[np.integer],
     seen: Mask | None = None,
     tracker: NDArray[np.integer] | None = None,
+    is_stated: bool = True,
 ) -> Mask:
     m = len(error)
     return misfit_images(
@@ -194,7 +195,19 @@ def judged(
         np.ones(m, bool) if seen is None else seen,
         np.asarray(np.zeros(m) if tracker is None else tracker, np.int64),
         np.asarray(time_ns, np.int64),
+        is_stated,
     )
+
+
+def test_few_images_of_a_star_tracker_of_unknown_noise_have_no_misfits() -> None:
+    """Noise of four times the guess: three images have a scatter of any size."""
+    rng = np.random.default_rng(3)
+    for m in (3, 6, 12, 40):
+        for _ in range(50):
+            assert not judged(*attitudes(rng, m, 4.0), is_stated=False).any()
+    error, variance, time_ns = attitudes(rng, 12, 4.0)
+    error[5, 1] = 400.0  # a jump of a degree
+    assert np.flatnonzero(judged(error, variance, time_ns, is_stated=False)).tolist() == [5]
 
 
 def test_sound_images_are_no_misfits() -> None:
