@@ -258,7 +258,8 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     shape_px: Floats | float = _FIRST_SHAPE_PX
     near: Posterior | None = None
     termination = 'iteration_limit'
-    share, before_sigma = 1.0, np.empty(0)
+    share = 1.0
+    before_sigma: Floats = np.empty(0)
     for k in range(_ROUNDS):
         last = _round(data, problem, state, judged, residual_px, shape_px, near, share)
         after = judge(
@@ -277,7 +278,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         # Where stars hardly show an unknown, whole steps overshoot to and fro: the part of the
         # step before that is left shows the share that ends in the minimum.
         if k:
-            left = (step_sigma @ before_sigma) / (before_sigma @ before_sigma)
+            left = float(step_sigma @ before_sigma / (before_sigma @ before_sigma))
             share = min(max(share / max(1.0 - left, share), _LEAST_SHARE), 1.0)
         before_sigma = step_sigma
     weights = Weights(
@@ -361,7 +362,8 @@ def _step_sigma(layout: Layout, found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
     in_state = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
-    return np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
+    none = np.zeros_like(sigma)
+    return np.asarray(np.divide(found.mean[in_state], sigma, out=none, where=sigma > 0))
 
 
 def _check_not_mirrored(state: State) -> None:

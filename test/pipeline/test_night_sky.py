@@ -25,7 +25,7 @@ from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.calibration_json import read_calibration
-from starcal_ros.pipeline.from_stars import from_stars
+from starcal_ros.pipeline.from_stars import _of_one_lens, from_stars
 from starcal_ros.pipeline.night_sky import photographs_of
 from starcal_ros.records import Image
 from starcal_ros.simulation.rendering import images
@@ -320,3 +320,7 @@ def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
     ]
     with pytest.raises(NotFromStars, match='^2 different images, 3 are needed'):
         starcal_ros.calibrate_images(write_pngs(frames, tmp_path / 'night'))
+
+
+def test_no_match_at_all_is_no_lens() -> None:
+    assert _of_one_lens({}) == ({}, ())

@@ -159,6 +159,8 @@ def _catalog(args: argparse.Namespace) -> int:
     )
     if made.refused:
         print_text(refusals(made.refused))
+    if made.unmoved:
+        print_text(f'{made.unmoved} stars have no proper motion: 0.1" off in ten years is usual')
     print_text(
         f'in the parameter file: catalog: {output.absolute()}, magnitude_limit:'
         f' {made.faintest:.1f}'
