@@ -5,7 +5,7 @@ Narrow cameras of 0.3 to 5 degrees, rendered and calibrated with attitudes and f
 The sky is that of the bundled catalog to V = 9, and below a draw with the mean density of stars
 (Allen 2000, Astrophysical Quantities, section 19.2) in one region 10 degrees wide, in which all
 images lie; the catalog file covers that region.  The mounting is off by 5 arcsec to 0.3 degrees,
-stated as its sigma.  From images alone the focal length is given to 10 %.
+stated as its sigma.  From images alone the focal length is given to 10 %, and the velocity.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bench.frames import load_set_up, observed, render_frame
+from bench.frames import earth_velocity_m_s, load_set_up, observed, render_frame
 from bench.night_sky import off_arcsec
 from bench.table import Table
 from bench.trials import in_processes, rms
@@ -232,6 +232,8 @@ def _from_images(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
         for image in images(given):
+            velocity_m_s = earth_velocity_m_s(image.time_ns)
+            writer.write_velocity('/spacecraft/velocity', image.time_ns, velocity_m_s, 'icrf')
             writer.write_image('/camera/image_raw', image, 'camera')
     found = night_sky.from_bags([bag], Topics(), values, folder)
     campaign = calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)

@@ -117,7 +117,8 @@ class CalibrationOptions:
     outlier_sigma: float = 4.5
     # 1-sigma of cx and cy, as a fraction of the longer side: how far mounts decentre detectors.
     principal_point_prior: float = 0.03
-    # 1-sigma of each lens coefficient: displacement of the corners, of the half diagonal.
+    # 1-sigma of each lens coefficient: displacement of the corners, of the half diagonal; it falls
+    # with the field beyond the third order.
     lens_prior: float = 0.1
     variance_components: bool = True  # sigmas of centroids and star tracker from the residuals
 

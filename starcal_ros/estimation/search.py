@@ -40,6 +40,7 @@ from starcal_ros.estimation.weights import FEWEST_STARS
 from starcal_ros.records import CameraGeometry, Ensemble
 
 Minimum = Solution[State, NormalEquations]
+_SERIES_RAD = 0.3  # angle from the axis at which all orders of a distortion may be as large
 
 
 def minimise(
@@ -188,13 +189,20 @@ def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
     Return the 1-sigma (p,) of camera parameters that no option states; 0: no prior.
 
     Lens coefficients by their displacement of a corner: without a prior, those of a numerator and
-    a denominator run into a pole on the detector.
+    a denominator run into a pole on the detector.  The series of a lens is in the angle from its
+    axis: in a narrow field each order is smaller than the one before, and not for its stars to
+    show.
     """
     corner = 0.5 * np.array([camera.width, camera.height]) / camera.parameters[0]
     none = np.zeros(len(COEFFICIENTS[camera.model]))
-    effect = np.linalg.norm(coefficient_jacobian(camera.model, corner, none), axis=0)
+    effect, half_way = (
+        np.linalg.norm(coefficient_jacobian(camera.model, part * corner, none), axis=0)
+        for part in (1.0, 0.5)
+    )
+    beyond_third = np.maximum(np.log2(effect / half_way) - 3.0, 0.0)
+    falling = min(float(np.linalg.norm(corner)) / _SERIES_RAD, 1.0) ** beyond_third
     centre_px = options.principal_point_prior * max(camera.width, camera.height)
-    of_lens = options.lens_prior * np.linalg.norm(corner) / effect
+    of_lens = options.lens_prior * np.linalg.norm(corner) / effect * falling
     return np.concatenate([[0.0, 0.0, 0.0, centre_px, centre_px], of_lens])
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Pixels
-from starcal_ros.camera import line_of_sight
+from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
 from starcal_ros.identification.blending import separate
@@ -51,9 +51,11 @@ from starcal_ros.stars.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.stars.psf_fit import stamp_radius_px
 
 _SEARCH_SIGMAS = 3.0
+_CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
 _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
 _MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
+_FEWEST_IN_FIELD = 2.0  # catalog stars in an image, on average over the window of the search
 _NEAREST = 200  # brightest predictions, searched in windows first
 _NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis
 
@@ -96,22 +98,19 @@ class StarSearch:
     )
     tracker_sigma_rad: float = 0.0
 
-    @property
-    def reach_rad(self) -> float:
+    def reach_rad(self, camera: CameraModel) -> tuple[float, float]:
         """
-        Largest error of the pointing of a prediction.
+        Largest error of a prediction in pointing and in roll.
 
-        That of the mounting with the star tracker's in this image, or, once aligned to an image,
-        the star tracker's in both.
+        In pointing those of the mounting, the principal point, and the star tracker in this image;
+        once aligned to an image, the star tracker's in both.
         """
         mounting_rad = math.radians(self.identification.prior_alignment_sigma_deg)
         tracker_rad = self.tracker_sigma_rad
-        return _SEARCH_SIGMAS * math.hypot(mounting_rad, tracker_rad, tracker_rad)
-
-    @property
-    def roll_reach_rad(self) -> float:
-        """Largest error of the roll of a prediction."""
-        return _ROLL_FACTOR * self.reach_rad
+        centre_rad = _CENTRE_SIGMA * max(camera.width, camera.height) / float(camera.parameters[0])
+        tilt_rad = math.hypot(mounting_rad, tracker_rad, tracker_rad, centre_rad)
+        roll_rad = _ROLL_FACTOR * math.hypot(mounting_rad, tracker_rad, tracker_rad)
+        return _SEARCH_SIGMAS * tilt_rad, _SEARCH_SIGMAS * roll_rad
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ def observe_stars(
         image.time_ns,
         search.catalog,
         options.magnitude_limit,
-        search.reach_rad,
+        search.reach_rad(geometry.camera)[0],
         exposure.velocity.m_s,
         exposure.site,
     )
@@ -302,8 +301,9 @@ def _check_catalog(
     Raises ImageRefused ``not_in_catalog``, whose detail is the sky that the catalog must cover.
     """
     camera, count = geometry.camera, len(prediction.catalog_index)
-    in_field = count / window_area(camera, search.reach_rad * float(camera.parameters[0]))
-    if in_field >= _MIN_STARS or count > _NEAREST:
+    reach_px = search.reach_rad(camera)[0] * float(camera.parameters[0])
+    in_field = count / window_area(camera, reach_px)
+    if in_field >= _FEWEST_IN_FIELD or count > _NEAREST:
         return
     attitude = geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
     x, y, z = attitude.apply([0.0, 0.0, 1.0])
@@ -344,8 +344,9 @@ def _find(
         raise ImageRefused(
             'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
         )
-    reach_px = search.reach_rad * float(camera.parameters[0])
-    return acquire(prediction, sources, geometry, reach_px, search.roll_reach_rad), sources
+    tilt_rad, roll_rad = search.reach_rad(camera)
+    reach_px = tilt_rad * float(camera.parameters[0])
+    return acquire(prediction, sources, geometry, reach_px, roll_rad), sources
 
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:

@@ -37,6 +37,9 @@ def run(args: argparse.Namespace) -> int:
     )
     if made.refused:
         terminal.print_text(refusals(made.refused))
+    if made.unmoved:
+        what = 'stars have no proper motion: 0.1" off in ten years is usual'
+        terminal.print_text(f'{made.unmoved} {what}')
     terminal.print_text(
         f'in the parameter file: catalog: {output.absolute()}, magnitude_limit:'
         f' {made.faintest:.1f}'

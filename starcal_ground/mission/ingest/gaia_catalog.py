@@ -71,13 +71,15 @@ class DeepCatalog:
     """
     Columns of a catalog file, its stars of the table, and the faintest V of these.
 
-    ``refused`` has the number of rows of the table that were left out, by reason.
+    ``refused`` has the number of rows of the table that were left out, by reason, ``unmoved`` that
+    of its stars without a proper motion.
     """
 
     columns: dict[str, NDArray[np.generic]]
     added: int
     faintest: float
     refused: dict[str, int]
+    unmoved: int
 
 
 def write_deep_catalog(table: Path, output: Path) -> DeepCatalog:
@@ -135,6 +137,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
         int(new.sum()),
         float(stars['magnitude'][new].max(initial=0.0)),
         refused,
+        int((stars['motion_source'][new] == MotionSource.UNKNOWN).sum()),
     )
 
 

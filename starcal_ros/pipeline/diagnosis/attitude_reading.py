@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.identification.star_finder import StarSearch
 from starcal_ros.pipeline.diagnosis.identified import Solved
 from starcal_ros.pipeline.setup import Setup
 
@@ -74,10 +73,11 @@ class Reading:
         tilt_rad = math.acos(min(max(float(axes[2, 2]), -1.0), 1.0))
         return tilt_rad, math.atan2(float(axes[1, 0]), float(axes[0, 0]))
 
-    def is_off(self, prior: Rotation, search: StarSearch) -> bool:
+    def is_off(self, prior: Rotation, setup: Setup) -> bool:
         """True if a prior alignment is off by more than images are searched to."""
         tilt_rad, roll_rad = self.off_by(prior)
-        return tilt_rad > search.reach_rad or abs(roll_rad) > search.roll_reach_rad
+        most_tilt_rad, most_roll_rad = setup.star_search.reach_rad(setup.prior.camera)
+        return tilt_rad > most_tilt_rad or abs(roll_rad) > most_roll_rad
 
     def quarter_turns(self, prior: Rotation) -> int:
         """
@@ -154,8 +154,7 @@ class Case:
         if prior is None:
             is_given = (fit[0].order, fit[0].direction) == _ways(self.setup)[0]
             return fit[0] if is_given else None
-        search = self.setup.star_search
-        near = [reading for reading in fit if not reading.is_off(prior, search)]
+        near = [reading for reading in fit if not reading.is_off(prior, self.setup)]
         if near:
             return near[0]
         likely = [

@@ -27,6 +27,7 @@ from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeOptions
 
+_PLACES = 8  # in the sky that a sentence lists
 _MEASURED = 10  # images, for the reason of their refusal
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
 """Refusals after which the sky of an image cannot be held against the set-up."""
@@ -206,7 +207,17 @@ def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
             groups.setdefault(observations.refusal, []).append(observations)
     return tuple(
         Refused(
-            reason, len(group), IMAGE_REFUSALS.get(reason, ''), group[0].time_ns, group[0].detail
+            reason, len(group), IMAGE_REFUSALS.get(reason, ''), group[0].time_ns, _detail(group)
         )
         for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
     )
+
+
+def _detail(group: Sequence[StarObservations]) -> str:
+    """Detail of the first image of a refusal, or the places that a catalog has to cover."""
+    details = list(dict.fromkeys(image.detail for image in group))
+    if group[0].refusal != 'not_in_catalog' or len(details) == 1:
+        return details[0]
+    others = [detail[detail.index('RA ') :] for detail in details[1:_PLACES] if 'RA ' in detail]
+    more = f', and {len(details) - _PLACES} more' if len(details) > _PLACES else ''
+    return f'{details[0]}; others at {"; ".join(others)}{more}'

@@ -298,7 +298,7 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
     if prior is None:
         sentence = 'prior_alignment is not given; the images show it.'
         return [Diagnosis('prior_alignment', values, sentence, (), mend)]
-    if not reading.is_off(prior, setup.star_search):
+    if not reading.is_off(prior, setup):
         return []
     tilt_deg, roll_deg = (math.degrees(angle) for angle in reading.off_by(prior))
     away = f'{tilt_deg:.1f} degrees away from it and is rolled by {roll_deg:.1f} degrees'

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
-from starcal_ground.images.from_stars import from_stars
+from starcal_ground.images.from_stars import _of_one_lens, from_stars
 from starcal_ground.images.night_sky import calibrate_images, photographs_of
 from starcal_ground.simulation.rendering import images
 import starcal_ros
@@ -320,3 +320,7 @@ def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
     ]
     with pytest.raises(NotFromStars, match='^2 different images, 3 are needed'):
         calibrate_images(write_pngs(frames, tmp_path / 'night'))
+
+
+def test_no_match_at_all_is_no_lens() -> None:
+    assert _of_one_lens({}) == ({}, ())

@@ -10,22 +10,33 @@ import numpy as np
 import pytest
 from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not-found]
 
+from bench.narrow import scenario_of
 from starcal_ground.products import write_camera_info
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline.setup import (
+    check_field_of_stars,
     load_setup,
     NODE_OPTION_CLASSES,
     OPTION_CLASSES,
     read_setup,
     Setup,
 )
+from starcal_ros.sky.catalog import load_catalog
 
 
 @pytest.fixture(scope='module')
 def setup(camera_yaml: Path) -> Setup:
     return load_setup(values(camera_yaml))
+
+
+def test_a_deep_catalog_need_not_cover_the_sky() -> None:
+    given = scenario_of(0.3, 3)
+    assert given.sky is not None
+    check_field_of_stars(given.sky, 14.7, given.prior.camera)
+    with pytest.raises(OptionError, match=r'magnitude_limit: 9 leaves \d+ stars in the catalog'):
+        check_field_of_stars(load_catalog(None, 9.0), 9.0, given.prior.camera)
 
 
 def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:

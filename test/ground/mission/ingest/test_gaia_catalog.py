@@ -77,7 +77,7 @@ def test_a_table_of_each_kind_is_added_to_the_bundled_catalog(tmp_path: Path, en
     write(given, path)
     made = write_deep_catalog(path, tmp_path / 'deep.npz')
     catalog = loaded(tmp_path / 'deep.npz')
-    assert len(catalog) == len(BUNDLED) + FAINT
+    assert len(catalog) == len(BUNDLED) + FAINT and made.unmoved == 1
     assert (np.diff(catalog.magnitude) >= 0).all() and made.faintest > 13.5
     faint = catalog.select((catalog.id > 0) & (catalog.id <= FAINT))
     faint = faint.select(np.argsort(faint.id))
