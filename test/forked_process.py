@@ -26,7 +26,7 @@ class ForkedProcess:
 
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         given = (name, arguments, str(log), dict(os.environ))
-        self._process = FORKSERVER.Process(target=_run, args=given)
+        self._process = FORKSERVER.Process(target=_run, args=given, daemon=True)
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid

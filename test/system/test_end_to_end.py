@@ -1,10 +1,12 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Bag to products as a separate process, against the truth."""
+"""Bag to products by the tool and by the nodes, against the truth."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
+import io
 import json
 from pathlib import Path
 import signal
@@ -44,12 +46,19 @@ needs_interfaces = pytest.mark.skipif(
 )
 
 
+def in_a_process(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the tool as a user does, with its log in the standard error stream."""
+    command = [sys.executable, '-m', 'starcal_ground.cli.main', *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
 def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the tool as a user does."""
-    return subprocess.run(
-        [sys.executable, '-m', 'starcal_ground.cli.main', *map(str, arguments)],
-        capture_output=True, text=True, cwd=ROOT, check=False,
-    )  # fmt: skip
+    """Run the tool in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    given = [str(argument) for argument in arguments]
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main.main(given)
+    return subprocess.CompletedProcess(given, status, out.getvalue(), err.getvalue())
 
 
 def calibrated(made: simulated_bag.SimulatedBag, folder: Path) -> Calibration:
@@ -241,7 +250,7 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
     whole = (TINY / 'tiny_0.mcap').read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) * 7 // 10])
-    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    done = in_a_process('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     assert done.returncode == 0, done.stderr
     assert done.stderr.count('\n') == 1 and 'truncated' in done.stderr  # said, once
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
@@ -254,7 +263,7 @@ def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
     content[len(content) * 9 // 10] ^= 4
     bag = tmp_path / 'flipped.mcap'
     bag.write_bytes(content)
-    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    done = in_a_process('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     assert done.returncode == 0, done.stderr
     assert 'damaged' in done.stderr and 'Traceback' not in done.stderr
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
@@ -264,7 +273,7 @@ def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
 @needs_interfaces
 @pytest.mark.nodes
 def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path) -> None:
-    done = starcal('demo', '-o', tmp_path)
+    done = in_a_process('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'sigma' in done.stdout and 'alignment z' in done.stdout
     assert done.stdout.endswith(f'open {tmp_path / "report.html"}\n')

@@ -86,6 +86,7 @@ def unmoved(pixels: Floats) -> Floats:
     return np.zeros_like(pixels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('wrong_clock', [False, True])
 def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: bool) -> None:
     errors = []
@@ -99,6 +100,7 @@ def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: 
     assert np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
+@pytest.mark.slow
 def test_in_space_no_ground_is_found_and_the_sigma_is_honest() -> None:
     for seed in range(4):
         images, text = with_air(seen_from(SiteOptions(), seed), CAMERA)
