@@ -137,7 +137,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
         int(new.sum()),
         float(stars['magnitude'][new].max(initial=0.0)),
         refused,
-        int((stars['motion_source'][new] == MotionSource.UNKNOWN).sum()),
+        int((stars['motion_source'][new] == sky_catalog.MotionSource.UNKNOWN).sum()),
     )
 
 

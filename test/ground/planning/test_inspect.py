@@ -22,6 +22,7 @@ from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline import topics
+from starcal_ros.pipeline.diagnosis.bags import refusals
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image, refused_image
@@ -45,7 +46,7 @@ def tiny_images() -> list[Image]:
 def test_the_places_that_a_catalog_lacks_are_listed() -> None:
     details = [f'0.1 catalog stars in a field at RA {k}.0, Dec +1.0 deg' for k in range(10)]
     images = [refused_image(k, 8, 8, 'not_in_catalog', detail) for k, detail in enumerate(details)]
-    (group,) = inspect.refusals(images)
+    (group,) = refusals(images)
     assert group.detail.startswith(f'{details[0]}; others at RA 1.0, Dec +1.0 deg; RA 2.0')
     assert group.detail.endswith('RA 7.0, Dec +1.0 deg, and 2 more')
 
