@@ -74,7 +74,7 @@ class Campaign:
 
 
 def source_of(
-    bags: Sequence[Path], setup: Setup, asked: Topics, through_air: ThroughAir | None = None
+    bags: Sequence[Path], setup: Setup, requested: Topics, through_air: ThroughAir | None = None
 ) -> Source:
     """
     Topics of bags to calibrate from, and a setup with an alignment.
@@ -83,12 +83,12 @@ def source_of(
     none, since their stars are identified.  Raises BagError when a bag cannot be read, a topic is
     missing or several have its type.  Raises OptionError when no alignment is found.
     """
-    topics = bag_topics.choose_topics(bags, asked, setup)
+    topics = bag_topics.choose_topics(bags, requested, setup)
     notes: tuple[str, ...] = ()
     if not (setup.is_aligned or topics.observations):
         from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags  # seldom needed, slow
 
-        setup, sentence = aligned_by_bags(bags, asked, setup)
+        setup, sentence = aligned_by_bags(bags, requested, setup)
         notes = (sentence,)
     return Source(tuple(bags), topics, setup, through_air, notes)
 
@@ -149,9 +149,9 @@ def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
 def calibrate_bags(
     bags: Sequence[Path],
     setup: Setup,
-    asked: Topics,
+    requested: Topics,
     inputs: Mapping[str, str] | None = None,
     through_air: ThroughAir | None = None,
 ) -> Campaign:
     """Calibration of bags by `source_of`, `observe` and `calibrate`, with their errors."""
-    return calibrate(observe(source_of(bags, setup, asked, through_air)), inputs)
+    return calibrate(observe(source_of(bags, setup, requested, through_air)), inputs)

@@ -55,7 +55,7 @@ _ALIGNING = 20  # images, of whose alignments the middle one is taken
 def ensemble_of(observations: Iterable[StarObservations], setup: Setup) -> Ensemble:
     """The ensemble of some images, each added by `add_to_ensemble`."""
     return functools.reduce(
-        lambda ensemble, one: add_to_ensemble(ensemble, one, setup), observations, Ensemble()
+        lambda ensemble, image: add_to_ensemble(ensemble, image, setup), observations, Ensemble()
     )
 
 
@@ -81,16 +81,16 @@ def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> boo
     Near compared with the size of the constellation: any prior camera is good enough, but a
     mirrored or mixed-up constellation stays off by its own size.
     """
-    seen = line_of_sight(camera, observations.measured_px)
-    exists = np.isfinite(seen[:, 0])
+    lines = line_of_sight(camera, observations.measured_px)
+    exists = np.isfinite(lines[:, 0])
     if exists.sum() < _FEWEST_STARS:
         return True
-    seen, directions = seen[exists], observations.direction_icrf[exists]
-    spread = float(np.sqrt(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    lines, directions = lines[exists], observations.direction_icrf[exists]
+    spread = float(np.sqrt(((lines - lines.mean(axis=0)) ** 2).sum(axis=1).mean()))
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', UserWarning)  # of stars on one line
-        _, rssd = Rotation.align_vectors(seen, directions)
-    return float(rssd) / math.sqrt(len(seen)) <= _MOST_OFF * spread
+        _, rssd = Rotation.align_vectors(lines, directions)
+    return float(rssd) / math.sqrt(len(lines)) <= _MOST_OFF * spread
 
 
 def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
@@ -233,8 +233,8 @@ def _not_judged(
         ),
         correlation=observability.correlation(result.shared_covariance, result.shared_names),
         star_trackers=tuple(
-            dataclasses.replace(one, frame=one.frame or setup.frames.star_tracker_frame)
-            for one in result.star_trackers
+            dataclasses.replace(tracker, frame=tracker.frame or setup.frames.star_tracker_frame)
+            for tracker in result.star_trackers
         ),
         model_checks=model_checks(result),
         field=factored_field(field, result.map_covariance) if field else None,
@@ -283,8 +283,8 @@ def estimate_with_smallest_lens(
             continue  # the stars do not determine a model that large
         if estimate.termination != 'converged' and best is not None:
             continue  # lost on the way: its lack of a field means nothing
-        found = estimate.geometry.camera
-        if not np.isfinite(line_of_sight(found, pixel_grid(found, 15, 15))).all():
+        camera = estimate.geometry.camera
+        if not np.isfinite(line_of_sight(camera, pixel_grid(camera, 15, 15))).all():
             continue  # beyond the stars it folds
         ratio = estimate.posterior.field.likelihood_ratio
         if ratio < _CHANCE:

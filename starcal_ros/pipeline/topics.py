@@ -44,7 +44,7 @@ _WITHOUT = {
 }
 
 
-def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = None) -> Topics:
+def choose_topics(paths: Sequence[Path], requested: Topics, setup: Setup | None = None) -> Topics:
     """
     Topics that a calibration of bags reads: images and telemetry, or recorded observations.
 
@@ -55,12 +55,12 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     there = reader.topics(paths)
     kinds = {topic.type_name for topic in there}
     only_recorded = not kinds & _IMAGE_TYPES and OBSERVATIONS_TYPE in kinds
-    if asked.observations or (only_recorded and not asked.image):
+    if requested.observations or (only_recorded and not requested.image):
         kind = OBSERVATIONS_TYPE
-        return Topics(observations=_choose(paths, kind, asked.observations, 'observations'))
-    image = choose_image_topic(paths, asked)
-    attitude, more = _choose_attitudes(paths, there, asked.attitude, setup)
-    velocity, temperature = asked.velocity, asked.temperature
+        return Topics(observations=_choose(paths, kind, requested.observations, 'observations'))
+    image = choose_image_topic(paths, requested)
+    attitude, more = _choose_attitudes(paths, there, requested.attitude, setup)
+    velocity, temperature = requested.velocity, requested.temperature
     if velocity or VELOCITY_TYPE in kinds:
         velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
     options = setup.calibration if setup else None
@@ -72,15 +72,15 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     return Topics(image, attitude, velocity, temperature, more_attitudes=more)
 
 
-def choose_image_topic(paths: Sequence[Path], asked: Topics) -> str:
+def choose_image_topic(paths: Sequence[Path], requested: Topics) -> str:
     """Topic of the images of bags; raises BagError when it is missing, or there are several."""
     there = [t for t in reader.topics(paths) if t.type_name in _IMAGE_TYPES]
-    there.sort(key=lambda t: (t.name != f'/{asked.image.lstrip("/")}', t.type_name != _RAW))
-    return _choose(paths, there[0].type_name if there else _RAW, asked.image, 'image')
+    there.sort(key=lambda t: (t.name != f'/{requested.image.lstrip("/")}', t.type_name != _RAW))
+    return _choose(paths, there[0].type_name if there else _RAW, requested.image, 'image')
 
 
 def _choose_attitudes(
-    paths: Sequence[Path], there: Sequence[reader.Topic], asked: str, setup: Setup | None
+    paths: Sequence[Path], there: Sequence[reader.Topic], requested: str, setup: Setup | None
 ) -> tuple[str, tuple[str, ...]]:
     """
     Topics of the first and of each further star tracker; empty, with a warning: not in the bags.
@@ -96,7 +96,7 @@ def _choose_attitudes(
             ' is left out'
         )
     first = [name for name in kinds if name not in named]
-    if setup and not (asked or first) and any(more):
+    if setup and not (requested or first) and any(more):
         reader.log_damage(
             'no topic of attitudes but those of more_star_trackers; the first star tracker,'
             f' {setup.frames.star_tracker_frame}, is left out'
@@ -104,22 +104,22 @@ def _choose_attitudes(
         return '', more
     # Poses, transforms and orientations of an Imu may be those of anything else.
     likely = [name for name in first if kinds[name] == ATTITUDE_TYPE] or first
-    if len(likely) > 1 and not asked:
+    if len(likely) > 1 and not requested:
         listed = ', '.join(f'{name} ({kinds[name].rpartition("/")[2]})' for name in likely)
         raise BagError(
             f'{", ".join(map(str, paths))}: several topics may hold the attitudes: {listed};'
             ' choose one with --attitude-topic'
         )
-    name = asked or ''.join(likely)
+    name = requested or ''.join(likely)
     own = [kind for topic, kind in kinds.items() if topic.lstrip('/') == name.lstrip('/')]
     try:
         return _choose(paths, own[0] if own else ATTITUDE_TYPE, name, 'attitude'), more
     except BagError as error:
         alone = '' if first else f'; {_CAMERA_ALONE}'
-        raise BagError(f'{error}{_not_read(there, asked)}{alone}') from error
+        raise BagError(f'{error}{_not_read(there, requested)}{alone}') from error
 
 
-def _not_read(there: Sequence[reader.Topic], asked: str) -> str:
+def _not_read(there: Sequence[reader.Topic], requested: str) -> str:
     """Return which topics seem to hold attitudes in messages that are not read, and the remedy."""
     return ''.join(
         f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}, which is not read: publish its'
@@ -127,13 +127,13 @@ def _not_read(there: Sequence[reader.Topic], asked: str) -> str:
         for topic in there
         if topic.type_name not in ATTITUDE_TYPES
         and _LIKE_ATTITUDES.search(topic.type_name.rpartition('/')[2])
-        and (not asked or topic.name.lstrip('/') == asked.lstrip('/'))
+        and (not requested or topic.name.lstrip('/') == requested.lstrip('/'))
     )
 
 
-def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:
+def _choose(paths: Sequence[Path], type_name: str, requested: str, what: str) -> str:
     try:
-        return reader.choose_topic(paths, type_name, asked)
+        return reader.choose_topic(paths, type_name, requested)
     except BagError as error:
         several = any(topic.type_name == type_name for topic in reader.topics(paths))
         remedy = f'choose one with --{what}-topic' if several else _WITHOUT.get(what, '')
@@ -231,7 +231,7 @@ def _of_frame(frame: Frame, setup: Setup, track: Track) -> tuple[StarObservation
 
 def without_attitudes(
     bags: Sequence[Path],
-    asked: Topics,
+    requested: Topics,
     options: Mapping[str, object],
     camera_alone: bool = False,
 ) -> bool:
@@ -246,7 +246,7 @@ def without_attitudes(
     if camera_alone:
         return has_images
     others = {*ATTITUDE_TYPES, OBSERVATIONS_TYPE}
-    return has_images and not (kinds & others or asked.attitude or stated_tracker(options))
+    return has_images and not (kinds & others or requested.attitude or stated_tracker(options))
 
 
 def stated_tracker(options: Mapping[str, object]) -> list[str]:

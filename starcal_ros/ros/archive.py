@@ -102,11 +102,11 @@ class Seal:
         content = json_value(data.decode())
         if not isinstance(content, dict):
             raise ValueError('not a JSON object')
-        checksum, found = content.pop(_CHECKSUM, None), content.pop(_HMAC, None)
+        checksum, seal = content.pop(_CHECKSUM, None), content.pop(_HMAC, None)
         text = _canonical(content)
         if checksum != hashlib.sha256(text).hexdigest():
             raise ValueError('the checksum is wrong')
-        self._check(found, text)
+        self._check(seal, text)
         return content
 
     def mark(self, number: int, data: bytes) -> str:
@@ -121,12 +121,12 @@ class Seal:
         """
         self._check(mark, _numbered(number, data))
 
-    def _check(self, found: object, text: bytes) -> None:
+    def _check(self, seal: object, text: bytes) -> None:
         if not self.key:
             return
-        if not found:
+        if not seal:
             raise ValueError('the HMAC is missing (state_key_file)')
-        if not hmac.compare_digest(str(found).encode(), self._hmac(text).encode()):
+        if not hmac.compare_digest(str(seal).encode(), self._hmac(text).encode()):
             raise ValueError('the HMAC is wrong (state_key_file)')
 
     def _hmac(self, text: bytes) -> str:
@@ -237,7 +237,7 @@ class Archive:
         kept = sorted(self._images.items(), key=lambda item: item[1].path.name)
         if not kept:
             return
-        files = [FileSpan(one.path.name, stamp, stamp, 1) for stamp, one in kept]
+        files = [FileSpan(image.path.name, stamp, stamp, 1) for stamp, image in kept]
         topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, len(files))
         with contextlib.suppress(OSError, ProductError):  # the images are whole without it
             self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
@@ -414,8 +414,8 @@ class Archive:
         else:
             self.last_event = max(self.last_event, highest)
         for name in names:
-            found = pattern.fullmatch(name)
-            if found is None:
+            match = pattern.fullmatch(name)
+            if match is None:
                 continue
             path = self.folder / folder / name
             try:
@@ -423,7 +423,7 @@ class Archive:
             except OSError as error:
                 raise _unreadable(path, error) from error
             if is_file:
-                yield path, found
+                yield path, match
             else:
                 self.damage.append(f'{path}: not a regular file, skipped')
 
@@ -432,17 +432,17 @@ class Archive:
         try:
             data = _content(path)
             self._seal.check_mark(name[2] or '', int(name[1]), data)
-            found = list(read_observations([path], TOPIC, damage.append))
+            records = list(read_observations([path], TOPIC, damage.append))
         except (BagError, ValueError) as error:
             self._set_aside(path, str(error))
             return None
-        if damage or len(found) != 1:
-            self._set_aside(path, damage[0] if damage else f'{len(found)} images, not one')
+        if damage or len(records) != 1:
+            self._set_aside(path, damage[0] if damage else f'{len(records)} images, not one')
             return None
-        if found[0].refusal:
-            self._set_aside(path, f'{found[0].refusal}: {found[0].detail}')
+        if records[0].refusal:
+            self._set_aside(path, f'{records[0].refusal}: {records[0].detail}')
             return None
-        return found[0]
+        return records[0]
 
     def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
         content = self._unsealed(path, product_files.SCHEMA)

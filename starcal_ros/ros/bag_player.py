@@ -151,9 +151,9 @@ class BagPlayer(PrintableLog):
         since_s = time.monotonic()
         while True:
             now_s = time.monotonic()
-            found = [player.get_subscription_count() for player in self._players.values()]
-            if found != matches:
-                matches, since_s = found, now_s
+            counts = [player.get_subscription_count() for player in self._players.values()]
+            if counts != matches:
+                matches, since_s = counts, now_s
             missing = [
                 *(name for name in needed if not is_read(name)),
                 *([] if not others or any(map(is_read, others)) else [' or '.join(others)]),

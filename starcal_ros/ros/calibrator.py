@@ -222,13 +222,13 @@ class Calibrator(StarcalNode):
 
     def _on_transforms(self, message: Any) -> None:
         """Take note of the frames of this node to which another one publishes a transform."""
-        mountings = (one.frame for one in self._setup.mountings)
+        mountings = (mounting.frame for mounting in self._setup.mountings)
         frames = {self._setup.frames.camera_frame, *mountings}
         with self._publishing:
             own = self._own_transforms
             frames |= {transform.child_frame_id for transform in own}
             names = {frame.lstrip('/') for frame in frames}
-            heard = (one.child_frame_id for one in message.transforms if one not in own)
+            heard = (sent.child_frame_id for sent in message.transforms if sent not in own)
             # A frame has one parent: each listener takes the transform that came last.
             self._foreign_frames = self._foreign_frames | (
                 names & {frame.lstrip('/') for frame in heard}

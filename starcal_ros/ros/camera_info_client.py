@@ -118,8 +118,8 @@ class CameraDriver:
         """
         was_there, self._is_there = self._is_there, self._client.service_is_ready()
         had = self._servers
-        found = self._node.get_publishers_info_by_topic(self._answers, no_mangle=True)
-        self._servers = frozenset(bytes(server.endpoint_gid) for server in found)
+        servers = self._node.get_publishers_info_by_topic(self._answers, no_mangle=True)
+        self._servers = frozenset(bytes(server.endpoint_gid) for server in servers)
         return self._is_there and (not was_there or not self._servers <= had)
 
     def _send(self) -> None:

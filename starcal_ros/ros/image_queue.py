@@ -375,7 +375,7 @@ class Unmatched:
                 return
             process = self._process = ChildProcess()
         try:
-            found = process.call(_answer, *question)
+            diagnosis = process.call(_answer, *question)
         except Exception:  # whatever it is, the node goes on
             return
         finally:
@@ -383,8 +383,8 @@ class Unmatched:
         with self._lock:
             if not self._in_a_row:
                 return  # images match again
-            self._diagnosis = found
-        self._on_answer(found)
+            self._diagnosis = diagnosis
+        self._on_answer(diagnosis)
 
 
 def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -> Diagnosis:

@@ -186,8 +186,8 @@ def _reliability_override(node: Node, name: str) -> QoSOverridingOptions | None:
     return QoSOverridingOptions([QoSPolicyKind.RELIABILITY]) if given else None
 
 
-def _mismatch(offered: QoSProfile, asked: QoSProfile) -> str:
+def _mismatch(offered: QoSProfile, requested: QoSProfile) -> str:
     """Why DDS does not connect two profiles, in the words of rclpy; empty: it does."""
-    outcome, why = qos_check_compatible(offered, asked)
+    outcome, why = qos_check_compatible(offered, requested)
     is_error = outcome == QoSCompatibility.ERROR
     return why.replace('ERROR: ', '').rstrip(';') if is_error else ''

@@ -230,11 +230,11 @@ class StarcalNode(PrintableLog, LifecycleNode):
         frames, camera = self._setup.frames, self._setup.prior.camera
         width_deg = math.degrees(2 * math.atan(camera.width / 2 / float(camera.parameters[0])))
         alignment = [round(number, 6) for number in frames.prior_alignment]
-        found = 'not given: found from the images'
+        unknown = 'not given: found from the images'
         return (
             f'prior camera {frames.camera_info_url}: {camera.width} x {camera.height},'
             f' {width_deg:.1f} degrees wide; prior_alignment'
-            f' {alignment if self._setup.is_aligned else found}'
+            f' {alignment if self._setup.is_aligned else unknown}'
         )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -317,8 +317,8 @@ def _refuse(request: Any, response: Any, why: str) -> None:
         response.result = refused
     else:
         # Parameters before the bad one are answered and may be set.
-        left = len(request.parameters) - len(response.results)
-        response.results = [*response.results, *[refused] * left]
+        unanswered = len(request.parameters) - len(response.results)
+        response.results = [*response.results, *[refused] * unanswered]
 
 
 def one_line(error: Exception) -> str:
@@ -500,8 +500,8 @@ def message_class(type_name: str) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def _class_and_kinds(type_name: str) -> tuple[Any, dict[str, str]]:
-    found = message_class(type_name)
-    return found, found.get_fields_and_field_types()
+    kind = message_class(type_name)
+    return kind, kind.get_fields_and_field_types()
 
 
 def _as_field(value: Any, kind: str) -> Any:

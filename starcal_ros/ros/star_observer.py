@@ -170,7 +170,7 @@ class StarObserver(StarcalNode):
         why = self._unmatched.diagnosis
         counts = dict(self._counts)  # the worker thread continues counting
         unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
-        not_used = [f'{name or first}: {one.images}' for name, one in unfit.items()]
+        not_used = [f'{name or first}: {tracker.images}' for name, tracker in unfit.items()]
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
@@ -196,7 +196,7 @@ class StarObserver(StarcalNode):
             return WARN, f'no image matches: {why.in_a_sentence()}', numbers
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
-        if why_not := [one.why for one in unfit.values() if one.why]:
+        if why_not := [tracker.why for tracker in unfit.values() if tracker.why]:
             return WARN, '; '.join(why_not), numbers
         if self._bad_velocity:
             return WARN, self._bad_velocity, numbers
@@ -366,13 +366,13 @@ class StarObserver(StarcalNode):
             more,
         )
 
-    def _on_diagnosis(self, found: Diagnosis) -> None:
+    def _on_diagnosis(self, diagnosis: Diagnosis) -> None:
         """Log why images match nothing; without a prior alignment, take the one found."""
         if self._setup.is_aligned:
-            self.get_logger().warning(f'no image matches: {found.in_a_sentence()}')
+            self.get_logger().warning(f'no image matches: {diagnosis.in_a_sentence()}')
             self.publish_health()
             return
-        values, sentence = found_alignment(found)
+        values, sentence = found_alignment(diagnosis)
         if values is None:
             self.get_logger().warning(f'prior_alignment is not given, and not found: {sentence}')
             return

@@ -232,18 +232,18 @@ class CalibratorState:
             if self._active is None:
                 return Answer(False, 'no calibration is active')
             wanted = self._active.before
-            found = [record for record in self._history if record.event == wanted]
-            if not found:
+            earlier = [record for record in self._history if record.event == wanted]
+            if not earlier:
                 kept = ' on record' if wanted else ''
                 return Answer(False, f'there is no calibration before the active one{kept}')
-            before = found[0].calibration
+            before = earlier[0].calibration
             refusals = refusals_today(before, self._setup)
             if refusals:
                 return Answer(
                     False,
                     f'calibration {before.number} is refused by the gate: {"; ".join(refusals)}',
                 )
-            calibration = self._activate(before.number, found[0].before, before)
+            calibration = self._activate(before.number, earlier[0].before, before)
         answer = self._answer(f'activated again: {summary(calibration)}')
         return dataclasses.replace(answer, calibration=calibration, active=True)
 
@@ -347,5 +347,5 @@ def _of_size(ensemble: Ensemble, archive: Archive, setup: Setup) -> Ensemble:
     for image in ensemble.images:
         if (image.width, image.height) != size:
             archive.set_aside_image(image.time_ns, f'an image of {image.width} x {image.height}')
-    kept = tuple(one for one in ensemble.images if (one.width, one.height) == size)
+    kept = tuple(image for image in ensemble.images if (image.width, image.height) == size)
     return Ensemble(kept, ensemble.refused)

@@ -134,13 +134,13 @@ class Case:
         """Every reading with its alignments; the configured one is first."""
         return [self._reading(way, 0.0) for way in _ways(self.setup)]
 
-    def _fitting(self, found: Sequence[Reading]) -> list[Reading]:
+    def _fitting(self, readings: Sequence[Reading]) -> list[Reading]:
         """Readings supported by most images, and by about as many as the best reading."""
         images = len(self.solved)
         enough = images if images < 3 else max(3, math.ceil(0.6 * images))
         if self.setup.is_aligned and images == 3:
             enough = 2  # one of the attitudes may be wrong
-        fit = [reading for reading in found if reading.agreeing >= enough]
+        fit = [reading for reading in readings if reading.agreeing >= enough]
         most = max((reading.agreeing for reading in fit), default=0)
         fit = [reading for reading in fit if reading.agreeing >= 0.8 * most]
         least_rad = min((max(r.scatter_rad, _ALIKE_RAD) for r in fit), default=0.0)
@@ -180,13 +180,13 @@ class Case:
         """The reading and stamp shift that most images support; None if there is none."""
         coarse = np.arange(-CLOCK_SEARCH_S, CLOCK_SEARCH_S + 1e-9, _COARSE_STEP_S)
         fine = np.arange(-0.3, 0.3 + 1e-9, _FINE_STEP_S)
-        found = []
+        readings = []
         for way in _ways(self.setup):
             tried = [self._reading(way, float(shift_s)) for shift_s in coarse]
             near_s = min(tried, key=_rank).shift_s
             tried += [self._reading(way, float(near_s + shift_s)) for shift_s in fine]
-            found.append(_middle_of_best(tried))
-        return next(iter(self._fitting(found)), None)
+            readings.append(_middle_of_best(tried))
+        return next(iter(self._fitting(readings)), None)
 
 
 def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> list[Rotation]:
@@ -199,7 +199,7 @@ def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> 
     if prior is None:
         return []
     sent = (_read_at(attitudes, np.array([time_ns]), way, setup)[0] for way in _ways(setup))
-    read = [(one[0] * prior).inv() for one in sent if one is not None]
+    read = [(rotations[0] * prior).inv() for rotations in sent if rotations is not None]
     return [_ROLLS[turns] * rotation for turns in (0, 2, 1, 3) for rotation in read]
 
 

@@ -45,7 +45,7 @@ class Refused:
 
 
 def diagnose_bags(
-    paths: Sequence[Path], asked: Topics, setup: Setup, refused: Sequence[Refused] = ()
+    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused] = ()
 ) -> Diagnosis:
     """
     Why the images of bags cannot be used: by their refusals, by their stamps, by their stars.
@@ -54,7 +54,7 @@ def diagnose_bags(
     images are measured where the sky does not name the cause. Raises BagError when a bag cannot be
     read, or holds no images with attitudes.
     """
-    topics = bag_topics.choose_topics(paths, asked, setup)
+    topics = bag_topics.choose_topics(paths, requested, setup)
     if topics.observations:
         raise BagError(f'{paths[0]}: no images to look at, only observations')
     channel = setup.frames.image_channel
@@ -68,40 +68,40 @@ def diagnose_bags(
     spans = _without_common_time(first, attitudes)
     shift_ns = spans[1][0] - spans[0][0] if spans else 0
     images = _images(paths, topics.image, setup, shift_ns)
-    found = diagnose(images, attitudes, setup, shift_ns / NANOSECONDS_PER_SECOND)
+    diagnosis = diagnose(images, attitudes, setup, shift_ns / NANOSECONDS_PER_SECOND)
     if spans:
-        return found if found.cause == 'clock' else of_two_clocks(*spans)
-    if found.cause not in ('none', 'unknown', 'no_stars'):
-        return found
+        return diagnosis if diagnosis.cause == 'clock' else of_two_clocks(*spans)
+    if diagnosis.cause not in ('none', 'unknown', 'no_stars'):
+        return diagnosis
     if not refused and setup.is_aligned:
         measured = tuple(islice(bag_topics.read(paths, topics, setup), _MEASURED))
-        refused = refusals(measured) if all(one.refusal for one in measured) else ()
+        refused = refusals(measured) if all(record.refusal for record in measured) else ()
     count = sum(group.count for group in refused)
-    by_itself = [one for one in refused if one.reason not in ('no_match', 'no_stars')]
-    return of_refusals(by_itself, count) or found
+    by_itself = [group for group in refused if group.reason not in ('no_match', 'no_stars')]
+    return of_refusals(by_itself, count) or diagnosis
 
 
 def of_a_failure(
-    paths: Sequence[Path], asked: Topics, setup: Setup, refused: Sequence[Refused]
+    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused]
 ) -> Diagnosis | None:
     """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
     try:
-        found = diagnose_bags(paths, asked, setup, refused)
+        diagnosis = diagnose_bags(paths, requested, setup, refused)
     except BagError:
         return None
-    return None if found.cause == 'none' else found
+    return None if diagnosis.cause == 'none' else diagnosis
 
 
-def aligned_by_bags(paths: Sequence[Path], asked: Topics, setup: Setup) -> tuple[Setup, str]:
+def aligned_by_bags(paths: Sequence[Path], requested: Topics, setup: Setup) -> tuple[Setup, str]:
     """
     A setup with the alignment that the images show where none is given, and a sentence on it.
 
     Recorded observations need none: their stars are identified. Raises BagError when a bag cannot
     be read. Raises OptionError when fewer than three images agree.
     """
-    if setup.is_aligned or bag_topics.choose_topics(paths, asked, setup).observations:
+    if setup.is_aligned or bag_topics.choose_topics(paths, requested, setup).observations:
         return setup, ''
-    values, sentence = found_alignment(diagnose_bags(paths, asked, setup))
+    values, sentence = found_alignment(diagnose_bags(paths, requested, setup))
     if values is None:
         raise OptionError(f'prior_alignment: not given, and not found: {sentence}')
     return aligned(setup, np.array(values)), sentence
@@ -199,10 +199,10 @@ def placed(
         yield StarObservations.of_image(image.time_ns, (width, height), attitude_gap_s=gap_s)
 
 
-def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
+def refusals(records: Iterable[StarObservations]) -> tuple[Refused, ...]:
     """Refused images by their reason, the most frequent first."""
     groups: dict[str, list[StarObservations]] = {}
-    for observations in seen:
+    for observations in records:
         if observations.refusal:
             groups.setdefault(observations.refusal, []).append(observations)
     return tuple(

@@ -88,14 +88,15 @@ class Diagnosis:
         return ' '.join([*said, f'(details: {command})'] if command else said)
 
 
-def found_alignment(found: Diagnosis) -> tuple[list[float] | None, str]:
+def found_alignment(diagnosis: Diagnosis) -> tuple[list[float] | None, str]:
     """The alignment of a diagnosis without a prior one, or None, with a sentence on it."""
-    if found.cause != 'prior_alignment' or not isinstance(found.found, list):
-        return None, found.in_a_sentence()
-    if found.images < IMAGES_OF_AN_ALIGNMENT:
-        return None, (f'{found.images} images agree, {IMAGES_OF_AN_ALIGNMENT} are needed.')
-    return found.found, (
-        f'prior_alignment is not given: found {found.found} from {found.images} images that agree.'
+    if diagnosis.cause != 'prior_alignment' or not isinstance(diagnosis.found, list):
+        return None, diagnosis.in_a_sentence()
+    if diagnosis.images < IMAGES_OF_AN_ALIGNMENT:
+        return None, (f'{diagnosis.images} images agree, {IMAGES_OF_AN_ALIGNMENT} are needed.')
+    return diagnosis.found, (
+        f'prior_alignment is not given: found {diagnosis.found} from {diagnosis.images} images'
+        ' that agree.'
     )
 
 
@@ -110,27 +111,29 @@ def diagnose(
     attitudes.
     """
     guesses = functools.partial(expected_rotations, attitudes, setup)
-    found = identify_images(images, setup.prior.camera, setup.catalog, guesses)
-    if found.solved:
-        return _held_against(Case(found.solved, attitudes, setup), len(found.seen), shift_s)
-    return _nothing_found(found, setup)
+    identified = identify_images(images, setup.prior.camera, setup.catalog, guesses)
+    if identified.solved:
+        return _held_against(
+            Case(identified.solved, attitudes, setup), len(identified.sources), shift_s
+        )
+    return _nothing_found(identified, setup)
 
 
-def _nothing_found(found: Identified, setup: Setup) -> Diagnosis:
+def _nothing_found(identified: Identified, setup: Setup) -> Diagnosis:
     """The cause where no image was identified."""
-    camera, seen = setup.prior.camera, found.seen
-    if not seen and found.other_sizes:
-        return _of_another_size(*found.other_sizes[0], camera)
-    if not seen:
+    camera, looked_at = setup.prior.camera, identified.sources
+    if not looked_at and identified.other_sizes:
+        return _of_another_size(*identified.other_sizes[0], camera)
+    if not looked_at:
         return Diagnosis('no_stars', 0, 'There is no image that can be read.')
-    count = int(np.median([len(sources.xy_px) for sources in seen]))
-    streaks = [streak for streak in map(smear, seen) if streak is not None]
-    looked = f'{len(seen)} images looked at, {count} star-like sources each'
-    if 2 * len(streaks) > len(seen):
+    count = int(np.median([len(sources.xy_px) for sources in looked_at]))
+    streaks = [streak for streak in map(smear, looked_at) if streak is not None]
+    looked = f'{len(looked_at)} images looked at, {count} star-like sources each'
+    if 2 * len(streaks) > len(looked_at):
         return _smeared(float(np.median([length for length, _ in streaks])), looked)
     if count < FEWEST_SOURCES:
-        level = float(np.median([s.background.level_dn for s in seen]))
-        noise = float(np.median([s.background.noise_dn for s in seen]))
+        level = float(np.median([s.background.level_dn for s in looked_at]))
+        noise = float(np.median([s.background.noise_dn for s in looked_at]))
         return Diagnosis(
             'no_stars',
             count,
@@ -143,7 +146,7 @@ def _nothing_found(found: Identified, setup: Setup) -> Diagnosis:
     return Diagnosis(
         'unknown',
         None,
-        'No image can be identified, and why was not found.',
+        'No image can be identified, and why was not identified.',
         (
             looked,
             'no pattern of them was found in the sky, mirrored or not, in the time of the search',
@@ -231,14 +234,14 @@ def _joined(findings: Sequence[Diagnosis], evidence: list[str]) -> Diagnosis:
         sentence = 'Attitudes, alignment and camera fit the images.'
         return Diagnosis('none', None, sentence, tuple(evidence))
     first, *others = findings
-    for one in findings:
-        evidence += one.evidence
-    evidence += [f'besides: {one.sentence}' for one in others]
+    for finding in findings:
+        evidence += finding.evidence
+    evidence += [f'besides: {finding.sentence}' for finding in others]
     return dataclasses.replace(
         first,
         evidence=tuple(evidence),
-        mend=tuple(line for one in findings for line in one.mend),
-        also=tuple(one.cause for one in others),
+        mend=tuple(line for finding in findings for line in finding.mend),
+        also=tuple(finding.cause for finding in others),
     )
 
 
@@ -268,12 +271,12 @@ def _order(reading: Reading) -> list[Diagnosis]:
 
 
 def _direction(reading: Reading, setup: Setup) -> list[Diagnosis]:
-    given, found = setup.attitude.attitude_direction, reading.direction
-    if found == given:
+    given, shown = setup.attitude.attitude_direction, reading.direction
+    if shown == given:
         return []
     sentence = f'The attitude quaternions are {reading}, not {given}.'
-    mend = f'attitude_direction: {found}'
-    return [Diagnosis('attitude_direction', found, sentence, mend=(mend,))]
+    mend = f'attitude_direction: {shown}'
+    return [Diagnosis('attitude_direction', shown, sentence, mend=(mend,))]
 
 
 def _clock(shift_s: float, setup: Setup) -> list[Diagnosis]:
@@ -292,8 +295,8 @@ def _clock(shift_s: float, setup: Setup) -> list[Diagnosis]:
 
 
 def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
-    found, prior = reading.star_tracker_from_camera, prior_alignment(setup)
-    values = [round(float(q), 7) for q in found.as_quat(canonical=True)]
+    alignment, prior = reading.star_tracker_from_camera, prior_alignment(setup)
+    values = [round(float(q), 7) for q in alignment.as_quat(canonical=True)]
     mend = (f'prior_alignment: {values}',)
     if prior is None:
         sentence = 'prior_alignment is not given; the images show it.'
@@ -308,10 +311,10 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
         way = {1: ' counterclockwise', 2: '', 3: ' clockwise'}[turns]
         sentence = f'The image is rotated by {degrees:.0f} degrees{way} against prior_alignment.'
         return [Diagnosis('rotated', degrees, sentence, tuple(evidence), mend)]
-    if (prior * found).magnitude() < _SAME_ALIGNMENT_RAD:
+    if (prior * alignment).magnitude() < _SAME_ALIGNMENT_RAD:
         evidence.append('prior_alignment is the inverse of it: camera from star tracker')
     w_first = type(prior).from_quat(prior.as_quat()[[1, 2, 3, 0]])
-    if (w_first.inv() * found).magnitude() < _SAME_ALIGNMENT_RAD:
+    if (w_first.inv() * alignment).magnitude() < _SAME_ALIGNMENT_RAD:
         evidence.append('prior_alignment is given with w first')
     sentence = (
         f'prior_alignment points {tilt_deg:.1f} degrees away from where the images show the'

@@ -35,7 +35,7 @@ _MISFIT_PX = 3.0  # of a star whose identification is left out of a rotation
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Sources:
     """
     Sources of an image.
 
@@ -49,7 +49,7 @@ class _Seen:
 
 
 @dataclass(frozen=True)
-class Solved(_Seen):
+class Solved(_Sources):
     """
     An image that was identified.
 
@@ -65,7 +65,7 @@ class Identified:
     """Images identified; sources of all images looked at; sizes (width, height) that differ."""
 
     solved: tuple[Solved, ...]
-    seen: tuple[BrightSources, ...]
+    sources: tuple[BrightSources, ...]
     other_sizes: tuple[tuple[int, int], ...]
 
 
@@ -83,47 +83,47 @@ def identify_images(
     of this thread.
     """
     finder = _Search(camera, catalog, guesses, time.thread_time() + _SEARCH_S)
-    seen: list[BrightSources] = []
+    looked_at: list[BrightSources] = []
     other_sizes: list[tuple[int, int]] = []
-    pending: list[_Seen] = []
+    pending: list[_Sources] = []
     searched = 0
     for image in itertools.islice(images, LOOKED_AT):
-        one = _seen(image, camera)
-        if one is None:
+        bright = _sources(image, camera)
+        if bright is None:
             height, width = image.pixels.shape
             other_sizes.append((width, height))
             if len(other_sizes) == _SEARCHED:
                 break
             continue
-        seen.append(one.sources)
+        looked_at.append(bright.sources)
         # The pattern of streaks is none of points.
-        if len(one.sources.xy_px) >= FEWEST_SOURCES and smear(one.sources) is None:
+        if len(bright.sources.xy_px) >= FEWEST_SOURCES and smear(bright.sources) is None:
             searched += 1
-            if not (finder.guess(one) or finder.look_up(one, search.ROUNDS[0])):
-                pending.append(one)
+            if not (finder.guess(bright) or finder.look_up(bright, search.ROUNDS[0])):
+                pending.append(bright)
                 if len(pending) == _FEW and not finder.solved:
                     pending = finder.look_up_rescaled(pending)
         if len(finder.solved) == _IMAGES or searched == _SEARCHED or finder.is_over():
             break
     for later in search.ROUNDS[1:]:
-        left, pending = pending, []
-        for one in left:
+        last, pending = pending, []
+        for bright in last:
             if len(finder.solved) >= _FEW or finder.is_over():
                 break
-            if not finder.look_up(one, later):
-                pending.append(one)
-    alike = sorted(_with_one_camera(finder.solved, catalog), key=lambda one: one.time_ns)
-    return Identified(tuple(alike), tuple(seen), tuple(other_sizes))
+            if not finder.look_up(bright, later):
+                pending.append(bright)
+    alike = sorted(_with_one_camera(finder.solved, catalog), key=lambda image: image.time_ns)
+    return Identified(tuple(alike), tuple(looked_at), tuple(other_sizes))
 
 
-def _seen(image: Image, camera: CameraModel) -> _Seen | None:
+def _sources(image: Image, camera: CameraModel) -> _Sources | None:
     """Sources of an image, turned to the sides of the camera; None if it has another size."""
     sides = (camera.height, camera.width)
     is_turned = image.pixels.shape != sides and image.pixels.shape[::-1] == sides
     pixels = np.ascontiguousarray(np.rot90(image.pixels)) if is_turned else image.pixels
     if pixels.shape != sides:
         return None
-    return _Seen(image.time_ns, bright_sources(pixels), is_turned)
+    return _Sources(image.time_ns, bright_sources(pixels), is_turned)
 
 
 @dataclass
@@ -140,21 +140,21 @@ class _Search:
         """True if the time given for the search has passed."""
         return time.thread_time() > self.deadline_s
 
-    def guess(self, one: _Seen) -> bool:
+    def guess(self, image: _Sources) -> bool:
         """True if one of its guessed rotations identifies an image."""
-        rotations = self.guesses(one.time_ns)
+        rotations = self.guesses(image.time_ns)
         ways = [self.solved[0].sky.mirrored] if self.solved else [False, True]
         for mirrored, rotation in itertools.product(ways, rotations):
             sky = search.confirm_sky(
-                one.sources.xy_px, self.camera, self.catalog, rotation, mirrored
+                image.sources.xy_px, self.camera, self.catalog, rotation, mirrored
             )
-            if self._take(one, sky):
+            if self._take(image, sky):
                 return True
         return False
 
-    def look_up(self, one: _Seen, searched: tuple[int, int], scale: float = 1.0) -> bool:
+    def look_up(self, image: _Sources, searched: tuple[int, int], scale: float = 1.0) -> bool:
         """True if a round of the search identifies an image; ``scale`` of the focal length."""
-        xy_px, width = one.sources.xy_px, self.camera.width
+        xy_px, width = image.sources.xy_px, self.camera.width
         fx, fy = (float(self.camera.parameters[k]) for k in (0, 2))
         camera, is_mirrored = self.camera.replace(fx=scale * fx, fy=scale * fy), False
         if self.solved:
@@ -172,21 +172,23 @@ class _Search:
         )
         if isinstance(sky, search.SkyMatch) and is_mirrored:
             sky = dataclasses.replace(sky, mirrored=True, xy_px=search.mirror(sky.xy_px, width))
-        return self._take(one, sky)
+        return self._take(image, sky)
 
-    def look_up_rescaled(self, pending: list[_Seen]) -> list[_Seen]:
+    def look_up_rescaled(self, pending: list[_Sources]) -> list[_Sources]:
         """The images that no focal length far from that of the camera identifies."""
         for scale in _OTHER_SCALES:
-            left = [one for one in pending if not self.look_up(one, search.ROUNDS[0], scale)]
+            unsolved = [
+                image for image in pending if not self.look_up(image, search.ROUNDS[0], scale)
+            ]
             if self.solved:
-                return left
+                return unsolved
         return pending
 
-    def _take(self, one: _Seen, sky: search.SkyMatch | search.NotFound) -> bool:
+    def _take(self, image: _Sources, sky: search.SkyMatch | search.NotFound) -> bool:
         """Add an image to those solved if it was identified."""
         if isinstance(sky, search.NotFound):
             return False
-        self.solved.append(Solved(**vars(one), sky=sky))
+        self.solved.append(Solved(**vars(image), sky=sky))
         return True
 
 
@@ -198,30 +200,32 @@ def _with_one_camera(solved: Sequence[Solved], catalog: StarCatalog) -> list[Sol
     """
     if not solved:
         return []
-    parameters = np.median([one.sky.camera.parameters for one in solved], axis=0)
+    parameters = np.median([image.sky.camera.parameters for image in solved], axis=0)
     camera = dataclasses.replace(solved[0].sky.camera, parameters=parameters)
     return [
         dataclasses.replace(
-            one,
-            sky=dataclasses.replace(one.sky, camera_from_icrf=_rotation(one.sky, camera, catalog)),
+            image,
+            sky=dataclasses.replace(
+                image.sky, camera_from_icrf=_rotation(image.sky, camera, catalog)
+            ),
         )
-        for one in solved
+        for image in solved
     ]
 
 
 def _rotation(sky: search.SkyMatch, camera: CameraModel, catalog: StarCatalog) -> Rotation:
     """The rotation ``camera_from_icrf`` of an identified image with another camera."""
     xy_px = search.mirror(sky.xy_px, camera.width) if sky.mirrored else sky.xy_px
-    seen = line_of_sight(camera, xy_px)
+    lines = line_of_sight(camera, xy_px)
     stars = catalog.direction_icrs[sky.catalog_index]
-    good = np.isfinite(seen[:, 0])
+    good = np.isfinite(lines[:, 0])
     limit_rad = _MISFIT_PX / float(camera.parameters[0])
     rotation = sky.camera_from_icrf
     for _ in range(2):
         if np.count_nonzero(good) < 3:
             return sky.camera_from_icrf
-        rotation, _ = Rotation.align_vectors(seen[good], stars[good])
-        apart = np.linalg.norm(rotation.apply(stars) - seen, axis=1)
+        rotation, _ = Rotation.align_vectors(lines[good], stars[good])
+        apart = np.linalg.norm(rotation.apply(stars) - lines, axis=1)
         # A camera that fits all images on average may be some pixels off in one.
         good = apart < max(limit_rad, 2.0 * float(np.nanmedian(apart)))
     return rotation
