@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from starcal_ground import products
+from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places
 from starcal_ground.mission.trend.places import Entry
 from starcal_ground.mission.trend.rows import COMPUTED, failure, kept_name, RECORDED, Row, row_of
@@ -384,7 +385,8 @@ def _answer(task: Task, path: Path) -> Answer:
         cause = error.__cause__
         if isinstance(cause, OSError):
             raise cause from error
-        return failed(task, str(error).replace(str(path), task.url))
+        said = explained(error) if isinstance(error, StarcalError) else str(error)
+        return failed(task, said.replace(str(path), task.url))
 
 
 def _of_task(row: Row, task: Task, bag: Path = Path()) -> Row:
