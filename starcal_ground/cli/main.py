@@ -135,7 +135,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # at the end of Python an error has no handler
     except StarcalError as error:
-        return arguments.complain(str(error))
+        from starcal_ground.file_kinds import explained
+
+        return arguments.complain(explained(error))
     except BrokenPipeError:
         # The reader of our output has ended (starcal ... | head).
         terminal.discard('stdout')

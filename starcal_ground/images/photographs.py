@@ -27,11 +27,11 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ground.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
 from starcal_ground.images.time_systems import middle_of_exposure, number, TimeError
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
 from starcal_ros.formats.image_files import (
     Card,
     content_of,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ground.file_kinds import explained
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
@@ -129,7 +130,7 @@ def inspect(
             seen.append(observations)
             on_image()
     except (BagError, OptionError) as error:
-        problems.append(str(error))
+        problems.append(explained(error))
     used = [observations for observations in seen if not observations.refusal]
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None

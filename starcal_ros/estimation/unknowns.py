@@ -572,5 +572,5 @@ class Refraction:
 
 
 def _cosine(zenith: Floats, directions: Floats) -> Floats:
-    """Cosines (n,) of zenith distances, as `sky.astrometry.refracted` takes them."""
+    """Cosines (n,) of zenith distances, at least `LEAST_COSINE`."""
     return np.asarray(np.maximum(np.sum(zenith * directions, axis=0), LEAST_COSINE))

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.file_kinds import FITS, has_surplus, kind_of, png_header, tiff_header
+from starcal_ros.formats import image_headers
+from starcal_ros.formats.image_headers import has_surplus, png_header, tiff_header
 from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import regular_file
 
@@ -67,7 +68,7 @@ def read_image(
 def is_fits(path: Path) -> bool:
     """True if a file is FITS by its content, compressed or not; raises IngestError."""
     with errors_as(IngestError, path):
-        return kind_of(path) is FITS
+        return image_headers.is_fits(path)
 
 
 def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:

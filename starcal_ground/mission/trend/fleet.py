@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from starcal_ground import products
+from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ground.products import OBSERVATIONS_FILE
 from starcal_ros import untrusted
@@ -383,7 +384,8 @@ def _answer(task: Task, path: Path) -> Answer:
         cause = error.__cause__
         if isinstance(cause, OSError):
             raise cause from error
-        return failed(task, str(error).replace(str(path), task.url))
+        said = explained(error) if isinstance(error, StarcalError) else str(error)
+        return failed(task, said.replace(str(path), task.url))
 
 
 def _of_task(row: trend_table.Row, task: Task, bag: Path = Path()) -> trend_table.Row:

@@ -16,7 +16,6 @@ from __future__ import annotations
 import bisect
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-import contextlib
 from dataclasses import dataclass
 import functools
 import io
@@ -38,18 +37,9 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import get_chunk_data_stream, StreamReader
 from mcap.summary import Summary
 
-from starcal_ros.errors import BagError, errors_as, ImageRefused
-from starcal_ros.formats.bag.typestore import typestore, typestore_of
-from starcal_ros.formats.file_kinds import FileKind, kind_of, MCAP, ROS_1_BAG, SQLITE_BAG
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPES,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    Message,
-    nearest_stamp_ns,
-    TEMPERATURE_TYPE,
-    VELOCITY_TYPE,
-)
+from starcal_ros.errors import BagError, errors_as, ImageRefused, NotABag
+from starcal_ros.formats.bag.typestore import typestore_of
+from starcal_ros.formats.messages.message_codec import Message, nearest_stamp_ns
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_from_message, refused_from_message
 from starcal_ros.records import Image, refused_image, StarObservations
@@ -64,14 +54,6 @@ _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
 # Damaged bytes are parsed as an arbitrary record, so the exceptions have no common base class.
 _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
-_OF_IMAGES = (
-    ': starcal calibrate or init takes images alone; starcal import makes a bag of image files and'
-    ' attitudes'
-)
-# Topics of other types may be unknown to the converter, which then stops.
-_CONVERTED = frozenset(
-    [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES, VELOCITY_TYPE, TEMPERATURE_TYPE]
-)
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
@@ -337,10 +319,11 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         else:
             raise BagError(f'{path}: no such bag')
     for file in files:
-        with errors_as(BagError, file):  # opening a pipe would wait for its writer
-            kind = kind_of(file)
-        if kind is not MCAP:
-            raise BagError(f'{file}: not an MCAP bag{_instead(file, kind)}')
+        # Opening a pipe would wait for its writer.
+        with errors_as(BagError, file), regular_file(file) as stream:
+            is_mcap = stream.read(len(MAGIC)) == MAGIC
+        if not is_mcap:
+            raise NotABag(f'{file}: not an MCAP bag', file)
     # A shell sorts rec_10 before rec_2.
     return sorted(dict.fromkeys(files), key=_first_ns)
 
@@ -509,23 +492,13 @@ def _files_of_folder(folder: Path) -> list[Path]:
     if not files:
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside else ''
-        raise BagError(f'{folder}: no .mcap files in the folder{_instead_of_any(here) or near}')
+        raise NotABag(f'{folder}: no .mcap files in the folder{near}', folder)
     missing = [name for name in names if not (folder / name).is_file()]
     if missing and listed:
         packed = (folder / f'{missing[0]}.zstd').is_file()
         remedy = f': zstd -d {shlex.quote(str(folder))}/*.zstd' if packed else ''
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing{remedy}')
     return files
-
-
-def _instead_of_any(files: Iterable[Path]) -> str:
-    """End of an error message on a folder without MCAP files: the first file that is of use."""
-    for file in files:
-        with contextlib.suppress(OSError, ValueError):
-            kind = SQLITE_BAG if file.suffix == '.db3' else kind_of(file)
-            if kind.is_image or kind.instead or kind in (SQLITE_BAG, ROS_1_BAG):
-                return f', but {file.name}:{_instead(file, kind).removeprefix(" but")}'
-    return ''
 
 
 def _metadata(path: Path) -> tuple[list[str], str]:
@@ -548,33 +521,6 @@ def _is_inside(name: object) -> bool:
     if not isinstance(name, str) or len(name) > _LONGEST_NAME:
         return False
     return not Path(name).is_absolute() and '..' not in Path(name).parts
-
-
-def _instead(file: Path, kind: FileKind) -> str:
-    """End of an error message on a file that is no MCAP bag: what it is, and what helps."""
-    if kind.is_image:
-        return f' but {kind.name}{_OF_IMAGES}'
-    if kind.instead:
-        return f' but {kind.name}: {kind.instead.replace("FILE", shlex.quote(str(file)))}'
-    if kind not in (SQLITE_BAG, ROS_1_BAG):
-        return ''
-    # rosbags converts the folder with its metadata.yaml, not the file in it.
-    source = file.parent if kind is SQLITE_BAG else file
-    command = ['rosbags-convert', '--src', str(source)]
-    command += ['--dst', str(source.with_name(f'{source.stem}_mcap')), '--dst-storage', 'mcap']
-    if names := _convertible(source):
-        command += ['--include-topic', *names]
-    return f' but {kind.name}: {shlex.join(command)} makes one'
-
-
-def _convertible(source: Path) -> list[str]:
-    """Topics that starcal reads of a bag of another kind; none where it cannot be opened."""
-    from rosbags.highlevel import AnyReader  # seldom needed, slow to load
-
-    # The exceptions of a damaged bag have no common base class.
-    with contextlib.suppress(Exception), AnyReader([source], default_typestore=typestore()) as bag:
-        return sorted(name for name, topic in bag.topics.items() if topic.msgtype in _CONVERTED)
-    return []
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

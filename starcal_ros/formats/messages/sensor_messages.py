@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.file_kinds import has_surplus, png_header, PNG_HEADER_BYTES
+from starcal_ros.formats.image_headers import has_surplus, png_header, PNG_HEADER_BYTES
 from starcal_ros.formats.messages.message_codec import (
     IMAGE_TYPE,
     Make,

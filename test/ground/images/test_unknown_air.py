@@ -13,7 +13,7 @@ from random_pointings import honesty  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.from_stars import options_of, pinhole
-from starcal_ground.images.unknown_air import with_air
+from starcal_ground.images.unknown_air import refracted, with_air, zenith_of
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import project
@@ -23,11 +23,9 @@ from starcal_ros.estimation.unknowns import Refraction
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.sky.astrometry import (
     apparent_directions,
-    refracted,
     SiteOptions,
     standard_pressure_hpa,
     through_the_air,
-    zenith_of,
 )
 from starcal_ros.sky.catalog import load_catalog
 

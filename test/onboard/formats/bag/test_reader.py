@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 import yaml
 
 from starcal_ground.bag_writer import BagWriter, image_to_message
+from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.formats.bag import writer as writer_module
@@ -204,10 +205,11 @@ def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) 
     if content is not None:
         path.write_bytes(content)
     path = tmp_path / name.split('/')[0]
-    with pytest.raises(BagError, match=text) as error:
+    with pytest.raises(BagError) as error:
         bag_reader.topics([path])
-    assert str(path) in str(error.value)
-    assert '\n' not in str(error.value)
+    said = explained(error.value)
+    assert str(path) in said and text in said
+    assert '\n' not in said
 
 
 def test_split_bag_is_read_in_order(tmp_path: Path) -> None:

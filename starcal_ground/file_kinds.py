@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Kind of a file by its content, and size of an image before it is decoded.
+Kind of a file by its content: images, bags, and what people give in their place.
 
 The first bytes decide, not the name.  Each kind that is not read names the command that makes a
 readable file of it.
@@ -8,27 +8,32 @@ readable file of it.
 
 from __future__ import annotations
 
-import bz2
-from collections.abc import Mapping
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
-import struct
-from typing import NamedTuple
-import zlib
+import shlex
 
+from starcal_ros.errors import NotABag, StarcalError
+from starcal_ros.formats.bag.typestore import typestore
+from starcal_ros.formats.image_headers import is_fits
+from starcal_ros.formats.messages.message_codec import (
+    ATTITUDE_TYPES,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.untrusted import regular_file
 
 _START_BYTES = 512
-_BLOCK_BYTES = 2**20  # bzip2 gives its first byte after a block of 900 kB
-PNG_HEADER_BYTES = 33
-_PNG_START = b'\x89PNG\r\n\x1a\n\0\0\0\rIHDR'
-_PNG_CHUNK = struct.Struct('>I4s')  # length, name
-_PNG_MOST_CHUNKS = 100_000
-# Colour type -> channels; a palette is decoded to three colours.
-_PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
-_WIDTH, _HEIGHT, _CHANNELS = 256, 257, 277  # tags of TIFF 6.0
-_TIFF_TYPES = {3: 'H', 4: 'I'}
-_TIFF_MOST_ENTRIES = 1000
+_OF_IMAGES = (
+    ': starcal calibrate or init takes images alone; starcal import makes a bag of image files and'
+    ' attitudes'
+)
+# Topics of other types may be unknown to the converter, which then stops.
+_CONVERTED = frozenset(
+    [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES, VELOCITY_TYPE, TEMPERATURE_TYPE]
+)
 
 
 @dataclass(frozen=True)
@@ -97,17 +102,14 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
 # Camera raw has the first bytes of a TIFF in these, whose first image is a preview.
 _RAW_ENDINGS = ('.dng', '.nef', '.nrw', '.arw', '.sr2', '.pef', '.srw', '.3fr', '.iiq', '.raw')
 _BMP_RESERVED = slice(6, 10)
-_COMPRESSED_FITS = (b'\x1f\x8b', b'BZh')  # astropy reads them
 
 
 def kind_of(path: Path) -> FileKind:
     """Kind of a regular file; raises OSError, or ValueError in one line for another file."""
+    if is_fits(path):
+        return FITS
     with regular_file(path) as file:
         start = file.read(_START_BYTES)
-        if start.startswith(_COMPRESSED_FITS):
-            start += file.read(_BLOCK_BYTES)
-            if _inflated(start).startswith(b'SIMPLE  ='):
-                return FITS
     if start.startswith(b'BM') and start[_BMP_RESERVED] == bytes(4):
         return FileKind('a BMP image', is_image=True)
     kinds = (kind for at, magic, kind in _MAGIC if start[at : at + len(magic)] == magic)
@@ -115,70 +117,49 @@ def kind_of(path: Path) -> FileKind:
     return RAW if kind is TIFF and path.name.lower().endswith(_RAW_ENDINGS) else kind
 
 
-def _inflated(start: bytes) -> bytes:
-    """First bytes of the content of a file compressed by gzip or bzip2."""
-    is_gzip = start.startswith(b'\x1f\x8b')
-    try:
-        if is_gzip:
-            return zlib.decompressobj(31).decompress(start, 64)
-        return bz2.BZ2Decompressor().decompress(start, 64)
-    except (zlib.error, OSError):
-        return b''
+def explained(error: StarcalError) -> str:
+    """Text of an error; where a bag was expected, with what is there, and what helps."""
+    if isinstance(error, NotABag):
+        place = error.place
+        with contextlib.suppress(OSError, ValueError):
+            instead = _instead_of_any(place) if place.is_dir() else _instead(place, kind_of(place))
+            if instead:
+                return f'{str(error).partition(" (did")[0]}{instead}'
+    return str(error)
 
 
-class Header(NamedTuple):
-    """Size of an image file, px, and its channels."""
-
-    width: int
-    height: int
-    channels: int
-
-
-def png_header(content: bytes) -> Header | None:
-    """Header at the start of a PNG (PNG 1.2, section 4.1.1); None if it is not a PNG."""
-    if content[:16] != _PNG_START or len(content) < PNG_HEADER_BYTES:
-        return None
-    width, height, _, colour = struct.unpack_from('>IIBB', content, 16)
-    return Header(width, height, _PNG_CHANNELS.get(colour, 0))
+def _instead_of_any(folder: Path) -> str:
+    """The first file of use in a folder without MCAP files."""
+    for file in sorted(folder.iterdir()):
+        with contextlib.suppress(OSError, ValueError):
+            kind = SQLITE_BAG if file.suffix == '.db3' else kind_of(file)
+            if kind.is_image or kind.instead or kind in (SQLITE_BAG, ROS_1_BAG):
+                return f', but {file.name}:{_instead(file, kind).removeprefix(" but")}'
+    return ''
 
 
-def has_surplus(content: bytes, header: Header) -> bool:
-    """
-    True if a PNG inflates to far more than its pixels, which a decoder would throw away.
-
-    A megabyte of compressed data can hold a gigabyte: seconds for nothing.
-    """
-    most = 2 * (2 * header.width * header.channels + 8) * header.height  # of 16 bit, interlaced
-    inflate, at, size = zlib.decompressobj(), 8, 0
-    for _ in range(_PNG_MOST_CHUNKS):
-        if at + _PNG_CHUNK.size > len(content):
-            return False
-        length, name = _PNG_CHUNK.unpack_from(content, at)
-        at += _PNG_CHUNK.size
-        if name == b'IDAT':
-            try:
-                size += len(inflate.decompress(content[at : at + length], most - size + 1))
-            except zlib.error:
-                return False  # the decoder refuses it
-            if size > most:
-                return True
-        at += length + 4  # its checksum
-    return True
+def _instead(file: Path, kind: FileKind) -> str:
+    """End of an error message on a file that is no MCAP bag: what it is, and what helps."""
+    if kind.is_image:
+        return f' but {kind.name}{_OF_IMAGES}'
+    if kind.instead:
+        return f' but {kind.name}: {kind.instead.replace("FILE", shlex.quote(str(file)))}'
+    if kind not in (SQLITE_BAG, ROS_1_BAG):
+        return ''
+    # rosbags converts the folder with its metadata.yaml, not the file in it.
+    source = file.parent if kind is SQLITE_BAG else file
+    command = ['rosbags-convert', '--src', str(source)]
+    command += ['--dst', str(source.with_name(f'{source.stem}_mcap')), '--dst-storage', 'mcap']
+    if names := _convertible(source):
+        command += ['--include-topic', *names]
+    return f' but {kind.name}: {shlex.join(command)} makes one'
 
 
-def tiff_header(content: bytes) -> Header | None:
-    """Header of the first image of a TIFF (TIFF 6.0, section 2); None if it is not a TIFF."""
-    order = {b'II*\0': '<', b'MM\0*': '>'}.get(content[:4])
-    if order is None:
-        return None
-    tags = {_CHANNELS: 1}
-    try:
-        (start,) = struct.unpack_from(f'{order}I', content, 4)
-        (count,) = struct.unpack_from(f'{order}H', content, start)
-        for at in range(start + 2, start + 2 + min(count, _TIFF_MOST_ENTRIES) * 12, 12):
-            tag, kind, number = struct.unpack_from(f'{order}HHI', content, at)
-            if tag in (_WIDTH, _HEIGHT, _CHANNELS) and number == 1:
-                (tags[tag],) = struct.unpack_from(f'{order}{_TIFF_TYPES[kind]}', content, at + 8)
-        return Header(tags[_WIDTH], tags[_HEIGHT], tags[_CHANNELS])
-    except (struct.error, KeyError):
-        return None
+def _convertible(source: Path) -> list[str]:
+    """Topics that starcal reads of a bag of another kind; none where it cannot be opened."""
+    from rosbags.highlevel import AnyReader  # seldom needed, slow to load
+
+    # The exceptions of a damaged bag have no common base class.
+    with contextlib.suppress(Exception), AnyReader([source], default_typestore=typestore()) as bag:
+        return sorted(name for name, topic in bag.topics.items() if topic.msgtype in _CONVERTED)
+    return []

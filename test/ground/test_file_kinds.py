@@ -20,12 +20,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE
 from starcal_ros.records import Image
 
-TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
+TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 ATTITUDE = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -106,17 +107,20 @@ def test_the_command_that_is_named_makes_a_bag_that_is_read(
     write(tmp_path / name)
     with pytest.raises(BagError) as error:
         reader.topics([tmp_path / name])
-    assert '\n' not in str(error.value)
-    run_remedy(str(error.value), tmp_path)
+    words = explained(error.value)
+    assert '\n' not in words
+    run_remedy(words, tmp_path)
     assert any(topic.type_name == ATTITUDE_TYPE for topic in reader.topics([tmp_path / read]))
 
 
 def test_a_file_of_a_sqlite_bag_is_converted_as_its_folder(tmp_path: Path) -> None:
     write_sqlite(tmp_path / 'flight')
     (file,) = (tmp_path / 'flight').glob('*.db3')
-    with pytest.raises(BagError, match="--include-topic '/star tracker/attitude'") as error:
+    with pytest.raises(BagError) as error:
         reader.topics([file])
-    run_remedy(str(error.value), tmp_path)
+    words = explained(error.value)
+    assert "--include-topic '/star tracker/attitude'" in words
+    run_remedy(words, tmp_path)
     assert reader.topics([tmp_path / 'flight_mcap'])
 
 
@@ -139,8 +143,9 @@ def test_another_file_is_named_with_the_command_that_helps(
     (tmp_path / name).write_bytes(content)
     with pytest.raises(BagError) as error:
         reader.topics([tmp_path if in_a_folder else tmp_path / name])
-    assert words.format(file=shlex.quote(str(tmp_path / name))) in str(error.value)
-    assert in_a_folder == ('no .mcap files in the folder, but' in str(error.value))
+    said = explained(error.value)
+    assert words.format(file=shlex.quote(str(tmp_path / name))) in said
+    assert in_a_folder == ('no .mcap files in the folder, but' in said)
 
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
