@@ -24,6 +24,7 @@ _INVALID = [math.nan] * 4
 _RUNS = 3  # the present clock, the previous one, and a wrong stamp between
 ARC_S = 1.0
 """Half of the time over which samples give the rate at an image."""
+_MOST_OF_A_RATE = 100  # samples: of correlated errors more show no more
 # Correlation lengths of the errors of samples: the slope over two seconds is worst for the last.
 _MEMORIES_S = (1e-6, 0.1, 0.5)
 
@@ -303,7 +304,8 @@ class _Run:
             places = low + self._valid(low, high).nonzero()[0][-2:]
         if len(places) < 2:
             raise ImageRefused('no_attitude', 'no attitude sample before that of the image')
-        return tuple(self._sample(int(k)) for k in places)
+        thinned = places[:: -(-len(places) // _MOST_OF_A_RATE)]
+        return tuple(self._sample(int(k)) for k in thinned)
 
     def expects(self, time_ns: int) -> bool:
         """See `AttitudeHistory.expects`."""

@@ -53,6 +53,7 @@ MAY_BE_INFINITE = frozenset(
         *(
             'temperature_degc',
             'star_tracker_rate_rad_s',
+            'star_tracker_rate_sigma_rad_s',
             'velocity_sigma_m_s',
             'zenith_icrf',
             'predicted_sigma',

@@ -353,6 +353,15 @@ def test_the_sigma_of_a_rate_is_its_scatter(
     assert low < np.sqrt(np.mean(np.square(in_sigma))) < high
 
 
+def test_a_fast_star_tracker_is_thinned() -> None:
+    rate_rad_s = np.array([0.01, -0.03, 0.02])
+    held = turning(rate_rad_s, tuple(np.arange(-1.2, 1.2, 0.002)))
+    samples = held._found(lambda run: run.arc(START_NS, 2.0))
+    assert 90 <= len(samples) <= 100 and len(held) == 1200
+    found, _ = held.rate_at(START_NS, 2.0, SIGMA_RAD)
+    np.testing.assert_allclose(found, rate_rad_s, atol=1e-9)
+
+
 def test_a_camera_that_speeds_up_has_the_rate_of_the_image() -> None:
     """Samples up to 0.2 s after the image: their mean rate is that of 0.4 s before."""
     at_s = np.arange(-0.95, 0.2, 0.1)
