@@ -304,8 +304,12 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
     if not reading.is_off(prior, setup):
         return []
     tilt_deg, roll_deg = (math.degrees(angle) for angle in reading.off_by(prior))
-    away = f'{tilt_deg:.1f} degrees away from it and is rolled by {roll_deg:.1f} degrees'
-    evidence = [f'prior_alignment points {away}']
+    away = f'{tilt_deg:.3g} degrees away from it and is rolled by {roll_deg:.3g} degrees'
+    stated = setup.identification.prior_alignment_sigma_deg
+    evidence = [
+        f'prior_alignment points {away}',
+        f'images are searched to 3 sigma of prior_alignment_sigma_deg: {stated:g}',
+    ]
     if turns := reading.quarter_turns(prior):
         degrees = 180.0 if turns == 2 else 90.0
         way = {1: ' counterclockwise', 2: '', 3: ' clockwise'}[turns]
@@ -317,8 +321,8 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
     if (w_first.inv() * alignment).magnitude() < _SAME_ALIGNMENT_RAD:
         evidence.append('prior_alignment is given with w first')
     sentence = (
-        f'prior_alignment points {tilt_deg:.1f} degrees away from where the images show the'
-        f' camera, and is rolled by {roll_deg:.1f} degrees.'
+        f'prior_alignment points {tilt_deg:.3g} degrees away from where the images show the'
+        f' camera, and is rolled by {roll_deg:.3g} degrees.'
     )
     return [Diagnosis('prior_alignment', values, sentence, tuple(evidence), mend)]
 
