@@ -56,6 +56,8 @@ _SMOOTH_RAD = math.radians(60.0)  # correlation length of errors that depend on 
 _POINTING, _NOISE, _TRACKER, _CHANGE, _STARS, _LENS, _VELOCITY, _RATE, _OUTLIERS = range(80, 89)
 _SAMPLES = 89
 _GAP_S = 2.0  # the default of the package
+_BLENDS = 90
+_BLEND_FREEDOM = 3.0  # degrees of freedom: medians of displacements are half of their rms
 _HALF_WIDTH_PX = 648.0
 _HALF_HEIGHT = 1024 / 1296  # half widths
 _CORNER = math.hypot(1.0, _HALF_HEIGHT)
@@ -163,6 +165,7 @@ class World:
     wander_arcsec: float = 0.0  # star tracker error correlated in time, each axis
     smooth_arcsec: float = 0.0  # star tracker error that depends on the attitude, each axis
     star_arcsec: float = 0.0  # error of the place of each star, each axis
+    blend: float = 0.0  # error of each star by fainter ones, over the sigma of its centroid
     bad_stars: int = 0  # catalog stars ten pixels off
     outlier_fraction: float = 0.0
     principal_point_px: tuple[float, float] = (0.0, 0.0)  # truth less prior
@@ -367,7 +370,15 @@ def _tracker_errors_rad(world: World, seed: int, camera_from_icrf: Rotation) -> 
 def _star_offsets_rad(world: World, scenario: Scenario, camera_from_icrf: Rotation) -> Floats:
     """Errors (n, 3) of the places of all catalog stars; the part along the direction is moot."""
     catalog, rng = load_catalog(None, world.magnitude_limit), _stream(scenario.seed, _STARS)
-    offsets = world.star_arcsec * ARCSECOND_RAD * rng.normal(size=(len(catalog), 3))
+    size_rad = np.full(len(catalog), world.star_arcsec * ARCSECOND_RAD)
+    offsets = size_rad[:, None] * rng.normal(size=(len(catalog), 3))
+    if world.blend:
+        # Most stars have hardly a neighbour within their PSF, and some a bright one: Student's t.
+        blended = _stream(scenario.seed, _BLENDS)
+        tail = np.sqrt(_BLEND_FREEDOM / blended.chisquare(_BLEND_FREEDOM, len(catalog)))
+        sigma_px = _sigma_px(_electrons(scenario, catalog.magnitude))
+        tail *= world.blend * sigma_px / scenario.truth.camera.parameters[0]
+        offsets += tail[:, None] * blended.normal(size=(len(catalog), 3))
     if world.bad_stars:
         near = [cone(catalog, axis, 0.1) for axis in camera_from_icrf.as_matrix()[:, 2]]
         bad = rng.choice(np.unique(np.concatenate(near)), world.bad_stars, replace=False)
@@ -405,8 +416,8 @@ def _image(
     seen = aberrated(directions, made.velocity_m_s) + offset_rad[near]
     pixels = _pixels(made, made.rate_rad_s[k], own, seen @ R.T)
     pixels += _outliers_px(world, len(pixels), _stream(seed, _OUTLIERS, k))
-    electrons = scenario.detector.zero_point_electrons * 10 ** (-0.4 * stars.magnitude)
-    sigma_px = _PSF_SIGMA_PX * np.sqrt(electrons + _NOISE_ELECTRONS**2) / electrons
+    electrons = _electrons(scenario, stars.magnitude)
+    sigma_px = _sigma_px(electrons)
     noise_px = sigma_px[:, None] * _stream(seed, _NOISE, k).normal(size=pixels.shape)
     inside = np.all((pixels > 0) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
     scene = Scene(
@@ -421,6 +432,15 @@ def _image(
         star_tracker_rate_rad_s=scenario.truth.star_tracker_from_camera.apply(made.rate_rad_s[k]),
         velocity_sigma_m_s=math.nan if world.velocity_m_s else GIVEN_SIGMA_M_S,
     )
+
+
+def _electrons(scenario: Scenario, magnitude: Floats) -> Floats:
+    return np.asarray(scenario.detector.zero_point_electrons * 10 ** (-0.4 * magnitude))
+
+
+def _sigma_px(electrons: Floats) -> Floats:
+    """1-sigma (n,) of centroids of stars by their light."""
+    return np.asarray(_PSF_SIGMA_PX * np.sqrt(electrons + _NOISE_ELECTRONS**2) / electrons)
 
 
 def aberrated(directions: Floats, velocity_m_s: Floats) -> Floats:
@@ -485,6 +505,8 @@ WORLDS = {
     'catalog03_bright24': dataclasses.replace(_BRIGHT, images=24, star_arcsec=0.3),
     'catalog1_bright60': dataclasses.replace(_BRIGHT60, pointing='fields4', star_arcsec=0.1),
     'catalog03_drift60': dataclasses.replace(_BRIGHT60, pointing='small', star_arcsec=0.3),
+    'blends_fields60': World(60, 'fields4', blend=0.4),
+    'blends_drift60': World(60, 'small', blend=0.4),
     'fields4_cat': World(60, 'fields4', star_arcsec=3.0),
     'wave11_050': World(lens=partial(ripple, 0.05, 11.0)),
     'wave14_050': World(lens=partial(ripple, 0.05, 14.0)),

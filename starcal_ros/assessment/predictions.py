@@ -2,11 +2,15 @@
 """
 Predictions of what was left out: images, stars and cells of the detector, from all others.
 
-The estimate without image k is one linear step from the posterior.  N is the information on the
-shared unknowns with their priors, M_k the part of image k with its own unknowns eliminated, J
-the derivatives by the shared unknowns, K those by the unknowns of the image, W their prior and
-``G = 1 - K (K' K + W)^-1 K'``: the residuals r become ``G r + G J (N - M_k)^-1 J' G r`` and have
-the covariance ``G + G J (N - M_k)^-1 J' G``.  Stars and cells are predicted as groups: the sum of
+The estimate without image k is one linear step from the posterior at the most likely amplitudes.
+N is the information on the shared unknowns with their priors, M_k the part of image k with its own
+unknowns eliminated, J the derivatives by the shared unknowns, K those by the unknowns of the
+image, W their prior and ``G = 1 - K (K' K + W)^-1 K'``: the residuals r, whitened by the working
+variance, become ``G r + G J (N - M_k)^-1 J' G r`` and have the covariance ``G + G (V - 1) G + G J
+((N - M_k)^-1 + E) J' G``, where V is the variance of an observation over the working one and E the
+covariance of the others by the errors that observations share, beyond the working weights.  (The
+posterior averaged over the amplitudes has wide tails: less an image, its inverse is nearly
+singular.)  Stars, cells and stars alike are predicted as groups: the sum of
 the residuals of a group has the variance of their noise and of the error that they share, less
 what the unknowns follow.  The mean square over the predicted variance is 1 where the model and its
 sigmas hold, in every part of the data.
@@ -24,12 +28,12 @@ from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
-from starcal_ros.estimation.posterior import common_shape
 from starcal_ros.records import ResidualBin
 
 _BINS = 4  # of each kind: corners and faint stars stand apart, and each holds a quarter
 _FEWEST_STARS = 30  # of a bin: its normalised residual is known to 9 %
 _FEWEST_IMAGES = 4  # three may determine no calibration without one of them
+_NO_EFFECT = 1e-3  # information on a coefficient times its prior variance
 _CELLS = 24  # of the detector along its width
 
 
@@ -37,8 +41,9 @@ def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
     """
     Return the normalised residuals of what others predict, by parts of the data.
 
-    Images by radius, magnitude and time; then stars by the number of their images, and cells of
-    the detector by radius.  Empty with fewer than four images.
+    Images by radius, magnitude and time; then stars by the number of their images, cells of the
+    detector by radius, and stars of like brightness of an image by magnitude.  Empty with fewer
+    than four images.
     """
     table = estimate.table
     if table.image_count < _FEWEST_IMAGES:
@@ -71,42 +76,56 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     """
     found: Floats = np.full(len(estimate.table), np.nan)
     expected: Floats = np.full(len(estimate.table), np.nan)
-    posterior = estimate.posterior
-    # The sidereal time of an image that is left out is not known from the others: kept as found.
-    part = np.setdiff1d(posterior.estimated, estimate.linear.layout.of(['site']))
-    # A change that all images share moves no prediction of one from the others.
-    shared = common_shape(estimate.linear.layout, posterior.common_shape_px2)
-    covariance = (posterior.covariance - shared)[np.ix_(part, part)]
-    shown = np.flatnonzero(np.diag(covariance) > 0)
-    part, covariance = part[shown], covariance[np.ix_(shown, shown)]
-    # Coefficients of the field that their prior holds at zero say nothing of an image.
-    follow = _followed(estimate, part)
-    part, covariance = part[follow], covariance[np.ix_(follow, follow)]
-    information = inverse(covariance)
+    part, mean, information = _at_most_likely(estimate)
+    errors = estimate.posterior.errors
+    assert errors is not None
+    root = errors.root[part]
+    excess = root @ errors.excess @ root.T
+    variance_px2 = estimate.weights.variance_px2
+    own_share = variance_px2 / (variance_px2 + estimate.weights.inflation_px2)
     of_image = estimate.linear.layout.image_precision(estimate.posterior.shape_sigma_px)
-    for rows, columns, own, residual in _images(estimate, part):
-        predicted = _predicted(columns, own, residual, information, np.diag(of_image))
+    for rows, columns, own, residual in _images(estimate, part, mean):
+        V = own_share[rows]
+        predicted = _predicted(
+            columns, own, residual, np.tile(V, 2), information, np.diag(of_image), excess
+        )
         if predicted is not None:
-            found[rows], expected[rows] = predicted
+            found[rows], expected[rows] = predicted[0] / V, predicted[1] / V
     return found, expected
 
 
-def _followed(estimate: Estimate, part: Indices) -> Indices:
-    """Return which unknowns move pixels by more than a thousandth of the noise of a star."""
-    layout = estimate.linear.layout
-    variance = np.diag(estimate.posterior.covariance)[part]
-    weight = np.zeros(layout.count)
-    weight[layout.places['field']] = np.diag(estimate.sums.field_information)
-    of_field = np.isin(part, np.arange(layout.count)[layout.places['field']])
-    return np.flatnonzero(~of_field | (variance * weight[part] > 1e-3))
+def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
+    """Return unknowns (d,), means (P,) of all and information (d, d) at the best amplitudes."""
+    posterior, layout = estimate.posterior, estimate.linear.layout
+    entry, field = layout['field'], layout.of(['field'])
+    assert entry.octave is not None and entry.term is not None
+    sigma_px = entry.sigma * np.exp(posterior.field.log_px)[entry.octave]
+    term, precision = np.zeros(layout.count), layout.prior_precision.copy()
+    term[field], precision[field] = entry.term * np.exp(posterior.term.log_px[0]), sigma_px**-2.0
+    # The sidereal time of an image that is left out is not known from the others: kept as found.
+    # Coefficients of the field that their prior holds at zero say nothing of an image.
+    shown = (sigma_px**2 + term[field] ** 2) * np.diag(posterior.information)[field]
+    kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])
+    part, held = np.setdiff1d(posterior.estimated, kept), np.intersect1d(posterior.estimated, kept)
+    own = precision[part]
+    pull = own * term[part]
+    information = posterior.information[np.ix_(part, part)] + np.diag(own)
+    information -= np.outer(pull, pull) / (1.0 + term[part] @ pull)
+    mean = posterior.mean.copy()
+    right = posterior.gradient[part] - own * layout.prior_offset[part]
+    right -= posterior.information[np.ix_(part, held)] @ mean[held]
+    mean[part] = inverse(information) @ right
+    return part, mean, information
 
 
-def _images(estimate: Estimate, part: Indices) -> Iterator[tuple[Indices, Floats, Floats, Floats]]:
+def _images(
+    estimate: Estimate, part: Indices, mean: Floats
+) -> Iterator[tuple[Indices, Floats, Floats, Floats]]:
     """Yield rows, columns (2 n, d), own columns (2 n, b) and residuals (2 n,) of each image."""
-    found = estimate.posterior
+    of_images = estimate.posterior.own - estimate.posterior.back @ mean
     for chunk, shared, own, residual in star_rows(estimate.linear):
-        left = residual - shared @ found.mean
-        left -= np.einsum('mij,mj->mi', own, found.of_images[chunk.image])
+        left = residual - shared @ mean
+        left -= np.einsum('mij,mj->mi', own, of_images[chunk.image])
         m, _, n = chunk.direction_icrf.shape
         real = chunk.whitener[0].reshape(m, n) > 0
         for i, rows in enumerate(chunk.row.reshape(m, n)):
@@ -115,14 +134,21 @@ def _images(estimate: Estimate, part: Indices) -> Iterator[tuple[Indices, Floats
 
 
 def _predicted(
-    J: Floats, K: Floats, r: Floats, information: Floats, own_prior: Floats
+    J: Floats,
+    K: Floats,
+    r: Floats,
+    V: Floats,
+    information: Floats,
+    own_prior: Floats,
+    excess: Floats,
 ) -> tuple[Floats, Floats] | None:
     """
     Squared residuals (n,) and their expected values of an image that the others predict.
 
     Derivatives J (2 n, d) by the shared unknowns and K (2 n, b) by those of the image, residuals r
-    (2 n,), N (d, d) and W (b, b) as at the top of this module; components u before v.  None where
-    the image alone determines something, or has too few stars for its rotation.
+    (2 n,), V (2 n,), N (d, d), W (b, b) and E (d, d) as at the top of this module; components u
+    before v.  None where the image alone determines something, or has too few stars for its
+    rotation.
     """
     n = len(r) // 2
     try:
@@ -133,15 +159,18 @@ def _predicted(
     except np.linalg.LinAlgError:
         return None
     Gr = Gr + GJ @ cho_solve(without, GJ.T @ r)
-    # Diagonals of G and of G J (N - M)^-1 J' G.  The inverse of the small matrix is formed, as its
-    # product with many rows takes a tenth of the time of their solution.
-    variance = 1.0 - ((K @ cho_solve(factor, np.eye(K.shape[1]))) * K).sum(axis=1)
-    variance += ((GJ @ cho_solve(without, np.eye(J.shape[1]))) * GJ).sum(axis=1)
+    # Diagonals.  The inverse of the small matrix is formed, as its product with many rows takes a
+    # tenth of the time of their solution.
+    back = K @ cho_solve(factor, np.eye(K.shape[1]))
+    leverage, beyond = (back * K).sum(axis=1), V - 1.0
+    variance = 1.0 - leverage + beyond * (1.0 - 2.0 * leverage)
+    variance += ((back @ ((K.T * beyond) @ K)) * back).sum(axis=1)
+    variance += ((GJ @ (cho_solve(without, np.eye(J.shape[1])) + excess)) * GJ).sum(axis=1)
     return (Gr**2).reshape(2, n).sum(axis=0), variance.reshape(2, n).sum(axis=0)
 
 
 def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBin]:
-    """Bins of stars and of cells of the detector: sums of residuals over their predicted sigma."""
+    """Bins of stars, cells and stars of like brightness: sums over their predicted sigma."""
     rows = np.flatnonzero(used)
     residual_px = estimate.residual_px[rows]
     covariance = estimate.covariance_px2[rows]
@@ -154,34 +183,36 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
     index = np.floor((pixels + 0.5) / size_px).astype(np.int64)
     cell = np.unique(index[:, 0] * (1 << 20) + index[:, 1], return_inverse=True)[1]
     star = np.unique(estimate.table.star[rows], return_inverse=True)[1]
-    place = sum(e.variance_px2 for e in estimate.shared_errors if e.of_star)
-    fine = sum(e.variance_px2 for e in estimate.shared_errors if not e.of_star)
+    magnitude = estimate.table.magnitude[rows].astype(np.float64)
+    edges = np.quantile(magnitude, np.linspace(0.0, 1.0, _BINS + 1)[1:-1])
+    alike = estimate.table.image[rows] * _BINS + np.searchsorted(edges, magnitude)
+    alike = np.unique(alike, return_inverse=True)[1]
+    of_stars, *finer = (error.share_px2[rows] for error in estimate.shared_errors)
+    fine = np.sum(finer, axis=0)
+    weight = 1.0 / variance
     bins = []
-    along: Floats
     for by, group, value, shared, along in (
-        ('star', star, on_sky, place, np.bincount(star).astype(np.float64)),
-        ('cell', cell, residual_px, fine, _radius_px(estimate, _centres(cell, pixels))),
+        ('star', star, on_sky, of_stars, np.bincount(star)[star]),
+        ('cell', cell, residual_px, fine, _radius_px(estimate, pixels)),
+        ('brightness', alike, residual_px, 0.0 * fine, magnitude),
     ):
-        weight = 1.0 / variance
-        total = np.bincount(group, weight)
-        summed = np.stack([np.bincount(group, weight * v) for v in value.T], axis=1)
-        noise = np.bincount(group, weight * free)
-        predicted = noise + shared * (total**2 - np.bincount(group, weight**2))
-        if by == 'cell':  # a star that comes again in its cell brings its error of place again
+        count = np.bincount(group)
+        predicted = np.bincount(group, weight * free) + _of_pairs(group, weight, shared)
+        if by == 'cell':  # a star that comes again in its cell brings its error again
             again = np.unique(cell * (int(star.max()) + 1) + star, return_inverse=True)[1]
             first = np.unique(again, return_index=True)[1]
-            twice = np.bincount(again, weight) ** 2 - np.bincount(again, weight**2)
-            predicted += place * np.bincount(cell[first], twice, len(predicted))
-        several = np.bincount(group) > 1
-        squared = (summed**2).sum(axis=1)
-        bins += _bins(by, along, squared, np.asarray(2.0 * predicted, np.float64), several)
+            twice = _of_pairs(again, weight, of_stars)
+            predicted += np.bincount(cell[first], twice, len(predicted))
+        squared: Floats = np.asarray(sum(np.bincount(group, weight * v) ** 2 for v in value.T))
+        mean = np.bincount(group, along) / count
+        bins += _bins(by, mean, squared, np.asarray(2.0 * predicted, np.float64), count > 1)
     return bins
 
 
-def _centres(group: Indices, pixels: Floats) -> Floats:
-    """Return the mean pixel (g, 2) of each group."""
-    count = np.bincount(group)
-    return np.stack([np.bincount(group, p) / count for p in pixels.T], axis=1)
+def _of_pairs(group: Indices, weight: Floats, share_px2: Floats) -> Floats:
+    """Return the variances of weighted sums over groups by what their members share in pairs."""
+    each = weight * np.sqrt(share_px2)
+    return np.asarray(np.bincount(group, each) ** 2 - np.bincount(group, each**2))
 
 
 def _bins(

@@ -33,6 +33,7 @@ from starcal_ros.estimation.levenberg_marquardt import NotObservable
 # micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
 # departures matter, costs a sound camera up to 30 % of its sigma.
 LOG_CENTRE, LOG_SIGMA = math.log(1e-5), 4.0
+UNSTATED = LOG_CENTRE, LOG_SIGMA
 # An octave of the field is smaller than the one before, within a factor of e.
 OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
@@ -78,18 +79,26 @@ class Averaged:
     term: Amplitudes
 
 
-def octave_prior(count: int) -> tuple[Floats, Floats]:
-    """Mean (count,) and precision (count, count) of the logarithms of octaves in a chain."""
-    mean: Floats = LOG_CENTRE + OCTAVE_STEP * np.arange(count, dtype=np.float64)
+def octave_prior(count: int, first: tuple[float, float] = UNSTATED) -> tuple[Floats, Floats]:
+    """
+    Mean (count,) and precision (count, count) of the logarithms of octaves in a chain.
+
+    ``first``: mean and 1-sigma of that of the first.
+    """
+    mean: Floats = first[0] + OCTAVE_STEP * np.arange(count, dtype=np.float64)
     precision = np.zeros((count, count))
-    precision[0, 0] = LOG_SIGMA**-2
+    precision[0, 0] = first[1] ** -2
     for k in range(1, count):
         precision[k - 1 : k + 1, k - 1 : k + 1] += np.array([[1, -1], [-1, 1]]) / OCTAVE_SIGMA**2
     return mean, precision
 
 
 def field_amplitudes(
-    information: Floats, gradient: Floats, octave: Indices, near: Amplitudes | None = None
+    information: Floats,
+    gradient: Floats,
+    octave: Indices,
+    near: Amplitudes | None = None,
+    first: tuple[float, float] = UNSTATED,
 ) -> Amplitudes:
     """
     Amplitudes of the octaves of a field by Fisher scoring.
@@ -101,9 +110,11 @@ def field_amplitudes(
     octave : (q,)
     near : Amplitudes, optional
         Amplitudes of the round before: the search starts there and from one other place.
+    first : float, float
+        Prior of the first octave, as of `octave_prior`.
     """
     count = int(octave.max()) + 1
-    mean, precision = octave_prior(count)
+    mean, precision = octave_prior(count, first)
     starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in _STARTS_PX]
     if near is not None:
         starts = [near.log_px, starts[1]]
@@ -160,7 +171,12 @@ def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
 
 
 def averaged_field(
-    information: Floats, gradient: Floats, octave: Indices, amplitudes: Amplitudes, term: Floats
+    information: Floats,
+    gradient: Floats,
+    octave: Indices,
+    amplitudes: Amplitudes,
+    term: Floats,
+    first: tuple[float, float] = UNSTATED,
 ) -> Averaged:
     """
     Return the coefficients averaged over a common factor of the amplitudes of the octaves.
@@ -169,7 +185,7 @@ def averaged_field(
     an amplitude of its own; those of the octaves are found without it, since what looks like it
     may be another one.
     """
-    mean, precision = octave_prior(len(amplitudes.log_px))
+    mean, precision = octave_prior(len(amplitudes.log_px), first)
     s = np.exp(amplitudes.log_px)[octave]
     values, vectors = eigh(information * np.outer(s, s), check_finite=False)
     values = np.maximum(values, 0.0)

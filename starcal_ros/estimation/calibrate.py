@@ -21,6 +21,7 @@ from starcal_ros.camera import CameraModel, project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
+from starcal_ros.estimation.amplitudes import UNSTATED
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import (
@@ -96,6 +97,7 @@ _LEAST_SHARE = 0.25  # of a step, so that it still arrives
 _FIRST_SHAPE_PX = 1e-4
 _SPACE_VELOCITY_M_S = 8000.0  # an orbit about the Earth
 _UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
+_LENS_RESIDUAL_LOG_SIGMA = 1.5  # of a residual by a data sheet: it is of the ground, not of flight
 _READOUT_ERROR = 0.01  # of the time by a data sheet: the tolerance of a clock, and rounding
 
 
@@ -336,7 +338,7 @@ def _round(
 
 
 def _assumed(data: Data) -> Assumptions:
-    """Return the priors of velocity, read-out and stamps by the options and the observations."""
+    """Return the priors of what is stated by the options and the observations."""
     options = data.options
     velocity_m_s = options.velocity_sigma_m_s
     if velocity_m_s < 0:
@@ -348,7 +350,10 @@ def _assumed(data: Data) -> Assumptions:
         'unknown': (0.0, _UNKNOWN_READOUT_S),
     }
     readout = readout_s[options.shutter]
-    return Assumptions(velocity_m_s, readout, options.stamp_sigma_s, data.refraction)
+    lens = UNSTATED
+    if options.lens_residual_px:
+        lens = math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA
+    return Assumptions(velocity_m_s, readout, options.stamp_sigma_s, data.refraction, lens)
 
 
 def _refraction(ensemble: Ensemble) -> Refraction | None:

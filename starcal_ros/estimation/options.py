@@ -106,6 +106,13 @@ class CalibrationOptions:
         low=0.0,
         high=3600.0,
     )
+    lens_residual_px: float = option(
+        0.0,
+        'rms residual per axis of the lens model by the ground calibration, accurate to a factor'
+        ' of 4, px; 0: not known',
+        low=0.0,
+        high=0.5,
+    )
     focal_temperature_order: int = option(
         0, 'degree of the focal length polynomial in temperature; 0: constant', low=0, high=2
     )

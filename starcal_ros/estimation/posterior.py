@@ -227,6 +227,7 @@ class _Solver:
         field = layout['field']
         assert field.octave is not None and field.term is not None
         self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
+        self.first = field.log_px
 
     def _of_free(self, arrow: Equations) -> tuple[Floats, Floats]:
         """Return the covariance of all but the field, the field known, and their gradient."""
@@ -248,7 +249,7 @@ class _Solver:
     def amplitudes(self, arrow: Equations, near: Amplitudes | None) -> Amplitudes:
         """Return the amplitudes of the octaves of the field."""
         information, gradient, *_ = self._of_field(arrow)
-        return field_amplitudes(information, gradient, self.octave, near)
+        return field_amplitudes(information, gradient, self.octave, near, self.first)
 
     def solve(
         self, arrow: Equations, amplitudes: Amplitudes
@@ -257,7 +258,7 @@ class _Solver:
         count = self.layout.count
         mean, covariance = np.zeros(count), np.zeros((count, count))
         information, left, free, gradient, back = self._of_field(arrow)
-        field = averaged_field(information, left, self.octave, amplitudes, self.term)
+        field = averaged_field(information, left, self.octave, amplitudes, self.term, self.first)
         mean[self.field] = self.unit * field.mean
         mean[self.free] = free @ gradient - back @ field.mean
         to_free = -back @ field.covariance

@@ -12,6 +12,12 @@ of different members of a group have in common::
 with the posterior mean of s^2 under the prior of amplitudes in place of an estimate.  A linear
 estimator with weights W has the exact covariance ``S^-1 (X' W V W X) S^-1`` under errors of
 covariance V (consider analysis, Schmidt 1966); groups are the off-diagonal part of V.
+
+Sightings i and j of a star share the variance ``c^2 + rho sigma_i sigma_j``: the error of its
+catalog place, and what displaces its centroids in proportion to their own sigma, as stars below
+the limit of the catalog, the phase of the pixel and its colour do.  A few blended stars have most
+of it: each star has a factor on its variance, as the errors of Student's t have (Lange, Little &
+Taylor 1989).
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ import math
 import numpy as np
 from scipy.sparse import csr_array
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
     LOG_CENTRE,
@@ -38,6 +44,9 @@ _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
 _STRIPS = (1 / 48, 1 / 192)  # of the width: height of groups of rows, width of groups of columns
 _NO_EFFECT = 0.01  # of the variance of the mean of a group
+_TAIL = 2.0  # degrees of freedom of the errors of stars
+_ROUNDING = 1e-9  # of sums over pairs, where there are none
+_ROUNDS = 8  # of the factors of stars
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
@@ -54,22 +63,30 @@ class SharedError:
     name : str
     group : (n,) int
         Number of the group of each observation.
-    variance_px2 : float
-        Posterior mean, per axis.
+    share_px2 : (n,)
+        Variance per axis that each observation shares, posterior mean.
     likelihood_ratio : float
         Twice the log likelihood of the best variance against none.
     of_star : bool
         Displacements keep their direction on the sky, not on the detector; they move no pixel.
     effect : float
         Variance of the mean of a group by the shared error, over that by noise.
+    beyond_px2 : (n,) or float
+        Part of ``share_px2`` by which a star differs from others of its brightness.
     """
 
     name: str
     group: Indices
-    variance_px2: float
+    share_px2: Floats
     likelihood_ratio: float
     of_star: bool
     effect: float
+    beyond_px2: Floats | float = 0.0
+
+    @property
+    def variance_px2(self) -> float:
+        """Mean variance per axis that an observation shares."""
+        return float(self.share_px2.mean())
 
     @property
     def matters(self) -> bool:
@@ -123,7 +140,8 @@ def pairs_of(group: Indices, star: Indices) -> Indices:
 
 def shared_errors(
     residual_px: Floats,
-    weight: Floats,
+    variance_px2: Floats,
+    used: Mask,
     groups: Sequence[Groups],
     from_sky: Floats,
     last_octave: tuple[Floats, Floats],
@@ -134,8 +152,9 @@ def shared_errors(
     Parameters
     ----------
     residual_px : (n, 2)
-    weight : (n,)
-        Reciprocal variance of each residual per axis, 1/px^2; 0: not used.
+    variance_px2 : (n,)
+        Variance of each residual per axis.
+    used : (n,) bool
     groups : sequence of Groups
         From `observation_groups`.
     from_sky : (n, 2, 2)
@@ -143,31 +162,115 @@ def shared_errors(
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     """
+    star = groups[0].group
+    sightings = np.maximum(np.bincount(star, used)[star], 1.0)
     on_sky = np.einsum('nba,nb->na', from_sky, residual_px)
-    moments = []
-    for one in groups:
-        residual = on_sky if one.of_one_star is None else residual_px
-        moments.append(pair_moment(residual, weight, one.group, one.of_one_star))
-    octaves = 1 + len(_FINE_OCTAVES)
-    variances = [
-        *chain_means(_PRIOR, moments[:1]),
-        *chain_means(last_octave[1] @ _next_octave(last_octave[0]), moments[1:octaves]),
+    usual_px2: Floats = np.zeros(len(star))
+    for _ in range(2):  # all sightings of a star weigh less, the more they share
+        working_px2 = variance_px2 + (sightings - 1.0) * usual_px2
+        place_px2, rho, of_stars = _of_stars(
+            on_sky, np.where(used, 1.0 / working_px2, 0.0), variance_px2, star
+        )
+        usual_px2 = np.minimum(place_px2 + rho * variance_px2, variance_px2)
+    weight = np.where(used, 1.0 / variance_px2, 0.0)
+    share_px2 = usual_px2 * _factors(on_sky, weight, usual_px2, star)
+    found = [_error(groups[0], weight, share_px2, of_stars, share_px2 - usual_px2)]
+    # Two stars that are in the same strips again and again are one pair.
+    variance_px2 = variance_px2 + sightings * share_px2 - usual_px2
+    weight = np.where(used, 1.0 / variance_px2, 0.0)
+    moments = [
+        pair_moment(residual_px, weight, kind.group, kind.of_one_star) for kind in groups[1:]
     ]
+    octaves = len(_FINE_OCTAVES)
+    variances = chain_means(last_octave[1] @ _next_octave(last_octave[0]), moments[:octaves])
     # Strips of rows and of columns are chains of their own, from the coarser to the finer.
     for first in range(octaves, len(moments), len(_STRIPS)):
         variances += chain_means(_PRIOR, moments[first : first + len(_STRIPS)])
-    used = weight > 0
-    return tuple(
-        SharedError(
-            one.name,
-            np.where(used, one.group, -1),
-            variance,
-            _ratio(*moment),
-            one.of_one_star is None,
-            variance * float((np.bincount(one.group, weight) ** 2).sum() / weight.sum()),
-        )
-        for one, moment, variance in zip(groups, moments, variances, strict=True)
+    for kind, moment, variance in zip(groups[1:], moments, variances, strict=True):
+        ratio = max(moment[0] / moment[1], 0.0) ** 2
+        found.append(_error(kind, weight, np.full(len(weight), variance), ratio, 0.0))
+    return tuple(found)
+
+
+def _error(
+    kind: Groups, weight: Floats, share_px2: Floats, ratio: float, beyond_px2: Floats | float
+) -> SharedError:
+    """Return an error of groups with its effect, by the weights (n,)."""
+    common = np.bincount(kind.group, weight * np.sqrt(share_px2))
+    effect = float((common**2).sum() / weight.sum())
+    group = np.where(weight > 0, kind.group, -1)
+    of_star = kind.of_one_star is None
+    return SharedError(kind.name, group, share_px2, ratio, of_star, effect, beyond_px2)
+
+
+def _of_stars(
+    on_sky: Floats, weight: Floats, variance_px2: Floats, star: Indices
+) -> tuple[float, float, float]:
+    """
+    Return ``c^2``, px^2, and rho of the sightings of stars, and twice their log likelihood ratio.
+
+    Posterior means: products of pairs of residuals on the sky are fitted by 1 and by the product
+    of their sigmas over that of a usual star.
+    """
+    usual_px2 = float(np.median(variance_px2[weight > 0]))
+    root = weight * np.sqrt(variance_px2 / usual_px2)
+    constant, both, relative = (
+        _pairs(one, star) for one in (weight, root, weight * variance_px2 / usual_px2)
     )
+    by_constant, by_relative = (
+        0.5 * (_pairs(one * on_sky[:, 0], star) + _pairs(one * on_sky[:, 1], star))
+        for one in (weight, root)
+    )
+    log_likelihood = np.zeros((len(_LOG_GRID), len(_LOG_GRID)))
+    x = np.exp(2.0 * _LOG_GRID)
+    if constant > _ROUNDING * float((weight**2).sum()):
+        log_likelihood -= both * np.outer(x, x)
+        log_likelihood += (by_constant * x - 0.5 * constant * x**2)[:, None]
+        log_likelihood += by_relative * x - 0.5 * relative * x**2
+    log_likelihood[:, x > usual_px2] = -np.inf  # sightings share no more than their variance
+    most = float(log_likelihood.max())
+    likely = np.exp(log_likelihood - most) * np.outer(_PRIOR, _PRIOR)
+    likely /= likely.sum()
+    return (
+        float(likely.sum(axis=1) @ x),
+        float(likely.sum(axis=0) @ x) / usual_px2,
+        max(2.0 * most, 0.0),
+    )
+
+
+def _pairs(value: Floats, group: Indices) -> float:
+    """Return the sum of the products of all pairs of values (n,) in a group, in both orders."""
+    return float((np.bincount(group, value) ** 2).sum() - (value**2).sum())
+
+
+def _factors(on_sky: Floats, weight: Floats, share_px2: Floats, star: Indices) -> Floats:
+    """
+    Return factors (n,) on the variances that sightings of a star share, 1 in the mean.
+
+    By expectation and maximisation from the mean residuals of stars; 1 for a star of one sighting,
+    where noise and shared error are the same.
+    """
+    count = int(star.max(initial=0)) + 1
+    total, squares = np.bincount(star, weight, count), np.bincount(star, weight**2, count)
+    factor = np.ones(count)
+    several = np.flatnonzero(total**2 - squares > _ROUNDING * total**2)
+    if len(several) == 0:
+        return factor[star]
+    total, squares = total[several], squares[several]
+    s, u, v = (
+        np.bincount(star, weight * value, count)[several] / total
+        for value in (share_px2, *on_sky.T)
+    )
+    squared, pairs = u**2 + v**2, (total**2 - squares) * s
+    # The variance of a residual has the shared part in it.
+    e = np.maximum(1.0 / total - s * squares / total**2, _ROUNDING / total)
+    own = np.ones(len(s))
+    for _ in range(_ROUNDS):
+        gain = own * s / (own * s + e)
+        own = (_TAIL + (squared * gain + 2.0 * e) * gain / s) / (_TAIL + 2.0)
+        own *= pairs.sum() / (pairs @ own)
+    factor[several] = own
+    return np.asarray(factor[star])
 
 
 def _cells(pixels: Floats, size_px: float, axes: Sequence[int]) -> Indices:
@@ -187,27 +290,21 @@ def pair_moment(
 
     Members with the same number in ``of_one_star`` are not multiplied.
     """
-    apart = np.arange(len(group)) if of_one_star is None else of_one_star
-    products = pairs = 0.0
-    for index, sign in ((group, 1.0), (apart, -1.0)):
-        pairs += sign * float((np.bincount(index, weight) ** 2).sum())
-        for axis in (0, 1):
-            summed = np.bincount(index, weight * residual_px[:, axis])
-            products += sign * float((summed**2).sum())
-    # Without pairs rounding is left.
-    if pairs <= 1e-9 * float((weight**2).sum()):
+
+    def apart(value: Floats) -> float:
+        own = 0.0 if of_one_star is None else _pairs(value, of_one_star)
+        return _pairs(value, group) - own
+
+    pairs = apart(weight)
+    if pairs <= _ROUNDING * float((weight**2).sum()):
         return 0.0, math.inf
+    products = sum(apart(weight * v) for v in residual_px.T)
     return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
 
 
 def _log_likelihood(estimate_px2: float, sigma_px2: float) -> Floats:
     """Log likelihood of amplitudes on the grid."""
     return np.asarray(-0.5 * ((estimate_px2 - np.exp(2.0 * _LOG_GRID)) / sigma_px2) ** 2)
-
-
-def _ratio(estimate_px2: float, sigma_px2: float) -> float:
-    """Twice the log likelihood ratio of the best variance against none."""
-    return max(estimate_px2 / sigma_px2, 0.0) ** 2
 
 
 def _next_octave(log_px: Floats) -> Floats:
@@ -255,16 +352,21 @@ def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
     return sum(error.variance_px2 for error in errors if not error.of_star)
 
 
-def place_variance_px2(errors: Sequence[SharedError]) -> float:
-    """Variance per axis of the places of stars; 0 where it changes no precision."""
-    return sum(error.variance_px2 for error in errors if error.of_star and error.matters)
+def star_variance_px2(errors: Sequence[SharedError]) -> Floats | float:
+    """Variance (n,) per axis that sightings of a star share; 0 where it changes no precision."""
+    return sum((error.share_px2 for error in errors if error.of_star and error.matters), 0.0)
+
+
+def star_beyond_px2(errors: Sequence[SharedError]) -> Floats | float:
+    """Part (n,) of it by which a star differs from others of its brightness."""
+    return sum((error.beyond_px2 for error in errors if error.of_star and error.matters), 0.0)
 
 
 class GroupSums:
     """
     Sums of weighted derivatives (n, 2, r) over groups, part by part of the observations.
 
-    `whole` is ``sum_g s^2 |sum_i Y_i|^2`` of each error, and `own` ``sum_i s^2 |Y_i|^2`` of all
+    `whole` is ``sum_g |sum_i s_i Y_i|^2`` of each error, and `own` ``sum_i s_i^2 |Y_i|^2`` of all
     with the inflation of the weights: their difference is the part of V beyond the working one.
     A group of one observation has only noise.  Observations of a variance below the sum of s^2, as
     of bright stars, share no more than that.
@@ -292,7 +394,7 @@ class GroupSums:
             members = np.bincount(error.group + 1)
             members[0] = 0  # not used
             self.is_shared[error.name] = members[error.group + 1] > 1
-            total += error.variance_px2 * self.is_shared[error.name]
+            total += error.share_px2 * self.is_shared[error.name]
         self.share = np.minimum(variance_px2 / np.maximum(total, 1e-300), 1.0)
         self.own_px2 = self.share * total + inflation_px2
 
@@ -304,7 +406,8 @@ class GroupSums:
             if error.of_star:
                 values = self.from_sky[rows].transpose(0, 2, 1) @ Y
             shape = (self.sums[error.name].shape[0], k)
-            part = np.sqrt(self.share[rows]) * self.is_shared[error.name][rows]
+            shared_px2 = self.share[rows] * error.share_px2[rows]
+            part = np.sqrt(shared_px2) * self.is_shared[error.name][rows]
             member = csr_array((part, (error.group[rows], np.arange(k))), shape=shape)
             self.sums[error.name][...] += member @ values.reshape(k, -1)
         flat = (Y * np.sqrt(self.own_px2[rows])[:, None, None]).reshape(2 * k, -1)
@@ -313,7 +416,4 @@ class GroupSums:
     def whole(self) -> dict[str, Floats]:
         """Return the matrix (r, r) of each error by its name."""
         flat = {name: one.reshape(-1, len(self.own)) for name, one in self.sums.items()}
-        return {
-            error.name: error.variance_px2 * (flat[error.name].T @ flat[error.name])
-            for error in self.errors
-        }
+        return {name: one.T @ one for name, one in flat.items()}

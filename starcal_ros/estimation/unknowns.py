@@ -36,6 +36,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, cosine_terms
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
+from starcal_ros.estimation.amplitudes import UNSTATED
 from starcal_ros.estimation.problem import (
     image_alignment,
     mounting_errors_rad,
@@ -95,6 +96,8 @@ class Unknown:
         q is twice their number: those of u, then those of v.
     octave : (q,) or None
         Octave of each coefficient of those functions.
+    log_px : float, float
+        Prior of the logarithm of the amplitude of the first octave: mean and 1-sigma.
     term : (q,) or None
         A likely combination of the functions, 1 px, with an amplitude of its own besides.
     tracker : (m, 3, q) or None
@@ -112,6 +115,7 @@ class Unknown:
     turn: Turn | None = None
     functions: Scalars | None = None
     octave: Indices | None = None
+    log_px: tuple[float, float] = UNSTATED
     term: Floats | None = None
     tracker: Floats | None = None
     widest: Floats | float = np.inf
@@ -205,12 +209,15 @@ class Assumptions:
         Offset of all stamps against the attitudes.
     refraction : Refraction or None
         About a zenith that is not known exactly; None: in space, or corrected.
+    lens_log_px : float, float
+        Logarithm of the residual of the lens: mean and 1-sigma.
     """
 
     velocity_m_s: float
     readout_s: tuple[float, float]
     stamp_s: float
     refraction: Refraction | None = None
+    lens_log_px: tuple[float, float] = UNSTATED
 
 
 def unknowns_in_state(problem: Problem, state: State) -> Layout:
@@ -359,7 +366,7 @@ def unknowns_of(
     if assumed.refraction is not None:
         entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
     entries += _of_timing(rates, height, assumed)
-    entries.append(_field(width, height))
+    entries.append(dataclasses.replace(_field(width, height), log_px=assumed.lens_log_px))
     entries.append(_shape(problem, state, size))
     entries += _errors_of_rates(rates, height)
     return Layout(tuple(entry for entry in entries if len(entry)))

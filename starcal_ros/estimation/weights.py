@@ -46,9 +46,10 @@ from starcal_ros.estimation.shared_errors import (
     coarsest_cells,
     Groups,
     pixel_variance_px2,
-    place_variance_px2,
     shared_errors,
     SharedError,
+    star_beyond_px2,
+    star_variance_px2,
 )
 from starcal_ros.estimation.star_equations import (
     ROTATION,
@@ -110,7 +111,9 @@ class Judged:
 
     def covariance_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) of the observations."""
-        return self.variance.of(table.covariance_px2, table.magnitude)
+        covariance_px2 = self.variance.of(table.covariance_px2, table.magnitude)
+        beyond_px2 = np.broadcast_to(star_beyond_px2(self.errors), len(table))
+        return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
 
     def inflation_px2(self, table: StarTable) -> Floats:
         """
@@ -119,7 +122,7 @@ class Judged:
         With it, k images of a star weigh as the mean of theirs does.
         """
         sightings = np.bincount(table.star, self.kept, int(table.star.max()) + 1)[table.star]
-        return np.asarray(np.maximum(sightings - 1.0, 0.0) * place_variance_px2(self.errors))
+        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_variance_px2(self.errors))
 
     def working_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) whose inverses are the weights."""
@@ -351,10 +354,12 @@ def judge(
         )
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()
+    # Without what is beyond others: whether a star is left out must not follow from its own size.
+    usual_px2 = star_variance_px2(before.errors) - star_beyond_px2(before.errors)
     kept = fitting_stars(
         residual_px,
         covariance_px2,
-        place_variance_px2(before.errors),
+        usual_px2,
         table,
         coarsest_cells(data.groups),
         options.outlier_sigma,
@@ -363,8 +368,9 @@ def judge(
         raise NotObservable('no image has three stars that fit')
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
-        weight = np.where(kept, 1.0 / own_px2, 0.0)
-        errors = shared_errors(residual_px, weight, data.groups, from_sky, found.last_octave)
+        errors = shared_errors(
+            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave
+        )
     return Judged(variance, errors, kept, attitudes)
 
 
@@ -543,7 +549,7 @@ _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
 def fitting_stars(
     residual_px: Floats,
     covariance_px2: Floats,
-    place_px2: float,
+    star_px2: Floats | float,
     table: StarTable,
     cells: Groups,
     outlier_sigma: float,
@@ -558,8 +564,8 @@ def fitting_stars(
     Parameters
     ----------
     residual_px, covariance_px2 : (n, 2), (n, 3)
-    place_px2 : float
-        Variance per axis of the places of stars, which all images of a star share.
+    star_px2 : (n,) or float
+        Variance per axis that sightings of a star share.
     cells : Groups
         Parts of the detector.
     """
@@ -570,9 +576,9 @@ def fitting_stars(
     star = table.star
     sightings = np.bincount(star)
     misses = np.bincount(star, ~fits)
-    # The variance of the place is in every observation, but it is one error.
+    # What sightings share is in the variance of each, but it is one error.
     own = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
-    share = np.minimum(place_px2 / own, 1.0)
+    share = np.minimum(star_px2 / own, 1.0)
     largest = np.bincount(star, share) / sightings * (sightings - 1) + 1.0
     summed = np.bincount(star, np.where(fits, length2, 0.0))
     bad = (2 * misses > sightings) | (summed > chdtri(2 * sightings, _STAR_CHANCE) * largest)

@@ -73,9 +73,10 @@ class ResidualBin:
     ``by`` names the quantity that defines the group.  Residuals of images predicted from other
     images are grouped by ``radius`` (px from the middle of the detector), ``magnitude`` or
     ``image`` (its number in order of time); sums over stars by ``star`` (its number of images),
-    sums over cells of the detector by ``cell`` (px from the middle).  ``low`` and ``high`` are the
-    limits of the group.  ``normalised`` is the RMS of the residuals over their predicted sigma, 1
-    if the model and its sigmas are right, and ``sigma`` its 1-sigma.
+    sums over cells of the detector by ``cell`` (px from the middle), sums over stars of like
+    magnitude of an image by ``brightness``.  ``low`` and ``high`` are the limits of the group.
+    ``normalised`` is the RMS of the residuals over their predicted sigma, 1 if the model and its
+    sigmas are right, and ``sigma`` its 1-sigma.
     """
 
     by: str

@@ -20,6 +20,7 @@ from starcal_ros.assessment.predictions import predicted_residuals, predictions
 from starcal_ros.camera import line_of_sight, project
 from starcal_ros.estimation.star_equations import whitening
 from starcal_ros.records import Ensemble, ResidualBin, StarObservations
+from studies.worlds import ripple
 
 MIDDLE_PX = np.array([647.5, 511.5])
 
@@ -85,11 +86,14 @@ def test_an_image_is_predicted_by_the_formula_of_the_module() -> None:
     W = np.diag([0.0, 0.0, 0.0, 30.0, 40.0, 50.0])
     G = np.eye(40) - K @ np.linalg.inv(K.T @ K + W) @ K.T
     N = J.T @ G @ J + np.diag([2.0, 3.0, 5.0, 7.0, 11.0])
-    predicted = predictions_module._predicted(J, K, r, N, W)
+    V, half = rng.uniform(0.2, 1.0, 40), rng.normal(size=(5, 5))
+    E = 0.1 * half @ half.T
+    predicted = predictions_module._predicted(J, K, r, V, N, W, E)
     assert predicted is not None
     by_others = np.linalg.inv(N - J.T @ G @ J)
     left = G @ r + G @ J @ by_others @ J.T @ G @ r
-    variance = np.diag(G + G @ J @ by_others @ J.T @ G)
+    own = G + G @ (np.diag(V) - np.eye(40)) @ G
+    variance = np.diag(own + G @ J @ (by_others + E) @ J.T @ G)
     for found, expected in zip(predicted, (left**2, variance), strict=True):
         np.testing.assert_allclose(found, expected[:20] + expected[20:], rtol=1e-10)
 
@@ -151,25 +155,80 @@ def test_a_bad_part_of_the_detector_shows_in_the_cells() -> None:
     assert worst.normalised > 1.0 + 3.5 * worst.sigma
 
 
-def test_a_bad_image_shows_in_its_part() -> None:
-    """One image of eight with a shape of its own: of a shutter that sticks."""
-    given = of_random_pointings(16, images=8)
-    ensemble = true_observations(given)
+def torn(ensemble: Ensemble, size_px: float = 0.3) -> Ensemble:
+    """The ensemble whose last image has a shape of its own, as of a shutter that sticks."""
     last = ensemble.images[-1]
     along = (last.measured_px[:, 0] / WIDTH - 0.5) * 8.0
-    torn = last.measured_px + 0.3 * np.stack([np.sin(along), np.cos(along) * 0], axis=-1)
-    images = (*ensemble.images[:-1], dataclasses.replace(last, measured_px=torn))
-    bins = bins_of(given, Ensemble(images))
+    moved_px = last.measured_px + size_px * np.stack([np.sin(along), 0.0 * along], axis=-1)
+    return Ensemble((*ensemble.images[:-1], dataclasses.replace(last, measured_px=moved_px)))
+
+
+def test_a_bad_image_shows_in_its_part() -> None:
+    given = of_random_pointings(16, images=8)
+    bins = bins_of(given, torn(true_observations(given)))
     assert worst_of(bins).by == 'image' and worst_of(bins).high == 7.0
     assert worst_of(bins).normalised > 1.1
 
 
-def test_places_of_stars_that_the_model_has_are_no_fault() -> None:
-    """
-    Catalog places off by 0.3 arcsec, the same in all images: their variance is estimated.
+FAULTS = {
+    'cell': lambda x, m: 0.3 * ((np.abs(x - [980.0, 580.0]) < 80.0).all(axis=1)),
+    'brightness': lambda x, m: 0.1 * (m > 7.2),
+    'image': None,
+}
+"""Displacements along u of stars at pixels x of magnitudes m, by the part that shows them."""
 
-    Without it the sums over the images of a star are larger than their noise.
+
+@pytest.mark.parametrize('by', list(FAULTS))
+def test_a_fault_is_seen_in_its_part(by: str) -> None:
+    """A region of the detector 0.3 px off, faint stars 0.1 px off, an image with its own shape."""
+    given = of_random_pointings(16, images=12)
+    ensemble, fault = true_observations(given), FAULTS[by]
+    sound = worst_of(bins_of(given, ensemble))
+    assert sound.normalised < 1.0 + 3.5 * sound.sigma
+    images = tuple(
+        dataclasses.replace(
+            image,
+            measured_px=image.measured_px
+            + np.outer(fault(image.measured_px, image.magnitude), [1.0, 0.0]),
+        )
+        for image in ensemble.images
+        if fault
+    )
+    worst = worst_of(bins_of(given, Ensemble(images) if fault else torn(ensemble, 0.4)))
+    assert worst.by == by
+    assert worst.normalised > 1.0 + 5.0 * worst.sigma
+
+
+def of_images(bins: list[ResidualBin]) -> list[ResidualBin]:
+    """The parts of the predictions of images."""
+    return [one for one in bins if one.by in ('radius', 'magnitude', 'image')]
+
+
+@pytest.mark.parametrize('seed', [21, 22])
+def test_few_images_of_a_lens_with_structure_are_predicted(seed: int) -> None:
     """
+    Five images, 0.15 px of a wave of a fourteenth of the width.
+
+    Less an image, the information of the average over the amplitudes is nearly singular.  At the
+    most likely ones an image with a shape of its own still stands apart.
+    """
+    given = of_random_pointings(seed, images=5)
+
+    def move(pixels: Floats) -> Floats:
+        half_widths = (pixels - MIDDLE_PX) / (WIDTH / 2.0)
+        return ripple(0.15, 14.0, np.random.default_rng(seed), half_widths)
+
+    ensemble = displaced(true_observations(given), move)
+    sound = of_images(bins_of(given, ensemble))
+    assert len(sound) >= 11
+    assert all(0.85 < one.normalised < 1.15 for one in sound)
+    worst = worst_of(of_images(bins_of(given, torn(ensemble, 0.6))))
+    assert (worst.by, worst.high) == ('image', 4.0)
+    assert worst.normalised > 1.2
+
+
+def of_three_fields() -> tuple[Scenario, Ensemble]:
+    """Fifteen images of three fields, whose catalog places are off by 0.1 px."""
     given = of_random_pointings(17, images=3)
     fields = given.pointing.attitudes_deg * 5
     given = dataclasses.replace(
@@ -189,11 +248,29 @@ def test_places_of_stars_that_the_model_has_are_no_fault() -> None:
         turn = np.array([off[one] for one in image.catalog_id.tolist()])
         moved_px = project(given.truth.camera, seen + turn) - image.measured_px
         images.append(dataclasses.replace(image, measured_px=image.measured_px + moved_px))
-    found = estimated(given, Ensemble(tuple(images)))
+    return given, Ensemble(tuple(images))
+
+
+def test_an_image_is_predicted_where_stars_come_again() -> None:
+    """The weights are lowered for what images share, the noise of an image is not."""
+    given, ensemble = of_three_fields()
+    assert all(0.85 < one.normalised < 1.15 for one in of_images(bins_of(given, ensemble)))
+    worst = worst_of(bins_of(given, torn(ensemble, 0.8)))
+    assert worst.by == 'image' and worst.high == 14.0
+    assert worst.normalised > 1.0 + 4.0 * worst.sigma
+
+
+def test_places_of_stars_that_the_model_has_are_no_fault() -> None:
+    """
+    Catalog places off by 0.3 arcsec, the same in all images: their variance is estimated.
+
+    Without it the sums over the images of a star are larger than their noise.
+    """
+    found = estimated(*of_three_fields())
     bins = [one for one in predictions(found) if one.by == 'star']
     assert bins and max(one.normalised for one in bins) < 1.15
     unshared = tuple(
-        dataclasses.replace(one, variance_px2=0.0) if one.of_star else one
+        dataclasses.replace(one, share_px2=0.0 * one.share_px2) if one.of_star else one
         for one in found.shared_errors
     )
     blind = predictions(dataclasses.replace(found, shared_errors=unshared))

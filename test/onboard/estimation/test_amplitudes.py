@@ -74,6 +74,22 @@ def test_the_prior_of_octaves_is_a_chain() -> None:
     assert mean == pytest.approx(CENTRE + STEP * np.arange(4))
     later = np.minimum.outer(np.arange(4), np.arange(4))
     assert np.linalg.inv(precision) == pytest.approx(16.0 + later)
+    mean, precision = octave_prior(4, (math.log(0.01), 1.5))
+    assert mean == pytest.approx(math.log(0.01) + STEP * np.arange(4))
+    assert np.linalg.inv(precision) == pytest.approx(2.25 + later)
+
+
+@pytest.mark.parametrize(('stated_px', 'low_px', 'high_px'), [(1e-4, 1e-4, 1e-3), (0.1, 0.1, 0.3)])
+def test_a_stated_residual_of_the_lens_decides_where_the_data_do_not(
+    stated_px: float, low_px: float, high_px: float
+) -> None:
+    octave = np.repeat(np.arange(3), 4)
+    information, gradient = np.eye(12), np.zeros(12)
+    first = math.log(stated_px), 1.5
+    mode = field_amplitudes(information, gradient, octave, first=first)
+    averaged = averaged_field(information, gradient, octave, mode, np.zeros(12), first)
+    sigma_px = np.sqrt(np.diag(averaged.covariance))
+    assert (low_px < sigma_px[:4]).all() and (sigma_px[:4] < high_px).all()
 
 
 @pytest.mark.parametrize('sigma_px', [(0.3, 0.1, 0.05), (0.05, 0.05, 0.0), (0.0, 0.2, 0.2)])

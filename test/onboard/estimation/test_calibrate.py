@@ -457,7 +457,8 @@ def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
     attitudes = weights.Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, (), ())
 
     def judged(variance_px2: float, stars: Indices) -> weights.Judged:
-        error = SharedError('star places', stars, variance_px2, 0.0, True, 1.0)
+        share_px2 = np.full(len(stars), variance_px2)
+        error = SharedError('star places', stars, share_px2, 0.0, True, 1.0)
         return weights.Judged(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
 
     once = dataclasses.replace(table, star=np.arange(len(table)))

@@ -298,9 +298,9 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
     cells = np.where(used, rng.integers(0, 9, n), -1)
     star = np.where(used, given.table.star, -1)
     errors = (
-        SharedError('star places', star, place_px**2, 0.0, True, 1.0),
-        SharedError('cells', cells, cell_px**2, 0.0, False, 1.0),
-        SharedError('rows', rng.integers(0, 5, n), 0.5, 0.0, False, 0.0),
+        SharedError('star places', star, np.full(n, place_px**2), 0.0, True, 1.0),
+        SharedError('cells', cells, np.full(n, cell_px**2), 0.0, False, 1.0),
+        SharedError('rows', rng.integers(0, 5, n), np.full(n, 0.5), 0.0, False, 0.0),
     )
     inflation = rng.uniform(0.0, 0.002, n)
     variance = (place_px**2 + cell_px**2) * rng.uniform(0.5, 2.0, n)
@@ -433,7 +433,7 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
         np.ones(n),
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
-        (SharedError('alone', np.arange(n), 1.0, 0.0, False, 1.0),),
+        (SharedError('alone', np.arange(n), np.ones(n), 0.0, False, 1.0),),
         ((np.arange(IMAGES), (0, 1, 2), np.arange(IMAGES), np.eye(IMAGES), 1.0),),
     )
     found = solved(given)
