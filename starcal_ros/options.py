@@ -83,10 +83,10 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
             are_different=bool(meta['choices']),
         )
     try:
-        checked: OptionValue = read_value(kind, value, field.name, {})
+        found: OptionValue = read_value(kind, value, field.name, {})
     except ValueError as error:
         raise OptionError(str(error)) from error
-    return with_home(field.name, str(checked)) if meta['is_path'] else checked
+    return with_home(field.name, str(found)) if meta['is_path'] else found
 
 
 def with_home(name: str, path: str) -> str:
@@ -195,7 +195,7 @@ def _flat(content: Mapping[str, object], namespace: str) -> dict[str, object]:
     for key, body in content.items():
         name = f'{namespace}/{key}' if namespace else key
         inside = body.values() if isinstance(body, dict) and 'ros__parameters' not in body else ()
-        if inside and all(isinstance(value, dict) for value in inside):
+        if inside and all(isinstance(one, dict) for one in inside):
             sections |= _flat(body, name)  # type: ignore[arg-type]
         else:
             sections[name] = body
