@@ -255,7 +255,7 @@ def calibrate_bag(
     (10, True)
     """
     paths = [Path(bag) for bag in ([bags] if isinstance(bags, (str, Path)) else bags)]
-    asked = Topics(
+    requested = Topics(
         image=image_topic,
         attitude=attitude_topic,
         velocity=velocity_topic,
@@ -263,9 +263,9 @@ def calibrate_bag(
         observations=observations_topic,
     )
     inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
-    if without_attitudes(paths, asked, read_values(Path(params))):
+    if without_attitudes(paths, requested, read_values(Path(params))):
         raise OptionError(f'{paths[0]}: no attitudes; starcal_ground.calibrate_images needs none')
-    return calibrate_bags(paths, read_setup(Path(params)), asked, inputs).calibration
+    return calibrate_bags(paths, read_setup(Path(params)), requested, inputs).calibration
 
 
 def read_calibration(path: Path | str) -> Calibration:

@@ -103,11 +103,11 @@ def sync_folder(folder: Path) -> None:
 def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
     """True if a path names the same file, by whatever name, as one of the others."""
     try:
-        found = path.stat()
+        own = path.stat()
     except OSError:
         return False  # there is no such file
     for other in others:
         with contextlib.suppress(OSError):
-            if os.path.samestat(found, other.stat()):
+            if os.path.samestat(own, other.stat()):
                 return True
     return False

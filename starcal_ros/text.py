@@ -19,7 +19,7 @@ def printable(text: str) -> str:
     Names of topics and files come from others: an escape sequence in one could clear the screen,
     change the lines above, or set the title of the window.
     """
-    return _UNSAFE.sub(lambda found: ascii(found[0])[1:-1], text)
+    return _UNSAFE.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 _SMALLEST, _LARGEST = 1e-9, 1e15

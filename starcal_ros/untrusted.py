@@ -178,11 +178,11 @@ def _checked(value: Any, depth: int = 0) -> Any:
 
 
 def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    values = dict(pairs)
+    if len(values) < len(pairs):
         ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f'duplicate key {shown(twice)}')
-    return found
+    return values
 
 
 def _no_constant(name: str) -> object:
@@ -218,15 +218,15 @@ class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[mi
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
         """Mapping with different texts as keys."""
-        found: dict[str, Any] = {}
+        mapping: dict[str, Any] = {}
         for key_node, value_node in node.value:
             key, line = self.construct_object(key_node, deep), key_node.start_mark.line + 1
             if not isinstance(key, str):
                 raise ValueError(f'line {line}: key {shown(key)} is not a text')
-            if key in found:
+            if key in mapping:
                 raise ValueError(f'line {line}: duplicate key {shown(key)}')
-            found[key] = self.construct_object(value_node, deep)
-        return found
+            mapping[key] = self.construct_object(value_node, deep)
+        return mapping
 
 
 # As the core schema of YAML and rcl read plain words; the first that matches counts.

@@ -261,7 +261,10 @@ class ObserverOptions:
     """Inputs of the star observer."""
 
     attitude_timeout_s: float = option(
-        10.0, 'longest wait of an image for the next attitude sample, wall clock, s', low=0.0
+        10.0,
+        'longest wait of an image for the next attitude sample, wall clock, s; more where'
+        ' telemetry brings attitudes in blocks, less to play a bag in which they drop out',
+        low=0.0,
     )
 
 

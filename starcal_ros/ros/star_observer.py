@@ -80,11 +80,6 @@ class StarObserver(StarcalNode):
         super().__init__(NAME)
         self._publishers_made: list[Any] = []
         self._worker: threading.Thread | None = None
-        self._counts: Counter[str] = Counter()
-        self._last_refusal = self._bad_velocity = ''
-        self._velocities_left_out = 0
-        self._retried = self._retried_used = 0
-        self._camera_info: Any = None  # of the active calibration, header of the last image
 
     def configure(self) -> None:
         """Load the prior camera and the catalog, create the publishers."""
@@ -99,7 +94,7 @@ class StarObserver(StarcalNode):
         self._annotated = self.create_lifecycle_publisher(
             ImageMessage, 'annotated_image', QoSProfile(depth=2)
         )
-        self._camera_info = None
+        self._camera_info: Any = None  # of the active calibration, header of the last image
         self._camera_infos = self.create_lifecycle_publisher(
             CameraInfo, 'image_camera_info', QoSProfile(depth=_IMAGES)
         )
@@ -121,7 +116,7 @@ class StarObserver(StarcalNode):
         self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
         self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
-        self._counts.clear()
+        self._counts: Counter[str] = Counter()
         self._restarts = self._retried = self._retried_used = 0
         self._last_refusal = self._bad_velocity = ''
         self._velocities_left_out = 0
