@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ground.cli.commands import mission
-from starcal_ground.products import check_outputs, make_folder, REPORT_FILE
-from starcal_ros.errors import missing_package, OptionError, StarcalError
+from starcal_ground.outputs import check_outputs, make_folder, REPORT_FILE
+from starcal_ros.errors import missing_package, NotABag, OptionError, StarcalError
 from starcal_ros.text import significant
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
@@ -54,10 +54,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(args, tool)
         finally:
             sys.stdout.flush()  # at the end of Python an error has no handler
-    except StarcalError as error:
+    except NotABag as error:
         from starcal_ground.file_kinds import explained
 
         return arguments.complain(explained(error))
+    except StarcalError as error:
+        return arguments.complain(str(error))
     except BrokenPipeError:
         # The reader of our output has ended (starcal ... | head).
         terminal.discard('stdout')

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict
-from starcal_ground.products import check_outputs, NOT_CALIBRATED_FILE, PRODUCT_FILES
+from starcal_ground.outputs import check_outputs
+from starcal_ground.products import NOT_CALIBRATED_FILE, PRODUCT_FILES
 from starcal_ground.report.thumbnails import THUMBNAILS_FOLDER, thumbnails_in
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import INTRINSIC_NAMES

@@ -18,7 +18,8 @@ from pathlib import Path
 import jinja2
 
 from starcal_ground import products
-from starcal_ground.products import CAMERA_INFO_FILE, OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ground.products import CAMERA_INFO_FILE
 from starcal_ground.report import detector_figures, figures, page_sections, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
 from starcal_ros.assessment.residuals import Residuals

@@ -18,10 +18,9 @@ from starcal_ground.cli import output
 from starcal_ground.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt, Time
 from starcal_ground.cli.output import check_folder
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.outputs import make_folder, REPORT_FILE
 from starcal_ground.products import (
-    make_folder,
     NotCalibrated,
-    REPORT_FILE,
     write_not_calibrated,
     write_observations,
     write_products,

@@ -20,7 +20,8 @@ from starcal_ground.cli.terminal import print_text
 from starcal_ground.images import night_sky
 from starcal_ground.images.from_stars import FromStars
 from starcal_ground.images.photographs import image_paths, Photograph
-from starcal_ground.products import check_outputs, make_folder, write_camera_info
+from starcal_ground.outputs import check_outputs, make_folder
+from starcal_ground.products import write_camera_info
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.bag import reader

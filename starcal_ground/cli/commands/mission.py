@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
 from starcal_ground.cli.terminal import print_text, progress_bar
-from starcal_ground.products import check_outputs, make_folder
+from starcal_ground.outputs import check_outputs, make_folder
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
 
@@ -66,7 +66,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _observations_of(calibration: Path) -> Path:
-    from starcal_ground.products import OBSERVATIONS_FILE
+    from starcal_ground.outputs import OBSERVATIONS_FILE
     from starcal_ros.formats.products.product_files import calibration_file
 
     path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)

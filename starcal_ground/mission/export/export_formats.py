@@ -15,7 +15,7 @@ from starcal_ground.mission.export.ck import ck_of_images
 from starcal_ground.mission.export.lookup_table import write_lookup_table
 from starcal_ground.mission.export.losses import Content, Loss, temperature_losses
 from starcal_ground.mission.export.spice import check_names, spice_kernels, SpiceNames
-from starcal_ground.products import check_outputs
+from starcal_ground.outputs import check_outputs
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import OptionError

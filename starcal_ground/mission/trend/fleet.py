@@ -29,13 +29,13 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import products
+from starcal_ground import outputs, products
 from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places
 from starcal_ground.mission.trend.places import Entry
 from starcal_ground.mission.trend.rows import COMPUTED, failure, kept_name, RECORDED, Row, row_of
 from starcal_ground.mission.trend.trend_table import Table
-from starcal_ground.products import OBSERVATIONS_FILE
+from starcal_ground.outputs import OBSERVATIONS_FILE
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -482,7 +482,7 @@ class Done:
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / kept_name(row)
-            products.make_folder(folder)
+            outputs.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error
