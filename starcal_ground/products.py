@@ -8,24 +8,21 @@ It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_cal
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-import contextlib
 import dataclasses
 from dataclasses import dataclass, fields
 import io
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from starcal_ground.bag_writer import BagWriter
+from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import is_marked, same_as_one_of
 from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
@@ -35,11 +32,10 @@ from starcal_ros.formats.products.product_files import (
 )
 from starcal_ros.record_fields import json_object, plain_record, read_record
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
-from starcal_ros.untrusted import json_value, read_archive, regular_file
+from starcal_ros.untrusted import json_value, read_archive
 
 OBSERVATIONS_TOPIC = '/observations'
 CAMERA_INFO_FILE = 'camera_info.yaml'
-OBSERVATIONS_FILE, REPORT_FILE = 'observations.mcap', 'report.html'
 RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
     CALIBRATION_FILE,
@@ -102,6 +98,8 @@ def write_observations(
     observations: Iterable[StarObservations], folder: Path, frame_id: str
 ) -> None:
     """Write the observations of a calibration with the frame of its camera; raises BagError."""
+    from starcal_ground.bag_writer import BagWriter  # mcap is not needed for more
+
     with BagWriter(folder / OBSERVATIONS_FILE) as writer:
         for record in observations:
             writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
@@ -177,38 +175,3 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         return prior
     except (KeyError, ValueError, TypeError, OverflowError):
         return None
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it where they are not there; raises ProductError."""
-    with errors_as(ProductError, path, 'created'):
-        path.mkdir(parents=True, exist_ok=True)
-
-
-def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
-    """
-    Check that a command may write its files: none is an input, and each is new or was its own.
-
-    Its own is a file that starcal wrote and nothing changed since.  Raises ProductError naming the
-    first file that would be replaced and the remedy.
-    """
-    inputs = tuple(inputs)
-    for path in outputs:
-        if same_as_one_of(path, inputs):
-            raise ProductError(
-                f'{path}: is an input of this command and would be replaced; choose another '
-                'place (-o)'
-            )
-        if os.path.isdir(path):
-            raise ProductError(f'{path}: is a folder, where a file is written; give another name')
-        if os.path.lexists(path) and not _is_own(path):
-            raise ProductError(
-                f'{path}: was not written by starcal, or was changed or copied since (or its file'
-                ' system keeps no extended attributes): give another name or remove it'
-            )
-
-
-def _is_own(path: Path) -> bool:
-    with contextlib.suppress(OSError, ValueError), regular_file(path, False) as file:
-        return is_marked(file)
-    return False

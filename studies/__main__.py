@@ -17,7 +17,7 @@ import sys
 import time
 
 from starcal_ground.cli import terminal
-from starcal_ground.products import make_folder
+from starcal_ground.outputs import make_folder
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS

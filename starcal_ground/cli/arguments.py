@@ -15,7 +15,7 @@ from types import FrameType
 from typing import Any, NoReturn, TYPE_CHECKING, TypeVar
 
 from starcal_ground.cli.terminal import print_text
-from starcal_ground.products import check_outputs
+from starcal_ground.outputs import check_outputs
 from starcal_ros.text import printable
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 import threading
 from typing import TYPE_CHECKING
 
-from starcal_ground import products
+from starcal_ground import outputs, products
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
 from starcal_ground.products import NotCalibrated
@@ -37,9 +37,9 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
     bag_files = reader.files_of_bags(bags)
     if same_as_one_of(folder, [file.parent for file in bag_files]):
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
-    outputs = [folder / name for name in (*products.PRODUCT_FILES, products.NOT_CALIBRATED_FILE)]
+    written = [folder / name for name in (*products.PRODUCT_FILES, products.NOT_CALIBRATED_FILE)]
     pictures = thumbnails.thumbnails_in(folder / thumbnails.THUMBNAILS_FOLDER)
-    products.check_outputs((*outputs, *pictures), (*bag_files, *files))
+    outputs.check_outputs((*written, *pictures), (*bag_files, *files))
 
 
 @contextlib.contextmanager
@@ -50,7 +50,7 @@ def failure_recorded(
     try:
         yield
     except kind as error:
-        products.make_folder(folder)
+        outputs.make_folder(folder)
         _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
         raise
 
@@ -88,7 +88,7 @@ def calibrate_into(
         observed = campaign.observe(source, selection, show, advance)
     if selection is not None and not observed.observations:
         raise OptionError(selection.without_images())
-    products.make_folder(folder)
+    outputs.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     products.write_observations(observed.observations, folder, source.setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
@@ -101,7 +101,7 @@ def calibrate_into(
             pictures = thumbnails.ordered(drawn.result())
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
     products.write_products(made.calibration, folder, made.residuals)
-    page, report, path = '', '', folder / products.REPORT_FILE
+    page, report, path = '', '', folder / product_files.REPORT_FILE
     if with_report:
         with drawings.kind('report'):
             page, report = _drawn(made, pictures, folder)
@@ -148,7 +148,7 @@ def _drawn(
     except ModuleNotFoundError as error:
         return '', f'no report: {missing_package(error, "report")}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
-    return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
+    return page.render(content, folder), f'look at {folder / product_files.REPORT_FILE}'
 
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:

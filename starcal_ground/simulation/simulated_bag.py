@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.products import check_outputs, write_camera_info
+from starcal_ground.outputs import check_outputs
+from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenes

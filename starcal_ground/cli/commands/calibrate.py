@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict
-from starcal_ground.products import make_folder
+from starcal_ground.outputs import make_folder
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import NotFromStars, OptionError
 from starcal_ros.text import significant

@@ -14,7 +14,7 @@ import argparse
 from pathlib import Path
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.products import check_outputs
+from starcal_ground.outputs import check_outputs
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

@@ -29,7 +29,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.images import first_setup, night_sky
     from starcal_ground.images.photographs import image_paths
-    from starcal_ground.products import check_outputs, make_folder, write_camera_info
+    from starcal_ground.outputs import check_outputs, make_folder
+    from starcal_ground.products import write_camera_info
     from starcal_ros.formats.bag import reader
     from starcal_ros.formats.products.product_files import write_atomically
 

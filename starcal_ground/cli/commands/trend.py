@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.products import check_outputs, make_folder
+from starcal_ground.outputs import check_outputs, make_folder
 from starcal_ros.errors import OptionError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 from starcal_ground.mission.export import camera_models, spice
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
 from starcal_ground.mission.export.exported import Content, Loss, temperature_losses
-from starcal_ground.products import check_outputs
+from starcal_ground.outputs import check_outputs
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table, LineOfSightTable
 from starcal_ros.camera import pixel_grid

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from starcal_ground import products
+from starcal_ground import outputs
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import photographs
 from starcal_ground.images.from_stars import options_of
@@ -109,7 +109,7 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     prior = [params] if camera else []
     if camera and not same_as_one_of(copied, [camera]):
         prior.append(copied)
-    products.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
+    outputs.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
 
 
 def _files_beside(bag: Path) -> tuple[Path, Path, Path]:

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import products
+from starcal_ground import outputs, products
 from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ground.products import OBSERVATIONS_FILE
@@ -481,7 +481,7 @@ class Done:
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
-            products.make_folder(folder)
+            outputs.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error

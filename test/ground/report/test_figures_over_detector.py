@@ -10,7 +10,7 @@ import pytest
 
 from starcal_ground.report import figures, svg
 from starcal_ros.camera import CameraModel
-from starcal_ros.camera.detector_field import DetectorField
+from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.records import CameraGeometry, refused_image, StarObservations
 
 CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, -0.05, 0, 0, 0, 0]))
@@ -39,9 +39,17 @@ def test_outward_arrows_cover_no_number_of_the_axes() -> None:
     assert v.min() >= 18 and v.max() <= drawn.height - 32
 
 
+def half_wave_along_u(amplitude_px: float) -> DetectorField:
+    coefficients_px = np.zeros((2, term_count(640, 512, 1)))
+    coefficients_px[0, 0] = amplitude_px
+    return DetectorField(640, 512, 1, coefficients_px)
+
+
 def test_the_scale_is_that_of_the_arrows() -> None:
-    """Arrows of a field that is 0.3 px along u have 1.5 times the length of 0.2 px."""
-    field = DetectorField(640, 512, 0, np.array([[0.3], [0.0]]))
+    """The longest arrows, of 0.3 px along u, have 1.5 times the length of 0.2 px."""
+    first_arrow_px = np.array([[19.5, 20.8]])
+    field = half_wave_along_u(1.0)
+    field = half_wave_along_u(0.3 / field.displacement_px(first_arrow_px)[0, 0])
     drawn = figures.field_vectors(field, CAMERA).svg.body
     assert '>scale: 0.2 px<' in drawn
     arrow = r'd="M([\d.]+),[\d.]+L[\d.]+,[\d.]+" fill="none" stroke="{}"[^>]*/><path d="M([\d.]+),'
@@ -54,7 +62,7 @@ def test_the_scale_is_that_of_the_arrows() -> None:
 
 
 def test_a_field_that_no_image_shows_is_not_drawn() -> None:
-    drawn = figures.field_vectors(DetectorField(640, 512, 0, np.array([[9e-4], [0.0]])), CAMERA)
+    drawn = figures.field_vectors(half_wave_along_u(6e-4), CAMERA)
     assert '>less than 0.001 px everywhere<' in drawn.svg.body and 'scale' not in drawn.svg.body
 
 
