@@ -27,10 +27,13 @@ START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
 SLOW_S = 5.0  # of processor time: more than a test of one second takes on any machine
 FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
-# Files of half a minute and more: last, one of them would keep one worker while the others wait.
+# Files of ten seconds and more, longest first: at the end, one of them would keep one worker while
+# the others wait.
 LONGEST = (
-    *('test_colcon', 'test_night_sky', 'test_monte_carlo', 'test_bench', 'test_kills'),
-    *('test_calibrate', 'test_diagnose', 'test_docs', 'test_set_up_mistakes'),
+    *('test_colcon', 'test_bench', 'test_night_sky', 'test_calibrate', 'test_monte_carlo'),
+    *('test_kills', 'test_output_files', 'test_untrusted_files', 'test_object_store'),
+    *('test_c_camera', 'test_gaia_catalog', 'test_set_up_mistakes', 'test_trend'),
+    *('test_recording', 'test_diagnose', 'test_overview', 'test_docs'),
     *('test_hostile_messages', 'test_set_camera_info_client', 'test_ros_tools'),
 )
 
@@ -42,7 +45,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that take longest."""
-    items.sort(key=lambda item: item.path.stem not in LONGEST)
+    place = {stem: k for k, stem in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @pytest.hookimpl(wrapper=True)

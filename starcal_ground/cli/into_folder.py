@@ -101,7 +101,7 @@ def calibrate_into(
             pictures = thumbnails.ordered(drawn.result())
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
     products.write_products(made.calibration, folder, made.residuals)
-    page, report, path = '', '', folder / product_files.REPORT_FILE
+    page, report, path = '', '', folder / outputs.REPORT_FILE
     if with_report:
         with drawings.kind('report'):
             page, report = _drawn(made, pictures, folder)
@@ -148,7 +148,7 @@ def _drawn(
     except ModuleNotFoundError as error:
         return '', f'no report: {missing_package(error, "report")}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
-    return page.render(content, folder), f'look at {folder / product_files.REPORT_FILE}'
+    return page.render(content, folder), f'look at {folder / outputs.REPORT_FILE}'
 
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:

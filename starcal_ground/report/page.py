@@ -22,7 +22,7 @@ import jinja2
 from markupsafe import Markup
 import numpy as np
 
-from starcal_ground import products
+from starcal_ground import outputs, products
 from starcal_ground.products import CAMERA_INFO_FILE
 from starcal_ground.report import figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
@@ -230,7 +230,7 @@ _PRODUCTS = (
     product_files.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
     products.RESIDUALS_FILE,
-    product_files.OBSERVATIONS_FILE,
+    outputs.OBSERVATIONS_FILE,
 )
 PDF_FILE = 'report.pdf'
 
@@ -260,7 +260,7 @@ def write_report(folder: Path) -> Path:
     failure = products.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
-    path = folder / product_files.REPORT_FILE
+    path = folder / outputs.REPORT_FILE
     product_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
@@ -268,7 +268,7 @@ def write_report(folder: Path) -> Path:
 def _read_folder(folder: Path) -> Found:
     residuals = folder / products.RESIDUALS_FILE
     observations, ensemble = (
-        folder / product_files.OBSERVATIONS_FILE,
+        folder / outputs.OBSERVATIONS_FILE,
         folder / product_files.STATE_ENSEMBLE,
     )
     calibration = product_files.read_calibration(product_files.calibration_file(folder))
@@ -375,7 +375,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
         for reason, count in record.images_refused.items()
     ]
     text = page_template('failure.html').render(record=record, pictures=pictures, refused=refused)
-    path = folder / product_files.REPORT_FILE
+    path = folder / outputs.REPORT_FILE
     product_files.write_atomically(path, text)
     return path
 

@@ -29,9 +29,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.outputs import make_folder
+from starcal_ground.outputs import make_folder, OBSERVATIONS_FILE
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:

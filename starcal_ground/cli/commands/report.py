@@ -15,8 +15,7 @@ for signatures (extra pdf).
 import argparse
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.outputs import check_outputs
-from starcal_ros.formats.products.product_files import REPORT_FILE
+from starcal_ground.outputs import check_outputs, REPORT_FILE
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
