@@ -381,7 +381,7 @@ def test_images_of_a_wrong_encoding(
         message.encoding = 'bgr8'
         return message
 
-    monkeypatch.setattr('starcal_ros.formats.bag.writer.image_to_message', colour)
+    monkeypatch.setattr('starcal_ground.bag_writer.image_to_message', colour)
     bag = tmp_path / 'colour.mcap'
     write_bag_of(bag, np.zeros((512, 640), np.uint8))
     monkeypatch.undo()

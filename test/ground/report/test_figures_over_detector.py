@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from starcal_ground.report import figures, svg
-from starcal_ros.camera import CameraModel
-from starcal_ros.camera.detector_field import DetectorField
+from starcal_ros.camera import CameraModel, pixel_grid
+from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.records import CameraGeometry, refused_image, StarObservations
 
 CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, -0.05, 0, 0, 0, 0]))
@@ -40,9 +40,9 @@ def test_outward_arrows_cover_no_number_of_the_axes() -> None:
 
 
 def test_the_scale_is_that_of_the_arrows() -> None:
-    """Arrows of a field that is 0.3 px along u have 1.5 times the length of 0.2 px."""
-    field = DetectorField(640, 512, 0, np.array([[0.3], [0.0]]))
-    drawn = figures.field_vectors(field, CAMERA).svg.body
+    """Arrows of 0.3 px along u have 1.5 times the length of 0.2 px."""
+    places = pixel_grid(CAMERA, 8, 6)
+    drawn = figures.arrows(CAMERA, places, np.tile([0.3, 0.0], (len(places), 1))).body
     assert '>scale: 0.2 px<' in drawn
     arrow = r'd="M([\d.]+),[\d.]+L[\d.]+,[\d.]+" fill="none" stroke="{}"[^>]*/><path d="M([\d.]+),'
     lengths = {}
@@ -54,7 +54,9 @@ def test_the_scale_is_that_of_the_arrows() -> None:
 
 
 def test_a_field_that_no_image_shows_is_not_drawn() -> None:
-    drawn = figures.field_vectors(DetectorField(640, 512, 0, np.array([[9e-4], [0.0]])), CAMERA)
+    coefficients = np.zeros((2, term_count(640, 512, 1)))
+    coefficients[0, 0] = 5e-4  # at most 7e-4 px
+    drawn = figures.field_vectors(DetectorField(640, 512, 1, coefficients), CAMERA)
     assert '>less than 0.001 px everywhere<' in drawn.svg.body and 'scale' not in drawn.svg.body
 
 
