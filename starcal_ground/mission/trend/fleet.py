@@ -32,7 +32,7 @@ import numpy as np
 from starcal_ground import outputs, products
 from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places, trend_table
-from starcal_ground.products import OBSERVATIONS_FILE
+from starcal_ground.outputs import OBSERVATIONS_FILE
 from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
