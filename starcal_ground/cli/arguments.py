@@ -15,7 +15,6 @@ from types import FrameType
 from typing import Any, NoReturn, TYPE_CHECKING, TypeVar
 
 from starcal_ground.cli.terminal import print_text
-from starcal_ground.outputs import check_outputs
 from starcal_ros.text import printable
 
 if TYPE_CHECKING:
@@ -163,6 +162,7 @@ def print_notes(notes: Sequence[str]) -> None:
 
 def check_file(output: Path, inputs: Sequence[Path]) -> None:
     """`check_outputs` of one file, which is no product beside an input either."""
+    from starcal_ground.outputs import check_outputs
     from starcal_ground.products import PRODUCT_FILES
 
     beside = [file.with_name(name) for file in inputs for name in PRODUCT_FILES]

@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict
-from starcal_ground.outputs import make_folder
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import NotFromStars, OptionError
 from starcal_ros.text import significant
@@ -118,6 +117,7 @@ def _source_by_stars(
     """Photographs, or bags without attitudes: those of their stars are written to a folder."""
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import night_sky
+    from starcal_ground.outputs import make_folder
     from starcal_ros.pipeline.campaign import source_of
 
     params = list(filter(None, [args.params]))

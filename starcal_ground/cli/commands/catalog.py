@@ -14,7 +14,6 @@ import argparse
 from pathlib import Path
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.outputs import check_outputs
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -27,6 +26,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.ingest.gaia_catalog import refusals, write_deep_catalog
+    from starcal_ground.outputs import check_outputs
 
     output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
     check_outputs([output], [args.table])

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.outputs import check_outputs, make_folder
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -41,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli import node_processes
     from starcal_ground.cli.commands.compare import with_truth
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
+    from starcal_ground.outputs import check_outputs, make_folder
     from starcal_ground.products import write_products
     from starcal_ground.report import page
     from starcal_ros.pipeline.campaign import source_of

@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.outputs import make_folder, OBSERVATIONS_FILE
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
 
@@ -70,6 +69,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
+    from starcal_ground.outputs import make_folder
     from starcal_ground.products import OBSERVATIONS_TOPIC
     from starcal_ros.formats.bag.reader import read_observations
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
@@ -103,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _observations_of(calibration: Path) -> Path:
+    from starcal_ground.outputs import OBSERVATIONS_FILE
     from starcal_ros.formats.products.product_files import calibration_file
 
     path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import errors_as, OptionError
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.text import significant
 from starcal_ros.untrusted import PRODUCT_BYTES, read_text
 
@@ -61,6 +60,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.planning.plan import Cone, plan_pointings, Request
     from starcal_ros.formats.bag import reader
+    from starcal_ros.formats.products.product_files import write_atomically
     from starcal_ros.pipeline.campaign import calibrate_bags
     from starcal_ros.pipeline.setup import files_of, read_setup
 

@@ -15,7 +15,6 @@ for signatures (extra pdf).
 import argparse
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.outputs import check_outputs, REPORT_FILE
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -26,6 +25,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.outputs import check_outputs, REPORT_FILE
     from starcal_ground.report import page
 
     names = (REPORT_FILE, page.PDF_FILE) if args.pdf else (REPORT_FILE,)
