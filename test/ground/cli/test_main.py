@@ -612,7 +612,7 @@ def test_without_ros_one_line_names_the_remedy(
 def test_parameters_of_the_nodes_are_known_to_the_tool(
     run: Run, tmp_path: Path, params: Callable[..., Path]
 ) -> None:
-    shared = params(autostart=True, wait_for_topic='x', use_sim_time=True, max_change_px=1e-6)
+    shared = params(autostart=True, attitude_timeout_s=2.0, use_sim_time=True, max_change_px=1e-6)
     status, _, err = run('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
     assert (status, err) == (3, '')
 
