@@ -18,6 +18,7 @@ from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
+    flat_array,
     Make,
     make_header,
     Message,
@@ -51,19 +52,32 @@ _NOT_SENT = ('model_checks', 'statements')
 def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
     """Return a starcal/StarObservations; ``frame_id`` is the camera's."""
     values = plain_record(record)
-    return make(OBSERVATIONS_TYPE, **message_fields(StarObservations, values, make, frame_id))
+    refused = values.pop('refused_stars')
+    if values['velocity_sigma_m_s'] == 0:
+        values['velocity_sigma_m_s'] = _EXACT_VELOCITY
+    return make(
+        OBSERVATIONS_TYPE,
+        **message_fields(StarObservations, values, make, frame_id),
+        refused_star_reasons=list(refused),
+        refused_star_counts=flat_array(list(refused.values()), np.uint32),
+    )
 
 
 def observations_from_message(message: Message) -> StarObservations:
     """
     Observations of a starcal/StarObservations.
 
-    Fields that a sender leaves at ROS's zeros have their defaults.
+    Fields that a sender leaves at ROS's zeros have their defaults, as have those that the message
+    of an older recording lacks.
 
     Raises ValueError when the arrays of the message do not fit each other or hold values that no
     star can have.
     """
     values = plain_message(StarObservations, message)
+    reasons, counts = message.refused_star_reasons, message.refused_star_counts
+    if len(reasons) != len(counts):
+        raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
+    values['refused_stars'] = dict(zip(reasons, counts, strict=True))
     values['detail'] = values['detail'][:_LONGEST_DETAIL]
     _forget_zeros(values)
     record = read_record(StarObservations, values)

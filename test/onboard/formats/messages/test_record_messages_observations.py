@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,11 +35,7 @@ def test_observations_round_trip(make: Any) -> None:
         ('measured_px', np.zeros(9), 'measured_px: 9 numbers, not 5 x 2'),
         ('measured_px', np.full(10, np.nan), r'measured_px\[0\]\[0\]: nan is not a finite number'),
         ('covariance_px2', np.zeros(15), 'not positive definite'),
-        (
-            'refused_stars',
-            [SimpleNamespace(reason='blend', count=-1)],
-            'refused_stars.blend: -1 is not',
-        ),
+        ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
         ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
         ('refused_star_px', np.full(8, np.inf), r'refused_star_px\[0\]\[0\]: inf is not a finite'),
         ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is not one of 2 reasons'),
@@ -127,6 +122,20 @@ def test_refused_stars_are_found_by_reason() -> None:
     assert list(places) == ['blend', 'saturated']
     np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
+
+
+def test_older_observations_are_read() -> None:
+    """Recordings are kept: fields that were added since have their defaults."""
+    message = observations_to_message(observations(), 'cam', plain)
+    del message.temperature_degc, message.zenith_icrf, message.refraction_arcsec
+    del message.refused_star_id, message.refused_star_px, message.refused_star_reason
+    del message.star_tracker_rate_rad_s, message.star_tracker_rate_sigma_rad_s
+    del message.velocity_sigma_m_s, message.star_tracker
+    record = observations_from_message(message)
+    assert np.isnan(record.temperature_degc) and np.isnan(record.velocity_sigma_m_s)
+    assert np.isnan(record.star_tracker_rate_rad_s).all() and np.isnan(record.zenith_icrf).all()
+    assert record.refused_stars == {'blend': 3, 'saturated': 1}
+    assert record.refused_px.shape == (0, 2)
 
 
 STAR_FIELDS = ('catalog_id', 'direction_icrf', 'measured_px', 'covariance_px2')
