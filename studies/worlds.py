@@ -485,10 +485,8 @@ WORLDS = {
     'rolling_slow': World(rate_deg_s=_SLOW_DEG_S, row_s=20e-6),
     'rolling_fast': World(rate_deg_s=_FAST_DEG_S, row_s=20e-6),
     **{
-        f'noisy_rate_{hz}hz': World(
-            rate_deg_s=0.1, row_s=20e-6, tracker_arcsec=10.0, tracker_hz=hz
-        )
-        for hz in (4, 10)
+        name: World(rate_deg_s=0.1, row_s=20e-6, tracker_arcsec=10.0, tracker_hz=hz)
+        for name, hz in (('noisy_rate_4hz', 4.0), ('noisy_rate_10hz', 10.0))
     },
     'filtered_rate': World(
         rate_deg_s=0.1, row_s=20e-6, tracker_arcsec=10.0, tracker_hz=10.0, filter_s=0.5

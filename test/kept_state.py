@@ -11,6 +11,7 @@ import itertools
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import numpy as np
 from sample_records import calibration  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
@@ -22,7 +23,12 @@ from starcal_ros.ros.state import Activation
 
 @functools.cache
 def images() -> tuple[StarObservations, ...]:
-    return true_observations(scenario('tiny', seed=7)).images
+    observed = true_observations(scenario('tiny', seed=7)).images
+    # A message cannot tell a rate of zero without a sigma from one that is not known.
+    sigma_rad_s = np.full(3, 1e-6)
+    return tuple(
+        dataclasses.replace(o, star_tracker_rate_sigma_rad_s=sigma_rad_s) for o in observed
+    )
 
 
 def activation(event: int, before: int = 0, number: int = 0) -> Activation:

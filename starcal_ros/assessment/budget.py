@@ -124,6 +124,8 @@ def statements(
     scopes = (('camera', 'map_arcsec'), ('pointing', 'pointing_arcsec'))[: 1 + has_alignment]
     rows = []
     for part in parts:
+        if not max(part.map_arcsec, part.pointing_arcsec) > 0:
+            continue
         option, value, left = _to_state(part.cause, estimate, options)
         for scope, of in scopes if option else ():
             before, gone = getattr(total, of), getattr(part, of)

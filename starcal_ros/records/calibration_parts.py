@@ -220,6 +220,9 @@ class Statement:
 
     ``scope`` is ``pointing``, lines of sight in the star tracker frame, or ``camera``, those of
     the camera alone, RMS over the detector; ``value`` is what the option would be set to.
+
+    >>> str(Statement('star_tracker_slow_arcsec', '5', 'pointing', 77.0, 11.0))
+    'state star_tracker_slow_arcsec: pointing 77″ becomes 11″ if it is 5'
     """
 
     option: str
