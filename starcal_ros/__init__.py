@@ -61,9 +61,9 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
         if name not in __all__:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         if name == '__version__':
-            from importlib import metadata
+            from starcal_ros.constants import software_version
 
-            value: object = metadata.version(__name__)
+            value: object = software_version()
         else:
             from starcal_ros import api
 

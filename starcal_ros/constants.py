@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Physical and angular constants, each with its authority; the text form of a stamp."""
+"""Physical and angular constants, each with its authority; texts of a stamp and of the version."""
 
 from __future__ import annotations
 
@@ -23,3 +23,13 @@ def utc_text(time_ns: int) -> str:
 
 
 MAX_STAMP_NS = 2**31 * NANOSECONDS_PER_SECOND - 1  # builtin_interfaces/Time: int32 seconds
+
+
+def software_version() -> str:
+    """Version of the installed package; 'unknown' in a source tree that is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version('starcal_ros')
+    except metadata.PackageNotFoundError:
+        return 'unknown'

@@ -19,10 +19,10 @@ import time
 from starcal_ground.cli import terminal
 from starcal_ground.outputs import make_folder
 from starcal_ground.simulation.scenario import scenario
+from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.solve import software_version
 from studies import monte_carlo, paper, study_figures, summary
 from studies.monte_carlo import Design, Row
 from studies.workers import processors, run_each

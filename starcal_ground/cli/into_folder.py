@@ -16,12 +16,13 @@ from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
 from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
+from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import campaign
-from starcal_ros.pipeline.solve import inputs_of, software_version
+from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 if TYPE_CHECKING:

@@ -159,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
     """Run the command of a command line."""
     if args.version:
-        from starcal_ros.pipeline.solve import software_version
+        from starcal_ros.constants import software_version
 
         terminal.print_text(f'starcal {software_version()}')
     elif args.command is None:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import json
 import math
 import os
@@ -29,7 +28,7 @@ from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.camera.projection import convert, ros_fit
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import errors_as, OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
@@ -354,11 +353,3 @@ def _digest(ensemble: Ensemble) -> str:
         if not math.isnan(image.temperature_degc):
             digest.update(np.array(image.temperature_degc, '<f8').tobytes())
     return digest.hexdigest()
-
-
-def software_version() -> str:
-    """Version of the installed package; 'unknown' in a source tree that is not installed."""
-    try:
-        return importlib.metadata.version('starcal_ros')
-    except importlib.metadata.PackageNotFoundError:
-        return 'unknown'

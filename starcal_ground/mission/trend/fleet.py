@@ -34,6 +34,7 @@ from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ground.outputs import OBSERVATIONS_FILE
 from starcal_ros import untrusted
+from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -41,7 +42,6 @@ from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
-from starcal_ros.pipeline.solve import software_version
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Calibration, StarObservations

@@ -31,10 +31,9 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import replacing
-from starcal_ros.pipeline.solve import software_version
 from starcal_ros.record_fields import check_shape, Count, Finite, json_object, read_record, Stamp
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable
 from starcal_ros.text import printable
