@@ -109,7 +109,17 @@ def lead_links(app: Sphinx, name: str, content: list[str]) -> None:
         content[0] = led_to_copies(content[0], path, path)
 
 
+def show_examples(
+    app: Sphinx, what: str, name: str, module: object, options: object, lines: list[str]
+) -> None:
+    """Show the examples of a command, which end the help that its module has, as they are."""
+    if name.startswith('starcal_ground.cli.commands.') and what == 'module':
+        first = next((k for k, line in enumerate(lines) if line.startswith('  ')), len(lines))
+        lines[first:first] = ['::', '']
+
+
 def setup(app: Sphinx) -> None:
     """Sphinx calls this."""
+    app.connect('autodoc-process-docstring', show_examples)
     app.connect('builder-inited', write_copies, priority=100)  # before autosummary looks for files
     app.connect('source-read', lead_links)
