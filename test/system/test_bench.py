@@ -110,15 +110,15 @@ def test_acquisition_bench() -> None:
 
 
 def test_a_match_that_is_right_in_a_part_of_the_image_is_refused() -> None:
-    """A crowded field 2.34 degrees off: 51 stars of a corner are right, 13 others chance."""
+    """A field 2.13 degrees off: the stars of a corner are right, the others chance."""
     rng = np.random.default_rng([acquisition.SEED, 1])
     scenario = acquisition.random_fields(rng, 40)
     kind = acquisition.SCRAMBLES['true stars, attitude 2 to 8 degrees off']
     fields = acquisition.scrambled_images(kind, scenario, rng, 100)
-    image, drawn, attitudes = [next(fields) for _ in range(8)][7]
+    image, drawn, attitudes = [next(fields) for _ in range(4)][3]
     right = Rotation.from_quat(drawn.icrf_from_star_tracker_xyzw)
     off_deg = np.degrees((right.inv() * Rotation.from_quat(attitudes)).magnitude())
-    shot = Exposure(image, attitudes[int(np.abs(off_deg - 2.34).argmin())], 0.0)
+    shot = Exposure(image, attitudes[int(np.abs(off_deg - 2.13).argmin())], 0.0)
     with pytest.raises(ImageRefused, match='part of the image'):
         observe_stars(
             shot,
