@@ -8,6 +8,7 @@ signal ends it, without a traceback.
 
 from __future__ import annotations
 
+import _thread
 import array
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -48,6 +49,7 @@ from starcal_ros.text import printable
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
 
+_ANSWERED_S = 0.5  # after a signal, by which the thread of rclpy has shut ROS down
 _SILENT_S = 5.0
 _TRIM_S = 10.0
 
@@ -407,18 +409,30 @@ def until_told_to_end(
 
 def _record_signals() -> list[int]:
     """
-    Handle SIGINT and SIGTERM by adding them to the list returned, and by nothing else.
+    Handle SIGINT and SIGTERM by adding them to the list returned.
 
     The handler of rclpy calls this one and shuts the context down, which ends every loop.  A
     KeyboardInterrupt in its place may hit the entry of a `threading.Condition` of the executor;
     its lock is then never released, and the threads that wait for it never end
-    (python/cpython#74174).
+    (python/cpython#74174).  On a signal during `rclpy.init` the handler of rclpy may meet no
+    context yet, and this one be called after it: a thread then shuts the context down.
     """
     told: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        told.append(number)
+        _thread.start_new_thread(_shut_down_late, ())  # `threading` would take a lock of Python's
+
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, lambda number, _frame: told.append(number))
+            signal.signal(number, note)
     return told
+
+
+def _shut_down_late() -> None:
+    time.sleep(_ANSWERED_S)
+    if rclpy.ok():
+        shut_down()
 
 
 def shut_down() -> None:
