@@ -198,7 +198,10 @@ def _disc(axis: Floats, count: int, radius_rad: float, rng: np.random.Generator)
     z = rng.uniform(math.cos(radius_rad), 1.0, count)
     angle, r = rng.uniform(0.0, 2 * math.pi, count), np.sqrt(1.0 - z * z)
     local = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
-    turn, _ = Rotation.align_vectors(axis[None], [[0.0, 0.0, 1.0]])
+    # The smallest rotation; SciPy 1.11 warns of a single pair of vectors in `align_vectors`.
+    about = np.cross([0.0, 0.0, 1.0], axis)
+    sine = float(np.linalg.norm(about))
+    turn = Rotation.from_rotvec(about * (math.atan2(sine, axis[2]) / max(sine, 1e-300)))
     return np.asarray(turn.apply(local))
 
 
