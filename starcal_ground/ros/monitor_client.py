@@ -27,7 +27,7 @@ from starcal_ros.formats.messages.record_messages import (
     status_from_message,
 )
 from starcal_ros.ros.inputs import LATCHED
-from starcal_ros.ros.node import end_quietly, until_told_to_end
+from starcal_ros.ros.node import end_quietly, is_overdue, until_told_to_end
 
 NAME = 'monitor'
 _PREFIX = 'starcal: '  # of the diagnostics of our nodes
@@ -99,7 +99,7 @@ def run(monitor: Monitor, once_after_s: float | None, console: Console) -> int:
         console.print(view(monitor.received))
         return 0
     with Live(view(monitor.received), console=console, auto_refresh=False, screen=True) as live:
-        while monitor.context.ok():
+        while monitor.context.ok() and not is_overdue():
             deadline_s = time.monotonic() + _PERIOD_S
             while (left_s := deadline_s - time.monotonic()) > 0:
                 rclpy.spin_once(monitor, timeout_sec=left_s)

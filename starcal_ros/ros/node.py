@@ -8,7 +8,6 @@ signal ends it, without a traceback.
 
 from __future__ import annotations
 
-import _thread
 import array
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -49,7 +48,8 @@ from starcal_ros.text import printable
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
 
-_ANSWERED_S = 0.5  # after a signal, by which the thread of rclpy has shut ROS down
+_ANSWERED_S = 1.0  # after a signal, by which the thread of rclpy has shut ROS down
+_told: list[float] = []  # times of the signals
 _SILENT_S = 5.0
 _TRIM_S = 10.0
 
@@ -407,32 +407,30 @@ def until_told_to_end(
         end()
 
 
-def _record_signals() -> list[int]:
+def _record_signals() -> list[float]:
     """
-    Handle SIGINT and SIGTERM by adding them to the list returned.
+    Handle SIGINT and SIGTERM by adding their time to the list returned, and by nothing else.
 
     The handler of rclpy calls this one and shuts the context down, which ends every loop.  A
     KeyboardInterrupt in its place may hit the entry of a `threading.Condition` of the executor;
     its lock is then never released, and the threads that wait for it never end
-    (python/cpython#74174).  On a signal during `rclpy.init` the handler of rclpy may meet no
-    context yet, and this one be called after it: a thread then shuts the context down.
+    (python/cpython#74174).
     """
-    told: list[int] = []
-
-    def note(number: int, _frame: object) -> None:
-        told.append(number)
-        _thread.start_new_thread(_shut_down_late, ())  # `threading` would take a lock of Python's
-
+    _told.clear()
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, note)
-    return told
+            signal.signal(number, lambda _number, _frame: _told.append(time.monotonic()))
+    return _told
 
 
-def _shut_down_late() -> None:
-    time.sleep(_ANSWERED_S)
-    if rclpy.ok():
-        shut_down()
+def is_overdue() -> bool:
+    """
+    Return True if a signal came that rclpy has not answered: a loop then ends by itself.
+
+    During `rclpy.init` the handler of rclpy may meet no context to shut down, and the handler here
+    be called after the question whether a signal came.
+    """
+    return bool(_told) and time.monotonic() > _told[0] + _ANSWERED_S
 
 
 def shut_down() -> None:
@@ -472,7 +470,7 @@ def _start(node: StarcalNode) -> bool:
 
 
 def _spin(node: StarcalNode, executor: Executor) -> None:
-    while node.context.ok():
+    while node.context.ok() and not is_overdue():
         try:
             executor.spin_once(timeout_sec=1.0)
         except ExternalShutdownException:
