@@ -32,7 +32,14 @@ from starcal_ros.formats.messages.message_codec import (
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import PlayerOptions
 from starcal_ros.ros.inputs import LATCHED
-from starcal_ros.ros.node import end_quietly, Executor, message_class, shut_down, until_told_to_end
+from starcal_ros.ros.node import (
+    end_quietly,
+    Executor,
+    is_overdue,
+    message_class,
+    shut_down,
+    until_told_to_end,
+)
 from starcal_ros.ros.parameters import OptionParameters
 from starcal_ros.ros.printable_log import PrintableLog
 
@@ -204,7 +211,7 @@ class BagPlayer(PrintableLog):
             time.sleep(min(left_s, _POLL_S))
 
     def _check_shutdown(self) -> None:
-        if not self.context.ok():
+        if not self.context.ok() or is_overdue():
             raise ExternalShutdownException
 
     def _tell_time(self, time_ns: int) -> None:
