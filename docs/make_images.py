@@ -24,7 +24,7 @@ import yaml
 
 from starcal_ground.cli import main as cli
 from starcal_ground.products import write_camera_info
-from starcal_ground.report.figures import (
+from starcal_ground.report.detector_figures import (
     cell_counts,
     distortion_contours,
     distortion_vectors,

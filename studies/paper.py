@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from starcal_ground.report.figures import (
+from starcal_ground.report.detector_figures import (
     distortion_contours,
     distortion_vectors,
-    outline,
     star_cloud,
 )
+from starcal_ground.report.figures import outline
 from starcal_ground.report.svg import Curve, Drawing, GRID, INK, Panel, plot, SERIES, sheet
 from starcal_ground.simulation.rendering import fixed_pattern, render
 from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenario, scene

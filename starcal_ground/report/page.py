@@ -24,7 +24,7 @@ import numpy as np
 
 from starcal_ground import outputs, products
 from starcal_ground.products import CAMERA_INFO_FILE
-from starcal_ground.report import figures, thumbnails, verdict
+from starcal_ground.report import detector_figures, figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
 from starcal_ground.report.thumbnails import star_of, Thumbnail
 from starcal_ground.report.verdict import Row
@@ -387,22 +387,22 @@ def charts_of(
     geometry, prior = calibration.geometry, products.prior_of(calibration)
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, Chart | None] = {
-        'vectors': figures.distortion_vectors(camera),
-        'contours': figures.distortion_contours(camera),
-        'sky': figures.pointings(observations, geometry),
+        'vectors': detector_figures.distortion_vectors(camera),
+        'contours': detector_figures.distortion_contours(camera),
+        'sky': detector_figures.pointings(observations, geometry),
     }
     if prior is not None:
-        charts['change'] = figures.change_contours(prior, geometry)
+        charts['change'] = detector_figures.change_contours(prior, geometry)
     if (field := camera.moving_field) is not None:
-        charts['lens_field'] = figures.field_vectors(field, camera)
+        charts['lens_field'] = detector_figures.field_vectors(field, camera)
     if maps is not None:
-        charts['cells'] = figures.cell_counts(maps.stars, camera)
-        charts['shape'] = figures.line_of_sight_sigma(maps, camera, is_alone=True)
-        charts['line_of_sight'] = figures.line_of_sight_sigma(maps, camera, False)
+        charts['cells'] = detector_figures.cell_counts(maps.stars, camera)
+        charts['shape'] = detector_figures.line_of_sight_sigma(maps, camera, is_alone=True)
+        charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
     if calibration.sigma_budget:
         parts = parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
-        charts['causes'] = figures.budget_over_detector(parts, camera)
+        charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if residuals is not None and residuals.used.any():
         charts |= _residual_charts(calibration, residuals)
         if prior is not None:
@@ -414,9 +414,9 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
     camera = calibration.geometry.camera
     sigma_arcsec = calibration.star_tracker_sigma_arcsec
     return {
-        'coverage': figures.star_coverage(residuals, camera),
+        'coverage': detector_figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
-        'field': figures.mean_residuals(residuals, camera),
+        'field': detector_figures.mean_residuals(residuals, camera),
         'spectrum': figures.spectrum(residuals, camera),
         'histogram': figures.histogram(residuals),
         'magnitude': figures.residuals_against_magnitude(residuals),

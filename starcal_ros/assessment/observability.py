@@ -23,12 +23,12 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import information_of_images, stars_alone, StarSums
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.outliers import FEWEST_STARS
 from starcal_ros.estimation.problem import image_blocks, Problem, State
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.temperature import why_unsupported
 from starcal_ros.estimation.unknowns import unknowns_in_state
-from starcal_ros.estimation.weights import FEWEST_STARS
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,

@@ -30,6 +30,7 @@ from starcal_ros.estimation.options import (
     check_enough,
     check_options,
 )
+from starcal_ros.estimation.outliers import dropped_stars
 from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
 from starcal_ros.estimation.problem import (
     AttitudeErrors,
@@ -71,7 +72,6 @@ from starcal_ros.estimation.weights import (
     CentroidVariance,
     Data,
     degrees_of_freedom,
-    dropped_stars,
     FREE_FACTOR,
     judge,
     Judged,

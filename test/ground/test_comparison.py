@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ground import comparison
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
-from starcal_ground.report.figures import write_comparison
+from starcal_ground.report.detector_figures import write_comparison
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         return arguments.EXIT_ACCEPTED
     result = comparison.compare(*map(read_calibration, files))
     if args.output:
-        from starcal_ground.report.figures import write_comparison
+        from starcal_ground.report.detector_figures import write_comparison
 
         arguments.check_file(args.output, files)
         write_comparison(result, args.output)

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from starcal_ground.report import figures, svg
+from starcal_ground.report import detector_figures, svg
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.records import CameraGeometry, refused_image, StarObservations
@@ -21,7 +21,7 @@ def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
     camera = CameraModel(
         width, height, np.array([1800.0, 0, 1800, width / 2, height / 2, -0.05, 0, 0, 0, 0])
     )
-    drawn = figures.distortion_vectors(camera).svg.__html__()
+    drawn = detector_figures.distortion_vectors(camera).svg.__html__()
     assert re.search(r'>scale: [\d.]+ px<', drawn)
     wide, high = map(float, re.findall(r'viewBox="0 0 (\d+) ([\d.]+)"', drawn)[0])
     tips = re.findall(rf'd="M([\d.]+),([\d.]+)L[^"]*Z" fill="{re.escape(svg.SERIES[1])}"', drawn)
@@ -30,7 +30,7 @@ def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
 
 
 def test_outward_arrows_cover_no_number_of_the_axes() -> None:
-    drawn = figures.distortion_vectors(CAMERA.replace(k1=0.05)).svg
+    drawn = detector_figures.distortion_vectors(CAMERA.replace(k1=0.05)).svg
     tips = re.findall(
         rf'd="M([\d.]+),([\d.]+)L[^"]*Z" fill="{re.escape(svg.SERIES[0])}"', drawn.body
     )
@@ -50,7 +50,7 @@ def test_the_scale_is_that_of_the_arrows() -> None:
     first_arrow_px = np.array([[19.5, 20.8]])
     field = half_wave_along_u(1.0)
     field = half_wave_along_u(0.3 / field.displacement_px(first_arrow_px)[0, 0])
-    drawn = figures.field_vectors(field, CAMERA).svg.body
+    drawn = detector_figures.field_vectors(field, CAMERA).svg.body
     assert '>scale: 0.2 px<' in drawn
     arrow = r'd="M([\d.]+),[\d.]+L[\d.]+,[\d.]+" fill="none" stroke="{}"[^>]*/><path d="M([\d.]+),'
     lengths = {}
@@ -62,31 +62,31 @@ def test_the_scale_is_that_of_the_arrows() -> None:
 
 
 def test_a_field_that_no_image_shows_is_not_drawn() -> None:
-    drawn = figures.field_vectors(half_wave_along_u(6e-4), CAMERA)
+    drawn = detector_figures.field_vectors(half_wave_along_u(6e-4), CAMERA)
     assert '>less than 0.001 px everywhere<' in drawn.svg.body and 'scale' not in drawn.svg.body
 
 
 def test_no_displacement_is_said() -> None:
     ideal = CAMERA.replace(k1=0.0)
-    assert '>no displacement<' in figures.distortion_vectors(ideal).svg.body
-    assert '>0 px everywhere<' in figures.distortion_contours(ideal).svg.body
+    assert '>no displacement<' in detector_figures.distortion_vectors(ideal).svg.body
+    assert '>0 px everywhere<' in detector_figures.distortion_contours(ideal).svg.body
 
 
 def test_a_flat_map_says_so_and_others_start_at_zero() -> None:
     flat = np.full((25, 25), 5.774)
     flat[0, 0] = 5.802
-    assert '>flat within 0.48 %<' in figures.detector_map(flat, CAMERA, '″').body
+    assert '>flat within 0.48 %<' in detector_figures.detector_map(flat, CAMERA, '″').body
     steep = np.linspace(1.0, 8.0, 625, dtype=np.float64).reshape(25, 25)
-    drawn = figures.detector_map(steep, CAMERA, '″').body
+    drawn = detector_figures.detector_map(steep, CAMERA, '″').body
     assert 'flat' not in drawn and '>0″<' in drawn and '>8″<' in drawn
-    assert '>unknown<' in figures.detector_map(np.full((3, 3), np.nan), CAMERA, '″').body
+    assert '>unknown<' in detector_figures.detector_map(np.full((3, 3), np.nan), CAMERA, '″').body
 
 
 def test_the_projection_of_the_sky() -> None:
     """Hammer: x = -2 sqrt(2) cos(d) sin(a/2) / sqrt(1 + cos(d) cos(a/2)), of unit area scale."""
     root2 = np.sqrt(2.0)
     longitude_deg, latitude_deg = np.array([0.0, 0, 0, 90, 180]), np.array([0.0, 90, -90, 0, 0])
-    x, y = figures.hammer(np.radians(longitude_deg), np.radians(latitude_deg))
+    x, y = detector_figures.hammer(np.radians(longitude_deg), np.radians(latitude_deg))
     quarter = -2 * root2 * np.sin(np.pi / 4) / np.sqrt(1 + np.cos(np.pi / 4))
     np.testing.assert_allclose(x, [0, 0, 0, quarter, -2 * root2], atol=1e-9)
     np.testing.assert_allclose(y, [0, root2, -root2, 0, 0], atol=1e-9)
@@ -102,15 +102,15 @@ def test_pointings_count_images_with_an_attitude() -> None:
         ),
         refused_image(3, 640, 512, 'no_attitude', ''),
     ]
-    chart = figures.pointings(seen, geometry)
+    chart = detector_figures.pointings(seen, geometry)
     assert chart is not None and 'Footprints of 2 images' in chart.text
     # A footprint and its line in the legend.
     assert [chart.svg.body.count(colour) for colour in svg.SERIES[:2]] == [2, 2]
-    assert figures.pointings(seen[2:], geometry) is None
+    assert detector_figures.pointings(seen[2:], geometry) is None
 
 
 def test_labels_of_contours_are_inside_the_frame_and_on_no_other_line() -> None:
-    drawn = figures.distortion_contours(CAMERA.replace(k1=-0.4, k2=0.3)).svg.body
+    drawn = detector_figures.distortion_contours(CAMERA.replace(k1=-0.4, k2=0.3)).svg.body
     x, bottom, right, y = map(
         float, re.findall(r'"M([\d.]+),[\d.]+V([\d.]+)H([\d.]+)V([\d.]+)Z"', drawn)[0]
     )

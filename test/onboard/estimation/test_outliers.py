@@ -12,14 +12,14 @@ import pytest
 from scipy.stats import chi2
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.estimation.shared_errors import Groups, pairs_of
-from starcal_ros.estimation.star_equations import StarTable
-from starcal_ros.estimation.weights import (
+from starcal_ros.estimation.outliers import (
     dropped_stars,
     FEWEST_STARS,
     fitting_stars,
     misfit_images,
 )
+from starcal_ros.estimation.shared_errors import Groups, pairs_of
+from starcal_ros.estimation.star_equations import StarTable
 
 IMAGES, STARS = 12, 30
 SIGMA_PX = 0.2

@@ -1,0 +1,464 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Figures over the detector and over the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import functools
+from pathlib import Path
+from typing import Any
+
+import contourpy
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.comparison import Comparison, DifferenceMap
+from starcal_ground.report import svg
+from starcal_ground.report.verdict import VISIBLE_PX
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
+from starcal_ros.camera.detector_field import DetectorField
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.records import (
+    BUDGET_COLUMNS,
+    BUDGET_ROWS,
+    CameraGeometry,
+    DetectorMaps,
+    SigmaPart,
+    StarObservations,
+)
+from starcal_ros.text import significant
+
+FLAT = 0.02  # relative range below which a map counts as flat
+_MOST_HEIGHT = 400.0
+_ROUNDING_PX = 1e-9  # smaller displacements (px) and sigmas (arcsec) are rounding errors
+_LEVELS = 5
+_BAR = 84.0  # units of the view box beside a map, for the bar of its colours
+_TOP, _BELOW = 26.0, 40.0
+_DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps; the same on a dark page
+_BUDGET_MAPS = 6
+_BUDGET_SHARE = 0.1  # fraction of the sigma; the map of a smaller cause would be dark everywhere
+_GAP = 10.0
+_SHORT = 20  # columns, of which one is the longest arrow from the middle of a cell
+_FOOTPRINTS = 200  # most footprints drawn on the sky
+
+
+def over_detector(camera: CameraModel, right: float = 12.0) -> svg.Panel:
+    """Panel with the aspect ratio of the detector and its axes."""
+    left = 54.0
+    wide = svg.WIDTH - left - right
+    high = wide * camera.height / camera.width
+    if high > _MOST_HEIGHT:
+        wide, high = wide * _MOST_HEIGHT / high, _MOST_HEIGHT
+    x = svg.Scale(-0.5, camera.width - 0.5, left, left + wide)
+    y = svg.Scale(-0.5, camera.height - 0.5, _TOP, _TOP + high)
+    panel = svg.Panel(x, y)
+    panel.axes('column u (px)', 'row v (px)', svg.named(x), svg.named(y), is_framed=True)
+    return panel
+
+
+def _drawn(panel: svg.Panel, *others: svg.Panel) -> svg.Drawing:
+    return panel.drawing(panel.y.end + _BELOW, *others)
+
+
+def star_cloud(measured_px: Floats, camera: CameraModel) -> svg.Drawing:
+    """Positions (n, 2) of stars on the detector."""
+    panel = over_detector(camera)
+    radius = float(np.clip(60.0 / np.sqrt(max(len(measured_px), 1)), 0.7, 1.8))
+    panel.cloud(measured_px, radius, 0.8)
+    return _drawn(panel)
+
+
+def star_coverage(residuals: Residuals, camera: CameraModel) -> svg.Chart:
+    """Positions of all used stars on the detector (paper, Fig. 5)."""
+    measured_px = residuals.measured_px[residuals.used]
+    text = f'All {len(measured_px):,} used star observations of all images.'
+    return svg.Chart('Star positions', star_cloud(measured_px, camera), text)
+
+
+def cell_counts(stars: NDArray[np.int64], camera: CameraModel) -> svg.Chart:
+    """Star counts (rows, columns) in equal cells of the detector; those of empty cells are red."""
+    panel = over_detector(camera, right=_BAR)
+    rows, columns = stars.shape
+    most = max(int(stars.max()), 1)
+    panel.picture(_coloured(np.kron(255 * stars / most, np.ones((16, 16)))))
+    for (row, column), count in np.ndenumerate(stars):
+        u = (column + 0.5) / columns * camera.width - 0.5
+        v = (row + 0.5) / rows * camera.height - 0.5
+        size = min(svg.LETTER, 124.0 / columns)
+        panel.text(u, v, str(count), _DARK if count else _BAD, _BRIGHT, size)
+    return svg.Chart(
+        'Stars per cell',
+        _drawn(panel, _bar(panel, float(most), '')),
+        f'Used star observations in {stars.size} equal cells: {int(stars.min())} to '
+        f'{int(stars.max())} per cell, {int((stars == 0).sum())} cells empty.',
+    )
+
+
+def distortion_vectors(camera: CameraModel) -> svg.Chart:
+    """Distortion as arrows (paper, Fig. 6 left)."""
+    places, columns = pixel_grid(camera, 17, 13), 16
+    shift_px = distortion_px(camera, places)
+    middle = 0.5 * (np.array([camera.width, camera.height]) - 1)
+    if ((places - middle) * shift_px).sum() > 0.0:  # outwards, over the numbers of the axes
+        places, columns = _middles_of_cells(camera), _SHORT
+        shift_px = distortion_px(camera, places)
+    return svg.Chart(
+        'Distortion vectors',
+        arrows(camera, places, shift_px, columns),
+        'Displacement of a star from its position with an ideal lens (dot). Arrows are '
+        'enlarged; the arrow above the figure is their scale.',
+    )
+
+
+def distortion_contours(camera: CameraModel) -> svg.Chart:
+    """Length of the distortion in pixels (paper, Fig. 6 right)."""
+    shift = distortion_px(camera, pixel_grid(camera, 60, 48))
+    return svg.Chart(
+        'Distortion magnitude',
+        detector_map(np.hypot(*shift.T).reshape(48, 60), camera, ' px'),
+        'Contours of the length of the distortion vectors; longer ones are thicker.',
+    )
+
+
+def change_contours(before: CameraGeometry, after: CameraGeometry) -> svg.Chart:
+    """Change of the lines of sight in pixels, common rotation removed."""
+    _, moved_px = movement(before, after, 60, 48)
+    return svg.Chart(
+        'Change relative to the prior',
+        detector_map(moved_px.reshape(48, 60), after.camera, ' px'),
+        'Change of the line of sight of each pixel relative to the prior, in pixels, with the '
+        'common rotation removed.',
+    )
+
+
+def mean_residuals(residuals: Residuals, camera: CameraModel) -> svg.Chart:
+    """Mean residual in cells of the detector, which shows unmodelled distortion."""
+    u, v = residuals.measured_px[residuals.used].T
+    edges_u = np.linspace(-0.5, camera.width - 0.5, 13)
+    edges_v = np.linspace(-0.5, camera.height - 0.5, 11)
+    count, *sums = (
+        np.histogram2d(u, v, (edges_u, edges_v), weights=weights)[0]
+        for weights in (None, *residuals.residual_px[residuals.used].T)
+    )
+    enough = count >= 5
+    centre_u, centre_v = (0.5 * (e[1:] + e[:-1]) for e in (edges_u, edges_v))
+    places = np.stack(np.meshgrid(centre_u, centre_v, indexing='ij'), axis=-1)[enough]
+    mean = np.stack([one[enough] / count[enough] for one in sums], axis=-1)
+    return svg.Chart(
+        'Mean residuals over the detector',
+        arrows(camera, places, mean),
+        'Mean residual of the stars in each cell, enlarged to the scale of the arrow above. A '
+        'regular pattern indicates distortion that the lens model does not describe; noise has '
+        'no pattern.',
+    )
+
+
+def field_vectors(field: DetectorField, camera: CameraModel) -> svg.Chart:
+    """The residual field, which adds to the lens model, as arrows."""
+    places = _middles_of_cells(camera)
+    return svg.Chart(
+        'Residual field in addition to the lens model',
+        arrows(camera, places, field.displacement_px(places), _SHORT, VISIBLE_PX),
+        'Displacement of a star from its position by the lens model, enlarged to the scale of '
+        'the arrow above the figure.',
+    )
+
+
+def _middles_of_cells(camera: CameraModel) -> Floats:
+    """Places (192, 2) from which arrows of the length `_SHORT` cover no number of the axes."""
+    u, v = (
+        (np.arange(cells) + 0.5) / cells * size - 0.5
+        for cells, size in ((16, camera.width), (12, camera.height))
+    )
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def arrows(
+    camera: CameraModel,
+    places: Floats,
+    shift_px: Floats,
+    columns: int = 16,
+    least_px: float = _ROUNDING_PX,
+) -> svg.Drawing:
+    """
+    Enlarged displacements (n, 2) at places (n, 2), with an arrow of a round length as scale.
+
+    The longest is as long as one of the columns; none is drawn if all are below ``least_px``.
+    """
+    panel = over_detector(camera)
+    if float(np.nanmax(np.hypot(*shift_px.T), initial=0.0)) > least_px:
+        _draw_arrows(panel, places, shift_px, [svg.SERIES[0]] * len(places), columns)
+    elif least_px > _ROUNDING_PX:
+        panel.note(f'less than {least_px:g} px everywhere')
+    else:
+        panel.note('no displacement')
+    return _drawn(panel)
+
+
+def _draw_arrows(
+    panel: svg.Panel, places: Floats, shift_px: Floats, colours: Sequence[str], columns: int
+) -> None:
+    """Draw displacements, the longest as long as a grid column is wide, and their scale."""
+    longest_px = float(np.nanmax(np.hypot(*shift_px.T), initial=0.0))
+    if not longest_px > _ROUNDING_PX:
+        panel.note('no displacement')
+        return
+    units_per_px = 0.95 * abs(panel.x.end - panel.x.start) / columns / longest_px
+    starts = np.stack([panel.x(places[:, 0]), panel.y(places[:, 1])], axis=-1)
+    for start, shift, colour in zip(starts, shift_px, colours, strict=True):
+        panel.outside.append(svg.arrow(start, units_per_px * shift, colour))
+    key_px = svg.round_step(longest_px / 2.5)
+    along = np.array([units_per_px * key_px, 0.0])
+    start = panel.x.end - along[0]
+    panel.outside.append(svg.arrow(np.array([start, 13.0]), along, svg.SERIES[1]))
+    panel.outside.append(svg.words(start - 7, 17, f'scale: {svg.in_digits(key_px)} px', 'end'))
+
+
+def line_of_sight_sigma(maps: DetectorMaps, camera: CameraModel, is_alone: bool) -> svg.Chart:
+    """1-sigma of the lines of sight, of the camera alone or with its alignment."""
+    sigma = maps.shape_sigma_arcsec if is_alone else maps.line_of_sight_sigma_arcsec
+    title, text = (
+        ('camera alone', 'with the rotation common to all pixels removed')
+        if is_alone
+        else ('camera and alignment', 'in the star tracker frame')
+    )
+    return svg.Chart(
+        f'Line of sight, {title}',
+        detector_map(sigma, camera, '″'),
+        f'1-sigma of the line of sight of each pixel, {text}: {significant(sigma.min(), 4)}″ to '
+        f'{significant(sigma.max(), 4)}″. The colours start at zero.',
+    )
+
+
+def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> svg.Chart | None:
+    """1-sigma of the camera alone over the detector, in total and by cause, on one scale."""
+    shown = [part for part in parts if part.map_over_detector_arcsec]
+    least = _BUDGET_SHARE * max((part.map_arcsec for part in shown), default=0.0)
+    shown = [part for part in shown if part.map_arcsec > least][:_BUDGET_MAPS]
+    if not shown or not shown[0].map_arcsec > _ROUNDING_PX:
+        return None
+    top = max(shown[0].map_over_detector_arcsec)
+    across = 2 if len(shown) <= 4 else 3
+    wide = (svg.WIDTH - _BAR - 4.0 - _GAP * (across - 1)) / across
+    high = wide * camera.height / camera.width
+    panels = []
+    for k, part in enumerate(shown):
+        row, column = divmod(k, across)
+        left, upper = 4.0 + column * (wide + _GAP), _TOP + row * (high + _TOP)
+        panel = svg.Panel(
+            svg.Scale(0.0, 1.0, left, left + wide), svg.Scale(0.0, 1.0, upper, upper + high)
+        )
+        sigma = np.reshape(part.map_over_detector_arcsec, (BUDGET_ROWS, BUDGET_COLUMNS))
+        panel.picture(_coloured(cv2.resize(255 * sigma / top, (90, 70))))
+        panel.outside.append(svg.words(left, upper - 7, part.cause, 'start'))
+        panels.append(panel)
+    last = panels[min(len(panels), across) - 1]
+    height = panels[-1].y.end + 8.0
+    sizes = ', '.join(
+        f'{significant(max(part.map_over_detector_arcsec), 2)}″ {part.cause}' for part in shown
+    )
+    return svg.Chart(
+        'Causes over the detector',
+        panels[0].drawing(height, *panels[1:], _bar(last, top, '″')),
+        f'1-sigma of the line of sight of each pixel, camera alone; largest values: {sizes}.',
+    )
+
+
+def detector_map(
+    values: Floats, camera: CameraModel, unit: str, shift_px: Floats | None = None
+) -> svg.Drawing:
+    """
+    Colours and labelled contours of a grid from corner to corner; the colours start at zero.
+
+    ``shift_px`` (rows, columns, 2) is drawn at the places of the grid, as arrows.
+    """
+    panel = over_detector(camera, right=_BAR)
+    finite = values[np.isfinite(values)]
+    low, top = (float(end) for end in (finite.min(initial=np.inf), finite.max(initial=0.0)))
+    if not top > _ROUNDING_PX:
+        panel.note(f'0{unit} everywhere' if len(finite) else 'unknown')
+        return _drawn(panel)
+    known = np.where(np.isfinite(values), values, 0.0)
+    panel.picture(_coloured(cv2.resize(255 * known / top, (240, 192))))
+    rows, columns = values.shape
+    u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
+    if shift_px is not None:
+        places = np.stack(np.meshgrid(u, v), axis=-1)
+        colours = np.where(values.ravel() > 0.6 * top, _DARK, _BRIGHT).tolist()
+        _draw_arrows(panel, places.reshape(-1, 2), shift_px.reshape(-1, 2), colours, columns)
+    elif top - low > FLAT * top:
+        levels = [x for x in svg.Scale(low, top, 0, 1).ticks(_LEVELS) if low < x < top]
+        _draw_contours(panel, contourpy.contour_generator(u, v, values), levels, top, unit)
+    else:
+        percent = 100 * (top - low) / top
+        panel.note(f'flat within {svg.in_digits(round(percent, 2))} %', _BRIGHT, _DARK)
+    return _drawn(panel, _bar(panel, top, unit))
+
+
+def _draw_contours(
+    panel: svg.Panel,
+    generator: contourpy.ContourGenerator,
+    levels: Sequence[float],
+    top: float,
+    unit: str,
+) -> None:
+    """Contours, thicker for higher levels, with one label each where there is room."""
+    lines = [
+        # contourpy's types allow other forms of a line as well.
+        [np.stack([panel.x(x), panel.y(y)], axis=-1)
+         for x, y in (np.asarray(line, np.float64).T for line in generator.lines(level))]
+        for level in levels
+    ]  # fmt: skip
+    for k, of_level in enumerate(lines):
+        colour = _DARK if levels[k] > 0.6 * top else _BRIGHT
+        for line in of_level:
+            panel.path(line, colour, 1.0 + 1.4 * k / max(len(levels) - 1, 1))
+    taken: list[Floats] = []
+    for k, level in enumerate(levels):
+        text = f'{svg.in_digits(level)}{unit}'
+        half = np.array([0.3 * len(text) + 0.5, 0.8]) * svg.LETTER
+        others = [line for other in (*lines[:k], *lines[k + 1 :]) for line in other]
+        place = _label_place(panel, lines[k], [*others, *taken], half)
+        if place is not None:
+            taken.append(place[None])
+            x, y = place.tolist()
+            panel.outside.append(svg.words(x, y + 4, text, colour=_BRIGHT, edge=_DARK))
+
+
+def _label_place(
+    panel: svg.Panel, lines: Sequence[Floats], others: Sequence[Floats], half: Floats
+) -> Floats | None:
+    """Label position on the lines of a level, farthest from other labels; None: no room."""
+    low, high = np.sort([[panel.x.start, panel.y.start], [panel.x.end, panel.y.end]], axis=0)
+    places = np.concatenate([*lines, np.empty((0, 2))])
+    places = places[((places > low + half) & (places < high - half)).all(axis=1)]
+    if not len(places):
+        return None
+    crossing = np.concatenate([*others, np.full((1, 2), -1e4)])
+    # In units of the label size: labels overlap if both components are below 1.
+    apart = (abs(places[:, None] - crossing) / half).max(axis=-1).min(axis=1)
+    best = int(np.argmax(apart))
+    return np.asarray(places[best]) if apart[best] > 1.0 else None
+
+
+def _bar(panel: svg.Panel, top: float, unit: str) -> svg.Panel:
+    """Bar of the colours beside a panel, from zero to the largest value."""
+    upright = svg.Scale(0.0, top, panel.y.end, panel.y.start)
+    bar = svg.Panel(svg.Scale(0, 1, panel.x.end + 12, panel.x.end + 26), upright)
+    bar.picture(_coloured(np.linspace(255, 0, 128)[:, None]))
+    for value in upright.ticks(_LEVELS):
+        name, y = f'{svg.in_digits(value)}{unit}', float(upright(value))
+        bar.outside.append(svg.words(bar.x.end + 5, y + 4, name, 'start'))
+    return bar
+
+
+def _coloured(levels: NDArray[Any]) -> NDArray[np.uint8]:
+    """BGR picture of levels 0 to 255."""
+    return np.asarray(_viridis()[np.rint(np.clip(levels, 0, 255)).astype(np.uint8)])
+
+
+@functools.cache
+def _viridis() -> NDArray[np.uint8]:
+    """Colours (256, 3) BGR, cached because OpenCV rebuilds its table in 10 ms per picture."""
+    shades = np.arange(256, dtype=np.uint8)[:, None]  # OpenCV 5 returns another shape for (256,)
+    return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS)[:, 0], np.uint8)
+
+
+def pointings(
+    observations: Sequence[StarObservations], geometry: CameraGeometry
+) -> svg.Chart | None:
+    """
+    Footprints of the images on the whole sky; None without an image that has an attitude.
+
+    A Hammer projection of the ICRS, right ascension 0 in the middle and increasing to the left.
+    Refused images that have an attitude are drawn too.
+    """
+    placed = [o for o in observations if not o.refusal or np.isfinite(o.attitude_gap_s)]
+    if not placed:
+        return None
+    top, bottom = 8.0, 8.0 + (svg.WIDTH - 16.0) / 2
+    root2 = np.sqrt(2)
+    panel = svg.Panel(
+        svg.Scale(-2 * root2, 2 * root2, 8.0, svg.WIDTH - 8.0),
+        svg.Scale(-root2, root2, bottom, top),
+    )
+    _draw_graticule(panel)
+    camera = geometry.camera
+    edge, end = np.linspace(-0.5, 0.5, 9), np.full(9, 0.5)
+    sides = [(edge, -end), (end, edge), (edge[::-1], end), (-end, edge[::-1])]
+    border = np.concatenate([np.stack(side, axis=-1) for side in sides])
+    in_camera = line_of_sight(camera, (border + 0.5) * [camera.width, camera.height] - 0.5)
+    in_tracker = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(in_camera)
+    every = -(-len(placed) // _FOOTPRINTS) or 1
+    for one in placed[::every]:
+        seen = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker)
+        x, y = hammer(np.arctan2(seen[:, 1], seen[:, 0]), np.arcsin(np.clip(seen[:, 2], -1, 1)))
+        # A line across the edge of the map would cross the whole map.
+        x = np.where(np.abs(np.diff(x, prepend=x[:1])) > 2.0, np.nan, x)
+        panel.curve(svg.Curve(x, y, svg.SERIES[1 if one.refusal else 0], width=1.2))
+    below = svg.Panel(panel.x, svg.Scale(0.0, 1.0, bottom + 32.0, bottom + 6.0))
+    below.legend([svg.Curve([], [], svg.SERIES[0], 'used')], is_left=True)
+    if any(one.refusal for one in placed):
+        below.legend([svg.Curve([], [], svg.SERIES[1], 'refused')])
+    text = (
+        f'Footprints of {len(placed)} images on the whole sky (ICRS, Hammer projection, right '
+        'ascension to the left).'
+    )
+    return svg.Chart('Pointings', panel.drawing(bottom + 32.0, below), text)
+
+
+def hammer(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:
+    """Hammer projection of places in rad, longitude increasing to the left."""
+    scale = np.sqrt(2.0 / (1.0 + np.cos(latitude) * np.cos(longitude / 2)))
+    return -2 * scale * np.cos(latitude) * np.sin(longitude / 2), scale * np.sin(latitude)
+
+
+def _draw_graticule(panel: svg.Panel) -> None:
+    along = np.linspace(-np.pi, np.pi, 73, dtype=np.float64)
+    for hours in range(-12, 13, 3):
+        x, y = hammer(np.radians(15.0 * hours * 0.99999), along / 2)
+        panel.curve(svg.Curve(x, y, svg.GRID, width=1.0))
+        if hours % 6 == 0 and abs(hours) < 12:
+            panel.text(x[36], y[36], f'{hours % 24} h', svg.MUTED)
+    for degrees in (-60, -30, 0, 30, 60):
+        x, y = hammer(along * 0.99999, np.radians(degrees))
+        panel.curve(svg.Curve(x, y, svg.GRID, width=1.0))
+        if degrees:
+            panel.text(x[36], y[36], f'{svg.in_digits(degrees)}°', svg.MUTED)
+
+
+def write_comparison(comparison: Comparison, path: Path) -> None:
+    """
+    Draw the difference of two calibrations over the detector, with and without common rotation.
+
+    Colours and arrows are in pixels; the title states the largest length, also in sigmas if known.
+
+    Raises OptionError for an ending that is not .svg. Raises ProductError when the file cannot be
+    written.
+    """
+    if path.suffix != '.svg':
+        raise OptionError(f'{path}: the name must end in .svg')
+    camera = comparison.a.geometry.camera
+    maps = [
+        _difference(camera, comparison.before, 'lines of sight, B minus A'),
+        _difference(camera, comparison.after, 'common rotation removed'),
+    ]
+    write_atomically(path, svg.sheet([maps]).document())
+
+
+def _difference(camera: CameraModel, difference: DifferenceMap, title: str) -> svg.Drawing:
+    """Length in pixels as colours from zero, direction as arrows with a scale."""
+    sigmas, _ = difference.worst_and_rms_sigmas
+    in_sigmas = f', {significant(sigmas, 2)} sigma' if np.isfinite(sigmas) else ''
+    drawn = detector_map(
+        difference.length_px[::2, ::2], camera, ' px', shift_px=difference.difference_px[::2, ::2]
+    )
+    return svg.sheet(
+        [[drawn]], f'{title}: at most {significant(difference.length_px.max(), 3)} px{in_sigmas}'
+    )

@@ -1,0 +1,155 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Stars and attitudes that do not fit the others.
+
+An error is judged by its variance beside the others, less what the unknowns follow of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, stdtrit
+
+from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.estimation.shared_errors import Groups
+from starcal_ros.estimation.star_equations import squared_sigmas, StarTable
+
+FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
+_FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
+_STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
+_FEWEST_ATTITUDES = 3  # whose scatter shows that one of them does not fit
+_MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
+_MOST_OF_A_LINE = 200  # attitudes: their 20,000 pairs give a slope to a hundredth of a sigma
+_EFFICIENCY = 0.37  # of the median of squares against their mean
+_CHANCE = 1e-5  # that the attitude of an image lies beyond the limit
+_MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
+
+
+def fitting_stars(
+    residual_px: Floats,
+    covariance_px2: Floats,
+    star_px2: Floats | float,
+    table: StarTable,
+    cells: Groups,
+    outlier_sigma: float,
+) -> Mask:
+    """
+    Return (n,) which observations are used.
+
+    Not an outlier, unless other stars at this place of the detector show the same, which is then
+    the lens; not of a star that is one in most of its images, or whose residuals together are too
+    large (a wrong catalog place, a planet); and in an image that has enough of the others.
+
+    Parameters
+    ----------
+    residual_px, covariance_px2 : (n, 2), (n, 3)
+    star_px2 : (n,) or float
+        Variance per axis that sightings of a star share.
+    cells : Groups
+        Parts of the detector.
+    """
+    length2 = squared_sigmas(residual_px, covariance_px2)
+    beside2 = _squared_beside(residual_px, covariance_px2, length2, cells, outlier_sigma)
+    length2 = np.minimum(length2, beside2)
+    fits = length2 < outlier_sigma**2
+    star = table.star
+    sightings = np.bincount(star)
+    misses = np.bincount(star, ~fits)
+    # What sightings share is in the variance of each, but it is one error.
+    own = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
+    share = np.minimum(star_px2 / own, 1.0)
+    largest = np.bincount(star, share) / sightings * (sightings - 1) + 1.0
+    summed = np.bincount(star, np.where(fits, length2, 0.0))
+    bad = (2 * misses > sightings) | (summed > chdtri(2 * sightings, _STAR_CHANCE) * largest)
+    fits &= ~(bad & (sightings >= _FEWEST_SIGHTINGS))[star]
+    left = np.bincount(table.image[fits], minlength=table.image_count)
+    return np.asarray(fits & (left[table.image] >= FEWEST_STARS))
+
+
+def _squared_beside(
+    residual_px: Floats, covariance_px2: Floats, length2: Floats, cells: Groups, limit: float
+) -> Floats:
+    """
+    Squared sigmas (n,) from what other stars in the same cell of the detector show together.
+
+    Their mean with their residuals cut at the limit, and with the observation itself as a zero:
+    a lone neighbour, or a wrong one among several, moves it little.
+    """
+    weight = 2.0 / (covariance_px2[:, 0] + covariance_px2[:, 2])
+    cut = np.minimum(1.0, limit / np.sqrt(np.maximum(length2, 1e-30)))
+    total = np.bincount(cells.group, weight)[cells.group]
+    shared = np.empty_like(residual_px)
+    for axis in (0, 1):
+        each = weight * cut * residual_px[:, axis]
+        shared[:, axis] = np.bincount(cells.group, each)[cells.group] / total
+        if cells.of_one_star is not None:
+            shared[:, axis] -= np.bincount(cells.of_one_star, each)[cells.of_one_star] / total
+    return squared_sigmas(residual_px - shared, covariance_px2)
+
+
+def dropped_stars(table: StarTable, kept: Mask) -> NDArray[np.int64]:
+    """Return catalog stars seen often enough to be told apart and left out of all images."""
+    catalog_id, star = np.unique(table.catalog_id, return_inverse=True)
+    sightings, uses = np.bincount(star), np.bincount(star, kept)
+    return np.asarray(catalog_id[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
+
+
+def misfit_images(
+    error: Floats,
+    variance: Floats,
+    seen: Mask,
+    star_tracker: Indices,
+    time_ns: Indices,
+    is_stated: bool,
+) -> Mask:
+    """
+    Return (m,) the images whose attitude does not fit the others of its star tracker.
+
+    Parameters
+    ----------
+    error, variance : (m, 3)
+        Attitude errors as the stars show them, in the stated sigma of each axis, and their
+        variances by the centroids.
+    seen : (m,) bool
+        Images with stars enough.
+    is_stated : bool
+        False where the stated sigma is a guess.
+
+    Notes
+    -----
+    Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
+    line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
+    guess, a scatter of few images determines none: the limit is that of Student's t.  With more
+    misfits than a third there is no majority that they could fail to fit.
+    """
+    misfit: Mask = np.zeros(len(seen), bool)
+    for k in np.unique(star_tracker[seen]):
+        here = seen & (star_tracker == k)
+        if np.count_nonzero(here) < _FEWEST_ATTITUDES:
+            continue
+        left = error[here] - _line_in_time(time_ns[here], error[here])
+        spread2 = np.median(left**2, axis=0) / _MEDIAN_OF_SQUARE
+        # The spread of a dozen images may be small by half: the stated sigma bounds it too.
+        usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
+        freedom = _EFFICIENCY * (np.count_nonzero(here) - 1)
+        limit = max(_MISFIT_SIGMA, 0.0 if is_stated else float(stdtrit(freedom, 1.0 - _CHANCE)))
+        found = (left**2 > limit**2 * usual).any(axis=1)
+        if 3 * np.count_nonzero(found) <= np.count_nonzero(here):
+            misfit[here] = found
+    return misfit
+
+
+def _line_in_time(time_ns: Indices, error: Floats) -> Floats:
+    """Return robust lines (k, 3) through errors (k, 3): median of slopes, median of the rest."""
+    time = (time_ns - time_ns.mean()) / max(float(np.ptp(time_ns)), 1.0)
+    some = np.arange(0, len(time), -(-len(time) // _MOST_OF_A_LINE))
+    one, other = (some[k] for k in np.triu_indices(len(some), 1))
+    apart = time[other] - time[one]
+    # Neighbours in time have slopes of noise alone.
+    far = np.abs(apart) > 0.25
+    slope = np.zeros(3)
+    if len(time) > 2 * _FEWEST_ATTITUDES and far.any():
+        slope = np.median((error[other] - error[one])[far] / apart[far, None], axis=0)
+    line = time[:, None] * slope
+    return np.asarray(line + np.median(error - line, axis=0))
