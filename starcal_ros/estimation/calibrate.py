@@ -279,7 +279,8 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         # Where stars hardly show an unknown, whole steps overshoot to and fro: the part of the
         # step before that is left shows the share that ends in the minimum.
         if k:
-            rest = float(step_sigma @ before_sigma) / float(before_sigma @ before_sigma)
+            of_before = max(float(before_sigma @ before_sigma), 1e-300)
+            rest = float(step_sigma @ before_sigma) / of_before
             share = min(max(share / max(1.0 - rest, share), _LEAST_SHARE), 1.0)
         before_sigma = step_sigma
     weights = Weights(
