@@ -163,6 +163,9 @@ def _field_type(hint: Any, marks: tuple[object, ...] = ()) -> FieldType:
         hint, *inner = get_args(hint)
         marks = (*inner, *marks)
     origin, arguments = get_origin(hint), get_args(hint)
+    if hasattr(origin, '__value__'):  # NDArray is a type alias of PEP 695 since NumPy 2.5
+        hint = origin.__value__[arguments]
+        origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         (hint,) = (argument for argument in arguments if argument is not type(None))
         return dataclasses.replace(_field_type(hint, marks), optional=True)
