@@ -24,7 +24,9 @@ import sys
 import sysconfig
 
 ROOT = Path(__file__).resolve().parent.parent
-OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
+OLDEST_PYTHON = (3, 10)
+# The pinned NumPy and SciPy serve CPython 3.10, and so not 3.14.
+NEWEST_PYTHON = {'oldest': (3, 13), 'pinned': (3, 13), 'newest': (3, 14)}
 HASHES = ROOT / 'requirements/hashes.txt'
 PACKAGES = {'pinned': ('runtime', 'mission', 'dev'), 'oldest': ('oldest',), 'newest': ()}
 WHEELS_STAMP, PACKAGE_STAMP = '.starcal-wheels', '.starcal-package'
@@ -53,7 +55,7 @@ def main() -> None:
     venv = args.venv.absolute()
     names = (*PACKAGES[args.versions], 'colcon', args.ros)
     requirements = [ROOT / 'requirements' / f'{name}.txt' for name in names]
-    check_request(args.ros, requirements[-1])
+    check_request(args.ros, requirements[-1], args.versions)
     bring_up_to_date(venv, args.ros, requirements, is_newest=args.versions == 'newest')
     for name in args.also:
         pip_install(venv, [ROOT / 'requirements' / f'{name}.txt'])
@@ -83,12 +85,12 @@ def bring_up_to_date(venv: Path, ros: str, requirements: list[Path], is_newest: 
     print(f'{shown(venv)}: ROS 2 {ros.capitalize()}, {python_name()}: ready', flush=True)
 
 
-def check_request(distro: str, distro_requirements: Path) -> None:
+def check_request(distro: str, distro_requirements: Path, versions: str) -> None:
     """Stop with one line if this Python or this distribution cannot be served."""
-    if not OLDEST_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON:
+    if not OLDEST_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON[versions]:
         sys.exit(
-            f'{sys.executable} is Python {sys.version_info[0]}.{sys.version_info[1]}; '
-            'starcal needs 3.10 to 3.13: make setup PYTHON=python3.12'
+            f'{sys.executable} is Python {sys.version_info[0]}.{sys.version_info[1]}; starcal '
+            'needs 3.10 to 3.13, or 3.14 with VERSIONS=newest: make setup PYTHON=python3.12'
         )
     if distro not in ('jazzy', 'kilted') or not distro_requirements.exists():
         sys.exit(f'ROS_DISTRO={distro}: starcal is built for jazzy and kilted')
