@@ -18,15 +18,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / 'docs' / 'tutorial.md'
-SOURCES = (
-    'setup.py',
-    'setup.cfg',
-    'pyproject.toml',
-    'MANIFEST.in',
-    'package.xml',
-    'LICENSE',
-    'msg',
-)
+MANIFEST = ROOT / 'MANIFEST.in'
+# What is made here and is no source.
+MADE = ('.*cache*', '.hypothesis', '*.egg-info', '__pycache__', '_build', 'generated')
 SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = (
     'contourpy',
@@ -75,25 +69,31 @@ def link_distribution(name: str, packages: Path) -> None:
 
 @pytest.fixture(scope='module')
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files that a wheel is built from."""
+    """The sources as in a fresh clone."""
     sources = tmp_path_factory.mktemp('build') / 'sources'
-    for package in ('starcal_ros', 'starcal_ground'):
-        compiled = shutil.ignore_patterns('__pycache__')
-        shutil.copytree(ROOT / package, sources / package, ignore=compiled)
-    for name in SOURCES:
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-        copy(ROOT / name, sources / name)
+    for name in re.findall(r'^graft (.+)', MANIFEST.read_text(), re.MULTILINE):
+        shutil.copytree(ROOT / name, sources / name, ignore=shutil.ignore_patterns(*MADE))
+    for path in ROOT.iterdir():
+        if path.is_file():
+            shutil.copy(path, sources)
     return sources
 
 
 @pytest.fixture(scope='module')
-def wheel(sources: Path) -> Path:
-    """A wheel made from the source distribution, which must have all that it takes."""
-    folder = sources.parent
+def unpacked(sources: Path) -> Path:
+    """The source archive, unpacked."""
     packed = run(sys.executable, '-c', SDIST, cwd=sources)
     assert packed.returncode == 0, packed.stderr
-    sdist = folder / packed.stdout.splitlines()[-1]
-    built = run(*PIP, 'wheel', *ALONE, '--no-build-isolation', sdist, cwd=folder)
+    archive = sources.parent / packed.stdout.splitlines()[-1]
+    run('tar', 'xzf', archive, cwd=sources.parent)
+    return archive.with_suffix('').with_suffix('')
+
+
+@pytest.fixture(scope='module')
+def wheel(unpacked: Path) -> Path:
+    """A wheel made from the source archive, which must have all that it takes."""
+    folder = unpacked.parent
+    built = run(*PIP, 'wheel', *ALONE, '--no-build-isolation', unpacked, cwd=folder)
     assert built.returncode == 0, built.stdout + built.stderr
     (wheel,) = folder.glob('starcal_ros-*.whl')
     return wheel
@@ -127,6 +127,24 @@ def flight_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture(scope='module')
 def report_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return installed(wheel, tmp_path_factory.mktemp('report'), 'report')
+
+
+@pytest.mark.packaging
+@pytest.mark.slow
+def test_the_source_archive_is_complete(sources: Path, unpacked: Path) -> None:
+    """It has each file of a clone but those of git and of editors, and its tests run in it."""
+    clone, archive = (
+        {str(path.relative_to(top)) for path in top.rglob('*') if path.is_file()}
+        for top in (sources, unpacked)
+    )
+    assert {
+        name for name in clone - archive if name[0] != '.' and '.egg-info' not in name
+    } == set()
+    tests = ('test/onboard/camera', 'test/system/test_named_in_documents.py')
+    done = run(
+        sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', *tests, cwd=unpacked
+    )
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.packaging
