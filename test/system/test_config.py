@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import sys
@@ -97,3 +98,15 @@ def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path: Path) -> 
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / 'out' / 'calibration.json').exists()
+
+
+def test_the_recorder_and_the_aggregator_know_the_names_of_the_interface_document() -> None:
+    interface = (ROOT / 'docs/icd.md').read_text()
+    record, diagnostics = (
+        yaml.safe_load((CONFIG / name).read_text())['/**']['ros__parameters']
+        for name in ('record.yaml', 'diagnostics.yaml')
+    )
+    published = re.findall(r'^\| pub \| `/?([^`]+)` \|', interface, re.MULTILINE)
+    assert {name.lstrip('/') for name in record['record']['topics']} <= set(published)
+    assert all(name[0] == '/' for name in record['record']['topics'])  # rosbag2 expands none
+    assert f'Its `name` is `{diagnostics["starcal"]["startswith"][0]}` and' in interface
