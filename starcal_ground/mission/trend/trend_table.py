@@ -25,6 +25,7 @@ import posixpath
 import sqlite3
 from typing import Annotated, Any, get_type_hints
 import urllib.parse
+import weakref
 
 import numpy as np
 
@@ -245,6 +246,7 @@ class Table:
                 with regular_file(self.path):
                     pass
             self._db = sqlite3.connect(self.path, timeout=_WAIT_S, isolation_level=None)
+            weakref.finalize(self, self._db.close)  # Python 3.13 warns of one that is left open
             with self.transaction():
                 if not self._schema():
                     for statement in _SCHEMA:
