@@ -34,8 +34,8 @@ from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
+from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
-from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import (
     Calibration,
     IMAGE_REFUSALS,
@@ -120,7 +120,10 @@ def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str
                 'time': utc_text(int(residuals.image_time_ns[k])),
                 'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
                 'misfit': bool(residuals.image_misfit[k]),
-                'tracker': [None if math.isnan(e) else round(float(e), 2) for e in error],
+                'tracker': [
+                    None if math.isnan(e) else round(float(e), 2)
+                    for e in error[: 3 * calibration.has_alignment]
+                ],
                 'stars': stars.ravel().tolist(),
             }
         )
@@ -313,6 +316,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
+        'times_of': calibration.provenance.get(solve.TIMES, ''),
         'active_since': utc_text(calibration.active_since_ns),
         'parameters': typeset(verdict.parameter_rows(calibration, prior)),
         'alignment': typeset(verdict.alignment_rows(calibration, prior)),
@@ -333,7 +337,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'refused_stars': refused_stars(observations, pictures),
         'model_rows': verdict.model_rows(calibration),
         'star_marks': star_marks(observations),
-        'files': [(name, *inputs_of([folder / name]).values()) for name in written],
+        'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
         'has_images': any(not one.reason for one in pictures),
         'used_images': used_images(observations, pictures),
         'options': _options(calibration),
@@ -352,8 +356,9 @@ def _options(calibration: Calibration) -> list[tuple[str, str]]:
 def _signed(calibration: Calibration) -> list[tuple[str, str]]:
     """Rows above a signature: names, times, and the provenance with its digests."""
     known = calibration.provenance.items()
+    frames = filter(None, (calibration.child_frame, calibration.parent_frame))
     return [
-        ('calibration', f'{calibration.child_frame} on {calibration.parent_frame}'),
+        ('calibration', ' on '.join(frames)),
         ('images', f'{utc_text(calibration.first_image_ns)} to {utc_text(calibration.time_ns)}'),
         *sorted((name, value) for name, value in known if name not in ('options', 'prior')),
     ]

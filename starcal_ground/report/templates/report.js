@@ -36,11 +36,12 @@
         `(${u}, ${v}) px, residual ${(du / 1000).toFixed(3)}, ${(dv / 1000).toFixed(3)} px` +
         (isUsed ? '' : ', left out');
     }
-    const tracker = image.tracker[0] === null ? 'too few stars for the star tracker error' :
-      `star tracker error ${image.tracker.map((a) => a.toFixed(1) + '″').join(', ')} about x, y, z`;
+    const tracker = !image.tracker.length ? '' :
+      image.tracker[0] === null ? ', too few stars for the star tracker error' :
+      `, star tracker error ${image.tracker.map((a) => a.toFixed(1) + '″').join(', ')} about x, y, z`;
     output.textContent = `Image ${image.number} of ${data.count}, ${image.time}: ` +
-      `${used} stars used, ${count - used} left out, ` +
-      (image.rms === null ? '' : `${image.rms.toFixed(3)} px rms, `) + tracker +
+      `${used} stars used, ${count - used} left out` +
+      (image.rms === null ? '' : `, ${image.rms.toFixed(3)} px rms`) + tracker +
       (image.misfit ? '; attitude misfit' : '') +
       `. Residuals enlarged ${Math.round(scale)} times.`;
     which.setAttribute('aria-valuetext', `image ${image.number}`);

@@ -30,6 +30,7 @@ from starcal_ros.formats.products.product_files import (
     read_calibration,
     write_calibration,
 )
+from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.state import Activation
@@ -154,6 +155,22 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
     text = page_of(tmp_path)
     assert '✕ Refused' in text and '✓ Accepted' not in text
     assert 'residual 2 px &amp; more is over the limit' in text
+
+
+def test_of_the_camera_alone_nothing_is_said_of_an_alignment(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    times = 'of the file: 10 of 10 images state none'
+    provenance = {**calibration.provenance, TIMES: times}
+    alone = dataclasses.replace(calibration, parent_frame='', provenance=provenance)
+    write_calibration(alone, tmp_path / CALIBRATION_FILE)
+    shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
+    text = page_of(tmp_path)
+    for words in ('Orientation of', 'x, y, z, w', 'may be activated', 'href="#alignment"',
+                  'Alignment: small rotation', ' on <code></code>', ' on </td>'):  # fmt: skip
+        assert words not in text, words
+    assert 'No alignment: the attitudes come from the stars' in text
+    # Those of the header and of the table to sign.
+    assert text.count(times) == 2 and '"tracker": []' in text
 
 
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
