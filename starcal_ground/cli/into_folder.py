@@ -52,8 +52,8 @@ def failure_recorded(
         yield
     except kind as error:
         outputs.make_folder(folder)
-        _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
-        raise
+        look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
+        raise kind(f'{error}{look}') from error
 
 
 @contextlib.contextmanager
@@ -120,13 +120,20 @@ def _calibrated(
     album: thumbnails.Album,
 ) -> campaign.Campaign:
     """The calibration of observed images; a failure is recorded in the folder."""
+    from starcal_ros.pipeline.diagnosis.bags import refusals
+
     try:
         made = campaign.calibrate(observed, inputs)
     except TooFewObservations as error:
         failure = _failure(str(error), observed)
-        _write_failure(folder, failure, album.unmatched)
-        raise TooFewObservations(failure.reason) from error
-    arguments.print_notes(made.notes[len(observed.source.notes) :])
+        look = _write_failure(folder, failure, album.unmatched)
+        raise TooFewObservations(f'{failure.reason}{look}') from error
+    refused = [
+        f'{group.count} of {len(made.observations)} images refused, {group.reason}:'
+        f' {group.meaning}{f" ({group.detail})" if group.detail else ""}'
+        for group in refusals(made.observations)
+    ]
+    arguments.print_notes([*made.notes[len(observed.source.notes) :], *refused])
     if made.observations is not observed.observations:
         products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
     return made
@@ -177,8 +184,12 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
 
 def _write_failure(
     folder: Path, failure: NotCalibrated, pictures: Sequence[thumbnails.Thumbnail] = ()
-) -> None:
-    """Replace what a folder holds of an earlier calibration by the record of a failure."""
+) -> str:
+    """
+    Replace what a folder holds of an earlier calibration by the record of a failure.
+
+    Returns where its report is, to append to the error; empty without one.
+    """
     software = f'starcal {software_version()}'
     products.write_not_calibrated(dataclasses.replace(failure, software=software), folder)
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
@@ -188,7 +199,8 @@ def _write_failure(
         except ModuleNotFoundError as error:
             missing_package(error, 'report')  # raises where another module is missing
         else:
-            page.write_report(folder)
+            return f'; look at {page.write_report(folder)}'
+    return ''
 
 
 class Drawings:
