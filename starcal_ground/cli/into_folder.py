@@ -53,7 +53,7 @@ def failure_recorded(
     except kind as error:
         outputs.make_folder(folder)
         look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
-        raise kind(f'{error}{look}') from error
+        raise type(error)(f'{error}{look}') from error
 
 
 @contextlib.contextmanager
@@ -120,20 +120,13 @@ def _calibrated(
     album: thumbnails.Album,
 ) -> campaign.Campaign:
     """The calibration of observed images; a failure is recorded in the folder."""
-    from starcal_ros.pipeline.diagnosis.bags import refusals
-
     try:
         made = campaign.calibrate(observed, inputs)
     except TooFewObservations as error:
         failure = _failure(str(error), observed)
         look = _write_failure(folder, failure, album.unmatched)
         raise TooFewObservations(f'{failure.reason}{look}') from error
-    refused = [
-        f'{group.count} of {len(made.observations)} images refused, {group.reason}:'
-        f' {group.meaning}{f" ({group.detail})" if group.detail else ""}'
-        for group in refusals(made.observations)
-    ]
-    arguments.print_notes([*made.notes[len(observed.source.notes) :], *refused])
+    arguments.print_notes(made.notes[len(observed.source.notes) :])
     if made.observations is not observed.observations:
         products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
     return made
