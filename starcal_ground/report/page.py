@@ -30,12 +30,13 @@ from starcal_ground.report.thumbnails import star_of, Thumbnail
 from starcal_ground.report.verdict import Row
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
+from starcal_ros.record_fields import nearest
 from starcal_ros.records import (
     Calibration,
     IMAGE_REFUSALS,
@@ -383,6 +384,35 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     path = folder / outputs.REPORT_FILE
     product_files.write_atomically(path, text)
     return path
+
+
+def plot(
+    source: Calibration | Path | str,
+    name: str,
+    residuals: Residuals | None = None,
+    observations: Sequence[StarObservations] = (),
+) -> Chart:
+    """
+    Figure of the report by its name, such as ``shape``, ``budget`` or ``histogram``, as SVG.
+
+    A notebook shows it; ``svg.document()`` is the text of a file.  ``source`` is a folder of
+    products, or a calibration with its residuals and observations, which some figures need.
+    Raises OptionError with the names that there are.
+
+    Examples
+    --------
+    >>> import starcal_ground
+    >>> figure = starcal_ground.plot('out', 'budget')
+    >>> figure.title, figure.svg.document()[:4]
+    ('Causes of the uncertainty', '<svg')
+    """
+    if not isinstance(source, Calibration):
+        read = _read_folder(Path(source))
+        source, residuals, observations = read.calibration, read.residuals, read.observations or ()
+    charts = charts_of(source, residuals, observations)
+    if name not in charts:
+        raise OptionError(f'{name!r} is not one of {", ".join(charts)}{nearest(name, charts)}')
+    return charts[name]
 
 
 def charts_of(

@@ -61,7 +61,7 @@ def opencv_yaml(calibration: Calibration) -> exported.Content:
         f'image_width: {camera.width}',
         f'image_height: {camera.height}',
         f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
-        *_opencv_matrix('camera_matrix', camera.matrix),
+        *_opencv_matrix('camera_matrix', camera.camera_matrix),
         *_opencv_matrix('distortion_coefficients', D[None, :]),
         *(_opencv_matrix('rotation', rotation) if aligned else []),
         f'largest_error_px: {made.worst_px!r}',
