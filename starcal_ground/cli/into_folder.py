@@ -147,7 +147,7 @@ def _drawn(
     try:
         from starcal_ground.report import page
     except ModuleNotFoundError as error:
-        return '', f'no report: {missing_package(error, "report")}'
+        return '', f'no report: {missing_package(error)}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
     return page.render(content, folder), f'look at {folder / outputs.REPORT_FILE}'
 
@@ -190,7 +190,7 @@ def _write_failure(
         try:
             from starcal_ground.report import page
         except ModuleNotFoundError as error:
-            missing_package(error, 'report')  # raises where another module is missing
+            missing_package(error)  # raises where another module is missing
         else:
             return f'; look at {page.write_report(folder)}'
     return ''

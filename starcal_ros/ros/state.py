@@ -115,7 +115,7 @@ class CalibratorState:
             from starcal_ros.ros.archive import Archive, read_seal
         except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
             raise ArchiveError(
-                f'state_dir: {missing_package(error, "")}, or leave state_dir empty: then a'
+                f'state_dir: {missing_package(error)}, or leave state_dir empty: then a'
                 ' restart loses the ensemble'
             ) from error
         seal = read_seal(options.state_key_file)
