@@ -288,6 +288,11 @@ addEventListener('load', () => {
     paper: getComputedStyle(document.body).backgroundColor,
     unnamed: document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label])').length,
     titles: document.querySelectorAll('#figure-images title').length,
+    contents: getComputedStyle(document.querySelector('nav')).position,
+    rows: new Set(
+      [...document.querySelectorAll('.charts.first figure')].map((f) => f.offsetTop)
+    ).size,
+    axes: document.querySelectorAll('#one-image svg text').length,
     loaded: [...document.images].every((image) => image.complete && image.naturalWidth > 0),
   };
   parent.postMessage(JSON.stringify(result), '*');
@@ -326,7 +331,7 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
 @pytest.mark.packaging
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
-@pytest.mark.parametrize(('width', 'dark'), [(400, False), (1600, True)])
+@pytest.mark.parametrize(('width', 'dark'), [(400, False), (1280, False), (1600, True)])
 def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -> None:
     measured, console = shown(page, tmp_path, width, dark)
     assert console == ''
@@ -341,5 +346,7 @@ def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -
         assert smallest >= 9, name  # px, from which print on a screen is readable
     assert measured['loaded'] and measured['unnamed'] == 0
     assert measured['titles'] == 10  # one for each image
+    assert measured['contents'] == 'sticky' and measured['rows'] == (3 if width == 400 else 1)
+    assert measured['axes'] > 10  # numbers of both axes, their names and the scale
     assert 'Image 1 of 10' in measured['before'][0] and measured['before'][1] > 100
     assert 'Image 2 of 10' in measured['after'][0] and measured['after'][1] > 100
