@@ -19,11 +19,18 @@ from typing import TYPE_CHECKING  # noqa: E402
 if TYPE_CHECKING:
     from starcal_ground.comparison import compare
     from starcal_ground.images.night_sky import calibrate_images
+    from starcal_ground.products import read_residuals
+    from starcal_ground.report.page import plot
 
-__all__ = ['calibrate_images', 'compare']
+__all__ = ['calibrate_images', 'compare', 'plot', 'read_residuals']
 
 if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
-    _MODULES = {'calibrate_images': 'images.night_sky', 'compare': 'comparison'}
+    _MODULES = {
+        'calibrate_images': 'images.night_sky',
+        'compare': 'comparison',
+        'plot': 'report.page',
+        'read_residuals': 'products',
+    }
 
     def __getattr__(name: str) -> object:
         """Import a public name at its first use (PEP 562)."""

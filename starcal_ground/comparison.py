@@ -70,7 +70,7 @@ class Comparison:
     --------
     >>> import dataclasses, starcal_ground, starcal_ros
     >>> a = starcal_ros.read_calibration('out')
-    >>> longer = a.geometry.camera.replace(fx=a.geometry.camera.matrix[0, 0] + 0.5)
+    >>> longer = a.geometry.camera.replace(fx=a.geometry.camera.camera_matrix[0, 0] + 0.5)
     >>> b = dataclasses.replace(a, geometry=dataclasses.replace(a.geometry, camera=longer))
     >>> comparison = starcal_ground.compare(a, b)
     >>> print(comparison.difference[0].round(3), comparison.after.length_px.shape)

@@ -113,7 +113,15 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
 
 
 def read_residuals(path: Path) -> Residuals:
-    """The residuals in an archive, equal to those written; raises ProductError."""
+    """
+    The residuals in an archive, equal to those written; raises ProductError.
+
+    >>> from pathlib import Path
+    >>> import starcal_ground
+    >>> residuals = starcal_ground.read_residuals(Path('out/residuals.npz'))
+    >>> residuals.residual_px.shape, int(residuals.used.sum())  # measured minus predicted
+    ((2997, 2), 2996)
+    """
     with errors_as(ProductError, path):
         names = ('format', *(field.name for field in fields(Residuals)))
         columns = read_archive(path, names)

@@ -19,7 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
-from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.assessment.lookup import Derivatives
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera import project as project_in_camera
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
@@ -44,6 +48,9 @@ __all__ = [
     'TooFewObservations',
     'calibrate',
     'calibrate_bag',
+    'calibrate_with_residuals',
+    'line_of_sight_covariance',
+    'line_of_sight_sigma_arcsec',
     'lines_of_sight',
     'observations_of',
     'project',
@@ -208,6 +215,25 @@ def calibrate(
     >>> print(calibration.accepted, calibration.geometry.camera.parameters[0].round())
     True 2000.0
     """
+    return calibrate_with_residuals(images, prior, **options)[0]
+
+
+def calibrate_with_residuals(
+    images: Iterable[StarObservations], prior: CameraGeometry, **options: object
+) -> tuple[Calibration, Residuals]:
+    """
+    The calibration of `calibrate`, and its residuals by star and image.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> from starcal_ros.formats.bag.reader import read_observations
+    >>> images = list(read_observations(['out/observations.mcap'], '/observations'))
+    >>> prior = starcal_ros.read_calibration('out').geometry
+    >>> calibration, residuals = starcal_ros.calibrate_with_residuals(images, prior)
+    >>> bool(residuals.residual_px[residuals.used].std() < 0.2)  # measured minus predicted
+    True
+    """
     known = names_of(CalibrationOptions, GateOptions)
     for name in options:
         if name not in known:
@@ -215,7 +241,8 @@ def calibrate(
     setup = load_setup(options, prior=prior)
     # The caller has looked the stars up: the bundled catalog has no part in the result.
     none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')
-    return solve.solve(solve.ensemble_of(images, setup), dataclasses.replace(setup, catalog=none))
+    setup, ensemble = dataclasses.replace(setup, catalog=none), solve.ensemble_of(images, setup)
+    return solve.solve_with_residuals(ensemble, setup)
 
 
 def calibrate_bag(
@@ -309,17 +336,20 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     product_files.write_calibration(calibration, file)
 
 
+Frame = Literal['camera', 'star_tracker']
+
+
 def lines_of_sight(
-    calibration: Calibration | CameraGeometry,
+    calibration: Calibration | CameraGeometry | CameraModel,
     pixels_px: ArrayLike,
-    frame: Literal['camera', 'star_tracker'] = 'camera',
+    frame: Frame = 'camera',
 ) -> Floats:
     """
     Unit vectors (..., 3) of the lines of sight of pixels (..., 2); the inverse of `project`.
 
     Parameters
     ----------
-    calibration : Calibration or CameraGeometry
+    calibration : Calibration, CameraGeometry or CameraModel
     pixels_px : (..., 2)
         (u, v); the centre of the first pixel is (0, 0).
     frame : {'camera', 'star_tracker'}
@@ -333,7 +363,7 @@ def lines_of_sight(
     Raises
     ------
     ValueError
-        For another frame.
+        For another frame, or the star tracker's without an alignment.
 
     Examples
     --------
@@ -345,13 +375,123 @@ def lines_of_sight(
     >>> starcal_ros.lines_of_sight(geometry, [711.5, 383.5], 'star_tracker').round(4).tolist()
     [0.0279, 0.0955, 0.995]
     """
-    geometry = calibration if isinstance(calibration, CameraGeometry) else calibration.geometry
-    in_camera = line_of_sight(geometry.camera, np.asarray(pixels_px, np.float64))
+    camera, frame_from_camera = _in_frame(calibration, frame)
+    in_camera = line_of_sight(camera, np.asarray(pixels_px, np.float64))
+    return np.asarray(in_camera @ frame_from_camera.T)
+
+
+def project(
+    calibration: Calibration | CameraGeometry | CameraModel,
+    directions: ArrayLike,
+    frame: Frame = 'camera',
+) -> Floats:
+    """
+    Pixels (..., 2) of directions (..., 3); the inverse of `lines_of_sight`.
+
+    Parameters
+    ----------
+    calibration : Calibration, CameraGeometry or CameraModel
+    directions : (..., 3)
+        Vectors of any length.
+    frame : {'camera', 'star_tracker'}
+        Their axes.
+
+    Returns
+    -------
+    (..., 2)
+        (u, v), outside the image too; NaN behind the camera and where the distortion folds.
+
+    Raises
+    ------
+    ValueError
+        For another frame, or the star tracker's without an alignment.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> sight = starcal_ros.lines_of_sight(calibration, [100.0, 200.0], 'star_tracker')
+    >>> starcal_ros.project(calibration, sight, 'star_tracker').round(6).tolist()
+    [100.0, 200.0]
+    """
+    camera, frame_from_camera = _in_frame(calibration, frame)
+    in_camera = np.asarray(directions, np.float64) @ frame_from_camera
+    return project_in_camera(camera, in_camera)
+
+
+def line_of_sight_covariance(
+    calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
+) -> Floats:
+    """
+    Covariance (..., 3, 3) of the unit vectors of `lines_of_sight`, rad^2.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    pixels_px : (..., 2)
+        (u, v).
+    frame : {'camera', 'star_tracker'}
+        ``camera``: of the camera alone, the rotation common to the detector removed;
+        ``star_tracker``: of camera and alignment together.
+
+    Raises
+    ------
+    ValueError
+        For another frame, or the star tracker's without an alignment.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> covariance = starcal_ros.line_of_sight_covariance(calibration, [[0, 0], [320, 256]])
+    >>> covariance.shape, bool(covariance[0].trace() > covariance[1].trace())  # corner, middle
+    ((2, 3, 3), True)
+    """
+    camera, frame_from_camera = _in_frame(calibration, frame)
+    pixels = np.asarray(pixels_px, np.float64)
+    derivatives = Derivatives.at(camera, pixels.reshape(-1, 2))
+    J = derivatives.J if frame == 'star_tracker' else derivatives.of_shape(camera)
+    covariance = derivatives.covariance_rad2(calibration.map_covariance, J)
+    turned = frame_from_camera @ covariance @ frame_from_camera.T
+    return turned.reshape(*pixels.shape[:-1], 3, 3)
+
+
+def line_of_sight_sigma_arcsec(
+    calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
+) -> Floats:
+    """
+    1-sigma (...) of the lines of sight of pixels (..., 2), arcsec, as in `starcal lookup`.
+
+    The root of the trace of `line_of_sight_covariance`, which has the parameters.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> alone, pointing = (
+    ...     starcal_ros.line_of_sight_sigma_arcsec(calibration, [320, 256], frame)
+    ...     for frame in ('camera', 'star_tracker'))
+    >>> bool(alone < 1.0 < pointing)
+    True
+    """
+    covariance = line_of_sight_covariance(calibration, pixels_px, frame)
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) / ARCSECOND_RAD)
+
+
+def _in_frame(
+    calibration: Calibration | CameraGeometry | CameraModel, frame: str
+) -> tuple[CameraModel, Floats]:
+    """Camera of a calibration, and the rotation (3, 3) from the camera frame to a frame."""
+    geometry = calibration.geometry if isinstance(calibration, Calibration) else calibration
+    camera = geometry if isinstance(geometry, CameraModel) else geometry.camera
     if frame == 'camera':
-        return in_camera
+        return camera, np.eye(3)
     if frame != 'star_tracker':
         raise ValueError(f"frame: {frame!r} is not 'camera' or 'star_tracker'")
-    return np.asarray(in_camera @ geometry.star_tracker_from_camera.as_matrix().T)
+    alone = isinstance(calibration, Calibration) and not calibration.has_alignment
+    if alone or isinstance(geometry, CameraModel):
+        raise ValueError(f'frame: {frame!r}: the camera alone has no alignment')
+    return camera, geometry.star_tracker_from_camera.as_matrix()
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -17,11 +17,19 @@ import sys
 
 # Modules of the extras in setup.cfg.
 _OF_EXTRAS = (
-    'astropy', 'contourpy', 'cryptography', 'dask', 'distributed', 'fsspec', 'jinja2',
-    'markupsafe', 'PIL', 'pyarrow', 'rawpy', 'spiceypy', 'weasyprint',
+    'astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'rawpy', 'spiceypy',
+    'weasyprint',
 )  # fmt: skip
 _OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
-_WITHOUT_KEY = ('mcap', 'rosbags')  # needed, but rosdep has no key for them
+# Of the plain install, by their names in PyPI: rosdep brings none of them.
+_NEEDED = {
+    'contourpy': 'contourpy',
+    'jinja2': 'Jinja2',
+    'markupsafe': 'Jinja2',
+    'mcap': 'mcap rosbags',
+    'PIL': 'Pillow',
+    'rosbags': 'mcap rosbags',
+}
 
 
 class StarcalError(Exception):
@@ -107,15 +115,16 @@ class TooFewObservations(StarcalError):
     """
 
 
-def missing_package(error: ModuleNotFoundError, extra: str) -> str:
+def missing_package(error: ModuleNotFoundError, extra: str = '') -> str:
     """
     One line with the command that installs a package for this interpreter.
 
-    Raises the error where something else is missing.
+    ``extra`` has it, if it is none of the plain install.  Raises the error where something else is
+    missing.
     """
     install = f'{error.name} is not installed: {sys.executable} -m pip install'
-    if error.name in _WITHOUT_KEY:
-        return f'{install} {" ".join(_WITHOUT_KEY)}'
+    if error.name in _NEEDED:
+        return f'{install} {_NEEDED[error.name]}'
     if error.name in _OF_STORES:
         return f'{install} {error.name}'
     if error.name not in _OF_EXTRAS:

@@ -22,8 +22,10 @@ import dataclasses
 from dataclasses import dataclass
 import difflib
 import functools
+import html
 import math
 import sys
+import textwrap
 import types
 from typing import Annotated, Any, get_args, get_origin, get_type_hints, TypeVar, Union
 
@@ -180,6 +182,62 @@ def _field_type(hint: Any, marks: tuple[object, ...] = ()) -> FieldType:
     if origin is tuple:
         return FieldType(tuple, item=_field_type(arguments[0], of_items), **limits)
     return FieldType(dict, item=_field_type(arguments[1], of_items), **limits)  # a Mapping
+
+
+_LINES, _WIDTH = 3, 96  # of a record as it is shown
+
+
+class Record:
+    """
+    Base of records with arrays: compared by their numbers, and shown in three lines.
+
+    Two are equal if they are of one type and all their fields are, arrays by shape and numbers;
+    unknown numbers (NaN) are equal.
+    """
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields."""
+        if type(self) is not type(other):
+            return NotImplemented
+        names = (field.name for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        return all(_is_equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        """Return name and fields in three lines."""
+        text = f'{type(self).__name__}({", ".join(self._in_words())})'
+        indent, end = {'subsequent_indent': '  '}, {'max_lines': _LINES, 'placeholder': ' ...)'}
+        return '\n'.join(textwrap.wrap(text, _WIDTH, **indent, **end))  # type: ignore[arg-type]
+
+    def _repr_html_(self) -> str:
+        """Return the summary, for notebooks."""
+        return f'<pre>{html.escape(self.summary())}</pre>'
+
+    def summary(self) -> str:
+        """Text with a line for each field; arrays and lists by their size."""
+        return '\n  '.join([type(self).__name__, *self._in_words()])
+
+    def _in_words(self) -> list[str]:
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        return [f'{field.name}={_in_short(getattr(self, field.name))}' for field in fields]
+
+
+def _is_equal(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.array_equal(a, b, equal_nan=True)
+    if isinstance(a, (tuple, list)) and isinstance(b, (tuple, list)):
+        return len(a) == len(b) and all(map(_is_equal, a, b))
+    return bool(a == b) or (a != a and b != b)  # NaN alone differs from itself
+
+
+def _in_short(value: Any) -> str:
+    if isinstance(value, np.ndarray) and value.size > 4:
+        return f'<{" x ".join(map(str, value.shape))} {value.dtype}>'
+    if isinstance(value, (tuple, list, Mapping)) and len(str(value)) > 60:
+        return f'<{len(value)} items>'
+    text = repr(value)
+    return text if len(text) <= 60 and '\n' not in text else f'{type(value).__name__}(...)'
 
 
 T = TypeVar('T')

@@ -52,8 +52,8 @@ def failure_recorded(
         yield
     except kind as error:
         outputs.make_folder(folder)
-        _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
-        raise
+        look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
+        raise type(error)(f'{error}{look}') from error
 
 
 @contextlib.contextmanager
@@ -124,8 +124,8 @@ def _calibrated(
         made = campaign.calibrate(observed, inputs)
     except TooFewObservations as error:
         failure = _failure(str(error), observed)
-        _write_failure(folder, failure, album.unmatched)
-        raise TooFewObservations(failure.reason) from error
+        look = _write_failure(folder, failure, album.unmatched)
+        raise TooFewObservations(f'{failure.reason}{look}') from error
     arguments.print_notes(made.notes[len(observed.source.notes) :])
     if made.observations is not observed.observations:
         products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
@@ -147,7 +147,7 @@ def _drawn(
     try:
         from starcal_ground.report import page
     except ModuleNotFoundError as error:
-        return '', f'no report: {missing_package(error, "report")}'
+        return '', f'no report: {missing_package(error)}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
     return page.render(content, folder), f'look at {folder / outputs.REPORT_FILE}'
 
@@ -177,8 +177,12 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
 
 def _write_failure(
     folder: Path, failure: NotCalibrated, pictures: Sequence[thumbnails.Thumbnail] = ()
-) -> None:
-    """Replace what a folder holds of an earlier calibration by the record of a failure."""
+) -> str:
+    """
+    Replace what a folder holds of an earlier calibration by the record of a failure.
+
+    Returns where its report is, to append to the error; empty without one.
+    """
     software = f'starcal {software_version()}'
     products.write_not_calibrated(dataclasses.replace(failure, software=software), folder)
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
@@ -186,9 +190,10 @@ def _write_failure(
         try:
             from starcal_ground.report import page
         except ModuleNotFoundError as error:
-            missing_package(error, 'report')  # raises where another module is missing
+            missing_package(error)  # raises where another module is missing
         else:
-            page.write_report(folder)
+            return f'; look at {page.write_report(folder)}'
+    return ''
 
 
 class Drawings:

@@ -118,7 +118,6 @@ def parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
-    command = ''
     try:
         terminal.open_missing_streams()
         if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
@@ -129,9 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             argcomplete.autocomplete(tool)
         try:
-            args = tool.parse_args(argv)
-            command = args.command or ''
-            return _run(args, tool)
+            return _run(tool.parse_args(argv), tool)
         finally:
             sys.stdout.flush()  # at the end of Python an error has no handler
     except StarcalError as error:
@@ -151,8 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        of_command = 'mission' if command == 'trend' else 'report'
-        extra = 'pdf' if error.name == 'weasyprint' else of_command
+        extra = 'pdf' if error.name == 'weasyprint' else 'mission'
         return arguments.complain(missing_package(error, extra))
 
 

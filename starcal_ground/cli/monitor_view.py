@@ -25,7 +25,7 @@ from starcal_ros.text import printable
 _HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
 _STALE = ('stale', 'yellow')
 _SHADES = ' ░▒▓█'
-_TIGHTEST = 6  # gate checks shown of a calibration that passed
+_TIGHTEST = 4  # gate checks shown of a calibration that passed
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,12 @@ def _lines(lines: Iterable[Text]) -> Text:
 
 
 def view(received: Received) -> Group:
-    """All panels in one column of 80 characters."""
+    """All panels in one column of 80 characters; health and gate are in the first 24 lines."""
     return Group(
+        Panel(_health(received.health), title='nodes', title_align='left'),
+        Panel(_calibration(received), title='calibration', title_align='left'),
         Panel(_images(received), title='images', title_align='left'),
         Panel(_ensemble(received), title='ensemble', title_align='left'),
-        Panel(_calibration(received), title='calibration', title_align='left'),
-        Panel(_health(received.health), title='nodes', title_align='left'),
     )
 
 
@@ -211,6 +211,6 @@ def _health(health: Mapping[str, tuple[int, str]]) -> Text:
 
 
 def _health_lines(health: Mapping[str, tuple[int, str]]) -> Iterator[Text]:
-    for name, (level, message) in sorted(health.items()):
+    for name, (level, message) in sorted(health.items(), key=lambda one: (-one[1][0], one[0])):
         words, style = _HEALTH.get(level, _STALE)
         yield Line(f'{name}: ').append(words, style).append(f' {message}')

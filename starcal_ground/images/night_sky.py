@@ -171,7 +171,9 @@ def from_photographs(
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
-    return _set_up(stars, [bag], stated, folder, is_located, Topics(), notes)
+    undated = sum(not one.dated for one in photographs)
+    times_of = f'of the file: {undated} of {len(photographs)} images state none' * bool(undated)
+    return _set_up(stars, [bag], stated, folder, is_located, Topics(), notes, times_of)
 
 
 def camera_of_photographs(
@@ -252,6 +254,7 @@ def _set_up(
     is_located: bool,
     given: Topics,
     notes: Sequence[str] = (),
+    times_of: str = '',
 ) -> NightSky:
     attitudes = folder / 'attitudes.mcap'
     with BagWriter(attitudes) as writer:
@@ -262,7 +265,9 @@ def _set_up(
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
+    setup = dataclasses.replace(setup, times_of=times_of)
     notes = [*notes, stars.in_a_sentence()]
+    notes += [f'the time is that {times_of}'] if times_of else []
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
     topics = dataclasses.replace(given, attitude=_ATTITUDE_TOPIC)

@@ -284,7 +284,7 @@ def _quiet() -> Iterator[None]:
 
 def _facts_of_picture(path: Path, kind: FileKind) -> tuple[_Tags, _Tags, int, int]:
     """Tags of EXIF and GPS, width and height."""
-    with needing('report', IngestError, path):
+    with needing('', IngestError, path):
         from PIL import Image
     start = content_of(path, _JPEG_HEADER_BYTES) if kind is JPEG else content_of(path)
     try:

@@ -123,12 +123,18 @@ class Prospect:
     information: Floats
 
     def best(self, chosen: Sequence[int], allowed: Mask, squares: Floats) -> int:
-        """Return which allowed candidate lowers a variance most, after those that are chosen."""
+        """
+        Return which allowed candidate lowers a variance most, after those that are chosen.
+
+        One that was chosen before comes back only if the others leave more than `_HELPS` of the
+        sigma: a slow error of the star tracker may be the same in one attitude.
+        """
         before = np.eye(self.root.shape[1]) + self.information[list(chosen)].sum(axis=0)
         seen = self.root.T @ squares @ self.root
         variance = np.full(len(self.information), np.inf)
         for k in np.flatnonzero(allowed):
             variance[k] = _variance(before + self.information[k], seen)
+        variance[list(chosen)] *= (1.0 + _HELPS) ** 2
         return int(np.argmin(variance))
 
     def variances(self, chosen: Sequence[int], squares: Floats) -> Floats:

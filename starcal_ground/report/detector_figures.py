@@ -308,17 +308,13 @@ def _draw_contours(
     top: float,
     unit: str,
 ) -> None:
-    """Contours, thicker for higher levels, with one label each where there is room."""
+    """Contours, thicker for higher levels, each open at one label where there is room."""
     lines = [
         # contourpy's types allow other forms of a line as well.
         [np.stack([panel.x(x), panel.y(y)], axis=-1)
          for x, y in (np.asarray(line, np.float64).T for line in generator.lines(level))]
         for level in levels
     ]  # fmt: skip
-    for k, of_level in enumerate(lines):
-        colour = _DARK if levels[k] > 0.6 * top else _BRIGHT
-        for line in of_level:
-            panel.path(line, colour, 1.0 + 1.4 * k / max(len(levels) - 1, 1))
     taken: list[Floats] = []
     for k, level in enumerate(levels):
         text = f'{svg.in_digits(level)}{unit}'
@@ -329,6 +325,13 @@ def _draw_contours(
             taken.append(place[None])
             x, y = place.tolist()
             panel.outside.append(svg.words(x, y + 4, text, colour=_BRIGHT, edge=_DARK))
+        colour = _DARK if level > 0.6 * top else _BRIGHT
+        for line in lines[k]:
+            shown = line
+            if place is not None:
+                at_label = np.asarray((abs(line - place) < half).all(axis=1))
+                shown = np.where(at_label[:, None], np.nan, line)
+            panel.path(shown, colour, 1.0 + 1.4 * k / max(len(levels) - 1, 1))
 
 
 def _label_place(

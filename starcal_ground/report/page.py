@@ -30,12 +30,13 @@ from starcal_ground.report.thumbnails import star_of, Thumbnail
 from starcal_ground.report.verdict import Row
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
+from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
-from starcal_ros.pipeline.solve import inputs_of
+from starcal_ros.record_fields import nearest
 from starcal_ros.records import (
     Calibration,
     IMAGE_REFUSALS,
@@ -120,7 +121,10 @@ def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str
                 'time': utc_text(int(residuals.image_time_ns[k])),
                 'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
                 'misfit': bool(residuals.image_misfit[k]),
-                'tracker': [None if math.isnan(e) else round(float(e), 2) for e in error],
+                'tracker': [
+                    None if math.isnan(e) else round(float(e), 2)
+                    for e in error[: 3 * calibration.has_alignment]
+                ],
                 'stars': stars.ravel().tolist(),
             }
         )
@@ -313,6 +317,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
+        'times_of': calibration.provenance.get(solve.TIMES, ''),
         'active_since': utc_text(calibration.active_since_ns),
         'parameters': typeset(verdict.parameter_rows(calibration, prior)),
         'alignment': typeset(verdict.alignment_rows(calibration, prior)),
@@ -333,7 +338,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'refused_stars': refused_stars(observations, pictures),
         'model_rows': verdict.model_rows(calibration),
         'star_marks': star_marks(observations),
-        'files': [(name, *inputs_of([folder / name]).values()) for name in written],
+        'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
         'has_images': any(not one.reason for one in pictures),
         'used_images': used_images(observations, pictures),
         'options': _options(calibration),
@@ -352,8 +357,9 @@ def _options(calibration: Calibration) -> list[tuple[str, str]]:
 def _signed(calibration: Calibration) -> list[tuple[str, str]]:
     """Rows above a signature: names, times, and the provenance with its digests."""
     known = calibration.provenance.items()
+    frames = filter(None, (calibration.child_frame, calibration.parent_frame))
     return [
-        ('calibration', f'{calibration.child_frame} on {calibration.parent_frame}'),
+        ('calibration', ' on '.join(frames)),
         ('images', f'{utc_text(calibration.first_image_ns)} to {utc_text(calibration.time_ns)}'),
         *sorted((name, value) for name, value in known if name not in ('options', 'prior')),
     ]
@@ -378,6 +384,35 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     path = folder / outputs.REPORT_FILE
     product_files.write_atomically(path, text)
     return path
+
+
+def plot(
+    source: Calibration | Path | str,
+    name: str,
+    residuals: Residuals | None = None,
+    observations: Sequence[StarObservations] = (),
+) -> Chart:
+    """
+    Figure of the report by its name, such as ``shape``, ``budget`` or ``histogram``, as SVG.
+
+    A notebook shows it; ``svg.document()`` is the text of a file.  ``source`` is a folder of
+    products, or a calibration with its residuals and observations, which some figures need.
+    Raises OptionError with the names that there are.
+
+    Examples
+    --------
+    >>> import starcal_ground
+    >>> figure = starcal_ground.plot('out', 'budget')
+    >>> figure.title, figure.svg.document()[:4]
+    ('Causes of the uncertainty', '<svg')
+    """
+    if not isinstance(source, Calibration):
+        read = _read_folder(Path(source))
+        source, residuals, observations = read.calibration, read.residuals, read.observations or ()
+    charts = charts_of(source, residuals, observations)
+    if name not in charts:
+        raise OptionError(f'{name!r} is not one of {", ".join(charts)}{nearest(name, charts)}')
+    return charts[name]
 
 
 def charts_of(

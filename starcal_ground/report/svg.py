@@ -77,6 +77,10 @@ class Chart:
     svg: Drawing
     text: str
 
+    def _repr_svg_(self) -> str:
+        """Return the drawing, for notebooks."""
+        return self.svg.document()
+
 
 @dataclass(frozen=True)
 class Curve:

@@ -10,14 +10,15 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.record_fields import Record
 from starcal_ros.records import MapCovariance
 
 _CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
 GRID = 25  # pixels a side over which calibrations are compared and common rotations taken
 
 
-@dataclass(frozen=True)
-class LineOfSightTable:
+@dataclass(frozen=True, eq=False, repr=False)
+class LineOfSightTable(Record):
     """
     Lines of sight of n pixels.
 
@@ -140,6 +141,12 @@ class Derivatives:
         """Return the variances (n,) of the directions, both angles summed; J as here."""
         unresolved = covariance.unresolved_px**2 * (self.by_pixel**2).sum(axis=(1, 2))
         return np.asarray(_trace(J, covariance.matrix) + unresolved)
+
+    def covariance_rad2(self, covariance: MapCovariance, J: Floats) -> Floats:
+        """Return the covariances (n, 3, 3) of the directions in the camera frame; J as here."""
+        by_pixel = covariance.unresolved_px * self.by_pixel
+        parts = J @ covariance.matrix @ J.swapaxes(1, 2), by_pixel @ by_pixel.swapaxes(1, 2)
+        return np.asarray(sum(parts))
 
 
 def common_rotation(camera: CameraModel) -> Floats:

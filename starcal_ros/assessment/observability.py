@@ -28,6 +28,7 @@ from starcal_ros.estimation.problem import image_blocks, Problem, State
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.temperature import why_unsupported
+from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
 from starcal_ros.estimation.unknowns import unknowns_in_state
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
@@ -98,9 +99,9 @@ def predicted_sigma(
     """
     1-sigma (k,) of `estimated_names` that a calibration would report, predicted at the prior.
 
-    Uses the covariances of centroids and star tracker as given; infinite for parameters that are
-    not observable yet.  Temperature terms that the images support are estimated jointly, so all
-    sigmas account for them.
+    Uses the covariances of centroids and star tracker as given, and the slow error of the star
+    tracker to expect; infinite for parameters that are not observable yet.  Temperature terms that
+    the images support are estimated jointly, so all sigmas account for them.
     """
     names = estimated_names(options, prior.camera.model)
     if not ensemble.images:
@@ -164,6 +165,15 @@ def _sigma_with(
     held = np.setdiff1d(first + np.flatnonzero(np.isfinite(problem.prior_sigma)), kept)
     by_held = covariance @ whole[np.ix_(kept, held)] * problem.prior_sigma[held - first]
     variance = np.diag(covariance) + (by_held**2).sum(axis=1)
+    if options.method != 'single':  # which takes star trackers as exact
+        here = np.flatnonzero(problem.star_tracker == 0)
+        stamps_ns = np.array([ensemble.images[k].time_ns for k in here], np.int64)
+        slow_rad = expected_slow_of_mean(
+            correlations_of(stamps_ns, state.camera_from_icrf[here]),
+            options.star_tracker_slow_arcsec * ARCSECOND_RAD,
+            float(problem.star_tracker_sigma_rad.min()),
+        )
+        variance[np.isin(kept, layout.of(['alignment']))] += slow_rad**2
     names = [layout.labels[k] for k in kept]
     return dict(zip(names, np.sqrt(variance).tolist(), strict=True))
 

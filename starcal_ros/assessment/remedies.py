@@ -25,6 +25,7 @@ REMEDIES: Mapping[str, str] = {
     'not_in_catalog': (
         'raise magnitude_limit, or give a catalog that covers these fields (starcal catalog)'
     ),
+    'no_match': 'ask the diagnostics of the star observer, or starcal diagnose, for the cause',
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
     # Checks of the gate, by option, with the section of the report.
     'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.record_fields import Shape, Within
+from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Ensemble
 
 
-@dataclass(frozen=True)
-class Residuals:
+@dataclass(frozen=True, eq=False, repr=False)
+class Residuals(Record):
     """
     Residuals of a calibration, m images in time order and n stars in image order.
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices
+from starcal_ros.record_fields import Record
 
 # Domain of the cosines in detector sides: a field need not be flat at the border.
 COSINE_DOMAIN = 1.2
@@ -67,8 +68,8 @@ def term_count(width: int, height: int, octaves: int) -> int:
     return len(cosine_terms(width, height, octaves)[0])
 
 
-@dataclass(frozen=True)
-class DetectorField:
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectorField(Record):
     """
     A displacement of every pixel: a star that the lens model places at u is measured at u + f(u).
 

@@ -33,7 +33,9 @@ from starcal_ros.camera.lens import (
     fold_radius2,
     ideal_by_rotation,
     ideal_points,
+    ros_distortion,
 )
+from starcal_ros.record_fields import Record
 
 MAX_SIDE_PX = 65536
 _MAX_FOCAL_PX = 1e8  # 0.002 arcsec per pixel
@@ -61,8 +63,8 @@ _INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal leng
 _HELD_PX = 1e-2
 
 
-@dataclass(frozen=True)
-class CameraModel:
+@dataclass(frozen=True, eq=False)
+class CameraModel(Record):
     """
     A camera: image size in pixels, parameters and lens model.
 
@@ -77,6 +79,8 @@ class CameraModel:
     ('fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'p1', 'p2')
     >>> camera.replace(k1=-0.1).distortion.tolist()
     [-0.1, 0.0, 0.0, 0.0, 0.0]
+    >>> camera.camera_matrix[0].tolist(), camera.opencv_coefficients.shape
+    ([2000.0, 0.0, 511.5], (5,))
     """
 
     width: int
@@ -128,10 +132,15 @@ class CameraModel:
         return self.field is not None and bool(self.field.coefficients.any())
 
     @property
-    def matrix(self) -> Floats:
+    def camera_matrix(self) -> Floats:
         """The (3, 3) camera matrix K with skew (Eq. 7)."""
         fx, skew, fy, cx, cy = self.intrinsics
         return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def opencv_coefficients(self) -> Floats:
+        """Distortion (c,) in OpenCV's order: for cv2, or cv2.fisheye if ``equidistant``."""
+        return ros_distortion(self.model, self.distortion)[1]
 
     def replace(self, **parameters: float) -> CameraModel:
         """Return the camera with some named parameters changed; ValueError for other names."""

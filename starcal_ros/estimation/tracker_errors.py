@@ -187,6 +187,18 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     )
 
 
+def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise: float) -> float:
+    """
+    Return the 1-sigma that the slow error is expected to give the mean of images.
+
+    Of its prior, the mean of s and of K: before a solve no scatter has been seen.
+    """
+    log_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
+    size = np.bincount(correlations.group) / len(correlations.group)
+    shared = float((size @ correlations.kernels @ size).mean())
+    return (stated_slow or noise) * math.exp(0.5 * log_sigma**2) * math.sqrt(shared)
+
+
 def groups_of(time_ns: Indices) -> Indices:
     """Return the group (m,) of each image: neighbours in time, of the same size but the last."""
     m = len(time_ns)

@@ -11,7 +11,7 @@ last few only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -143,7 +143,19 @@ def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
     setup = observed.source.setup
     ensemble = solve.ensemble_of(observed.observations, setup)
     calibration, residuals = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
-    return Campaign(setup, observed.observations, ensemble, calibration, residuals, observed.notes)
+    notes = (*observed.notes, *_refusals(observed.observations))
+    return Campaign(setup, observed.observations, ensemble, calibration, residuals, notes)
+
+
+def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:
+    """Sentences on the reasons of refused images."""
+    if any(image.refusal for image in observations):
+        from starcal_ros.pipeline.diagnosis.bags import refusals  # slow
+
+        for group in refusals(observations):
+            detail = f' ({group.detail})' if group.detail else ''
+            count = f'{group.count} of {len(observations)} images'
+            yield f'{count} refused, {group.reason}: {group.meaning}{detail}'
 
 
 def calibrate_bags(

@@ -200,7 +200,7 @@ class Setup:
     Options of every stage, with prior camera, catalog and detector frames loaded.
 
     Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
-    alignment is determined.
+    alignment is determined.  ``times_of`` says where stamps are from that are not of the images.
     """
 
     frames: SetupOptions
@@ -220,6 +220,7 @@ class Setup:
     camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
     flat: Floats | None = None
     mountings: tuple[Mounting, ...] = ()
+    times_of: str = ''
 
     @property
     def star_search(self) -> StarSearch:

@@ -46,6 +46,8 @@ from starcal_ros.records import (
 )
 from starcal_ros.untrusted import regular_file
 
+TIMES = 'image times'
+"""Key of the provenance: where the stamps are from, if the images state none."""
 _FEWEST_STARS = 3  # two fit their mirror image
 _MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
 _ALIGNING = 20  # images, of whose alignments the middle one is taken
@@ -310,6 +312,7 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'options': json.dumps(setup.options(), sort_keys=True),
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': _digest(ensemble),
+        **({TIMES: setup.times_of} if setup.times_of else {}),
         **{f'input {name}': value for name, value in inputs.items()},
     }
 

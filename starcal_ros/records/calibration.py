@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.record_fields import Count, Finite, Quaternion, Shape, Stamp
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.record_fields import Count, Finite, Quaternion, Record, Shape, Stamp
 from starcal_ros.records.calibration_parts import (
     MapCovariance,
     ModelChecks,
@@ -22,8 +23,9 @@ from starcal_ros.records.calibration_parts import (
     SigmaPart,
     StarTrackerAlignment,
     Statement,
+    TOTAL,
 )
-from starcal_ros.text import significant
+from starcal_ros.text import significant, to_sigma
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -31,8 +33,8 @@ if TYPE_CHECKING:
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
 
-@dataclass(frozen=True)
-class CameraGeometry:
+@dataclass(frozen=True, eq=False)
+class CameraGeometry(Record):
     """
     The camera and its alignment to the star tracker: the prior, or a calibration.
 
@@ -103,8 +105,8 @@ class TemperatureTerms:
             raise ValueError(f'focal_per_degc: {order} numbers, at most 2 are allowed')
 
 
-@dataclass(frozen=True)
-class DetectorMaps:
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectorMaps(Record):
     """
     Precision of a calibration over the detector; v increases with the row.
 
@@ -131,8 +133,8 @@ class DetectorMaps:
     shape_sigma_arcsec: Annotated[Floats, Shape(('map_rows', 'map_cols'))]
 
 
-@dataclass(frozen=True)
-class Correlation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Correlation(Record):
     """
     Correlations (k, k) of the k named numbers that have an uncertainty.
 
@@ -200,8 +202,8 @@ class GateCheck:
         return f'{number} {self.unit}' if self.unit else number
 
 
-@dataclass(frozen=True)
-class Calibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Record):
     """
     One calibration with its covariance, statistics and provenance.
 
@@ -281,6 +283,8 @@ class Calibration:
     (('alignment_x', 'alignment_y', 'alignment_z'), (13, 13))
     >>> calibration.accepted, calibration.reasons, calibration.images_used
     (True, (), 10)
+    >>> print(repr(calibration).splitlines()[0])  # of three; summary() has more
+    Calibration of camera on star_tracker: accepted by the gate
     """
 
     time_ns: Stamp
@@ -340,6 +344,35 @@ class Calibration:
             camera = dataclasses.replace(camera, field=detector_field)
             geometry = dataclasses.replace(self.geometry, camera=camera)
             object.__setattr__(self, 'geometry', geometry)
+
+    def __repr__(self) -> str:
+        """Return verdict, images, residual and precision in three lines."""
+        camera, frame = self.geometry.camera, f' on {self.parent_frame}' * self.has_alignment
+        total = next((part for part in self.sigma_budget if part.cause == TOTAL), None)
+        sigma = 'not recorded'
+        if total is not None:
+            pointing = f', with alignment {significant(total.pointing_arcsec, 2)}″'
+            sigma = f'camera alone {significant(total.map_arcsec, 2)}″' + pointing * bool(frame)
+            sigma += ' rms over the detector'
+        return (
+            f'Calibration of {self.child_frame}{frame}:'
+            f' {"accepted" if self.accepted else "refused"} by the gate\n'
+            f'  {camera.model}, {camera.width} x {camera.height} px; {self.stars_used} stars in'
+            f' {self.images_used} images, residual {significant(self.residual_rms_px, 3)} px rms'
+            f' per axis\n  1-sigma of lines of sight: {sigma}'
+        )
+
+    def summary(self) -> str:
+        """Text with the verdict, its reasons, and each parameter with its 1-sigma."""
+        lines = [repr(self), *(f'  refused: {reason}' for reason in self.reasons)]
+        parameters, sigma = self.geometry.camera.parameters.tolist(), self.sigma.tolist()
+        for name, value, one in zip(self.parameter_names, parameters, sigma, strict=False):
+            known = f'1-sigma {significant(one, 2)}' if one > 0 else 'held'
+            lines.append(f'  {name:12} {to_sigma(value, one):>12}  {known}')
+        for name, one in zip(ALIGNMENT_NAMES, sigma[-3:] * self.has_alignment, strict=False):
+            known = f'1-sigma {significant(one / ARCSECOND_RAD, 2)}″'
+            lines.append(f'  {name:25}  {known}')
+        return '\n'.join(lines)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera.detector_field import DetectorField, term_count
-from starcal_ros.record_fields import Count, Finite, Quaternion, Shape, Within
+from starcal_ros.record_fields import Count, Finite, Quaternion, Record, Shape, Within
 from starcal_ros.text import significant
 
 TOTAL = 'total'
@@ -129,8 +129,8 @@ class ModelChecks:
     predictions: tuple[ResidualBin, ...] = ()
 
 
-@dataclass(frozen=True)
-class StarTrackerAlignment:
+@dataclass(frozen=True, eq=False, repr=False)
+class StarTrackerAlignment(Record):
     """
     Alignment of the camera to one of several star trackers.
 
@@ -258,8 +258,8 @@ _STEPS = 1000
 _NO_VARIANCE = 1e-12  # times the largest eigenvalue: smaller ones are rounding
 
 
-@dataclass(frozen=True)
-class MapCovariance:
+@dataclass(frozen=True, eq=False, repr=False)
+class MapCovariance(Record):
     """
     Covariance of all that moves a line of sight.
 
@@ -278,8 +278,8 @@ class MapCovariance:
     unresolved_px: float = 0.0
 
 
-@dataclass(frozen=True)
-class ResidualField:
+@dataclass(frozen=True, eq=False, repr=False)
+class ResidualField(Record):
     """
     Field over the detector in addition to the lens model.
 

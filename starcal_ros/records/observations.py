@@ -22,6 +22,7 @@ from starcal_ros.record_fields import (
     Named,
     OneOf,
     Quaternion,
+    Record,
     Shape,
     Stamp,
     Unit,
@@ -136,8 +137,8 @@ _FiniteOrNaN = Annotated[float, Within()]
 _FloatsOrNaN = Annotated[NDArray[np.float32], Within(), Shape(('n',))]
 
 
-@dataclass(frozen=True)
-class StarObservations:
+@dataclass(frozen=True, eq=False, repr=False)
+class StarObservations(Record):
     """
     The stars measured and identified in one image, or the reason of its refusal.
 
@@ -316,8 +317,8 @@ def refused_image(
     )
 
 
-@dataclass(frozen=True)
-class Ensemble:
+@dataclass(frozen=True, eq=False, repr=False)
+class Ensemble(Record):
     """
     The input of a calibration: usable images in order of arrival, and counts of the others.
 
@@ -352,8 +353,8 @@ class Ensemble:
         return Ensemble((*self.images, observations), self.refused)
 
 
-@dataclass(frozen=True)
-class EnsembleStatus:
+@dataclass(frozen=True, eq=False, repr=False)
+class EnsembleStatus(Record):
     """
     Images and stars collected so far, and the precision of a calibration made from them.
 

@@ -333,6 +333,9 @@ class StarObserver(StarcalNode):
         # Asked first: an attitude that comes during the measurement was awaited.
         awaited = self._star_trackers.awaited(image.time_ns)
         observations, self._track = self._observe_next(image, before)
+        why = self._unmatched.diagnosis
+        if why is not None and observations.refusal == 'no_match':
+            observations = dataclasses.replace(observations, detail=why.in_a_sentence())
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
             self.get_logger().warning('image stamps went back: restarted the sequence')

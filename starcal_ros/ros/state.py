@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +13,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.errors import ArchiveError, missing_package, OptionError, StarcalError
+from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.errors import (
+    ArchiveError,
+    missing_package,
+    OptionError,
+    StarcalError,
+    TooFewObservations,
+)
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup
-from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
+from starcal_ros.records import (
+    Calibration,
+    counted_refusal,
+    Ensemble,
+    EnsembleStatus,
+    IMAGE_REFUSALS,
+    StarObservations,
+)
 
 if TYPE_CHECKING:
     from starcal_ros.ros.archive import Archive
@@ -75,6 +89,7 @@ class CalibratorState:
         # locks held, `_disk` first.
         self._records = threading.Lock()
         self._ensemble = Ensemble()
+        self._details: dict[str, str] = {}  # of the last image refused for each reason
         self._history: tuple[Activation, ...] = ()
         self._active: Activation | None = None  # of the history
         self._disk = threading.Lock()  # guards the archive
@@ -100,7 +115,7 @@ class CalibratorState:
             from starcal_ros.ros.archive import Archive, read_seal
         except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
             raise ArchiveError(
-                f'state_dir: {missing_package(error, "")}, or leave state_dir empty: then a'
+                f'state_dir: {missing_package(error)}, or leave state_dir empty: then a'
                 ' restart loses the ensemble'
             ) from error
         seal = read_seal(options.state_key_file)
@@ -175,6 +190,7 @@ class CalibratorState:
             if self._ensemble is not ensemble:  # emptied meanwhile: start with this image
                 grown = solving.add_to_ensemble(Ensemble(), observations, self._setup)
             self._ensemble = grown
+            self._details[counted_refusal(observations.refusal)] = observations.detail
         self.save()
 
     def reset(self) -> Answer:
@@ -206,6 +222,8 @@ class CalibratorState:
             calibration = solving.solve(
                 ensemble, self._setup, method, estimate, active=self.active
             )
+        except TooFewObservations as error:
+            return Answer(False, f'{error}{self._why_refused(ensemble.refused)}')
         except StarcalError as error:
             return Answer(False, str(error))
         if not calibration.accepted and not force:
@@ -223,6 +241,16 @@ class CalibratorState:
             calibration = self._activate(self._next_event(), before, calibration)
         message = self._answer(f'activated: {summary(calibration)}').message
         return Answer(True, message, calibration, True)
+
+    def _why_refused(self, refused: Mapping[str, int]) -> str:
+        """Return the most frequent refusal, its last detail and the remedy; empty if none."""
+        if not refused:
+            return ''
+        reason = max(refused, key=lambda name: refused[name])
+        with self._records:
+            detail = self._details.get(reason, '')
+        words = (detail.rstrip('.') or IMAGE_REFUSALS.get(reason, ''), REMEDIES.get(reason, ''))
+        return f'; {refused[reason]} images refused as {reason}: {"; ".join(filter(None, words))}'
 
     def rollback(self) -> Answer:
         """Activate the calibration before the active one again."""

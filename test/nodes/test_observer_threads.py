@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import dataclasses
 from pathlib import Path
 import threading
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -14,8 +16,11 @@ pytest.importorskip('starcal.msg')
 
 import rclpy
 
+from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
+from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
+from starcal_ros.ros.image_queue import Waiting
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
 
@@ -58,3 +63,26 @@ def test_the_worker_alone_changes_prediction_and_counts(
     go_on.set()
     assert done.wait(60.0)
     assert observer._geometry is not prior
+
+
+def test_a_refusal_has_the_cause_once_it_is_known(observer: StarObserver, tiny_bag: Path) -> None:
+    """The calibrator answers with the detail of the last refusal."""
+    topics = {topic.type_name: topic.name for topic in reader.topics([tiny_bag])}
+    of_images = topics.pop('sensor_msgs/msg/Image')
+    images = []
+    for raw in reader.read_raw([tiny_bag], [of_images, *topics.values()]):
+        message = reader.decode(raw)
+        if raw.topic == of_images:
+            images.append(message)
+        elif hasattr(message, 'quaternion'):
+            observer._on_attitude(message)
+    first = images[0]
+    pixels = np.asarray(first.data).reshape(first.height, -1, 2)[:, ::-1]
+    mirrored = dataclasses.replace(first, data=pixels.ravel())
+    waiting = Waiting(0, first.width, first.height, mirrored, 0.0)
+    observer._measure(waiting)
+    assert observer._last_refusal.startswith('no_match: ') and 'chance' in observer._last_refusal
+    observer._unmatched._diagnosis = Diagnosis('mirrored', 1, 'The image is mirrored.')
+    observer._track = dataclasses.replace(observer._track, latest_ns=None)
+    observer._measure(waiting)
+    assert observer._last_refusal.startswith('no_match: The image is mirrored.')

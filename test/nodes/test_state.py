@@ -172,6 +172,34 @@ def test_what_is_forced_says_so(
     state.close()
 
 
+# Refused images, and what the answer of a request says of them.
+REFUSED = {
+    'none': ([], '', False),
+    'cause': (
+        [('no_match', '23 star-like sources'), ('no_match', 'The images are mirrored.')],
+        '; 2 images refused as no_match: The images are mirrored; ask the diagnostics of the star',
+        True,
+    ),
+    'most': (
+        [('glare', ''), ('glare', ''), ('no_stars', '1 source')],
+        '; 2 images refused as glare: ',
+        True,
+    ),
+    'dropped': ([('wrong_size', '')] * 2, '; 2 images refused as wrong_size: ', True),
+}
+
+
+@pytest.mark.parametrize('name', REFUSED)
+def test_a_request_without_images_is_answered_with_the_cause(setup: Setup, name: str) -> None:
+    images, words, expected = REFUSED[name]
+    state = started(setup)
+    for k, (reason, detail) in enumerate(images):
+        state.add(refused_image(k, 640, 512, reason, detail))
+    message = state.solve().message
+    assert message.startswith('too few observations') and ('refused' in message) is expected
+    assert words in message and '\n' not in message and not message.endswith(': ')
+
+
 def test_what_would_count_twice_or_wrong_is_refused(
     setup: Setup, shown: tuple[StarObservations, ...]
 ) -> None:

@@ -128,9 +128,9 @@ def opencv_of(camera: CameraModel, e: np.ndarray) -> tuple[np.ndarray, np.ndarra
     _, D = ros_distortion(camera.model, camera.distortion)
     if camera.model == 'equidistant':
         points = (e / e[:, 2:])[:, None]
-        pixels, J = cv2.fisheye.projectPoints(points, still, still, camera.matrix, D)
+        pixels, J = cv2.fisheye.projectPoints(points, still, still, camera.camera_matrix, D)
     else:
-        pixels, J = cv2.projectPoints(e, still, still, camera.matrix, D)
+        pixels, J = cv2.projectPoints(e, still, still, camera.camera_matrix, D)
     return pixels.reshape(-1, 2), J.reshape(len(e), 2, -1)
 
 

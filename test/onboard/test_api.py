@@ -16,6 +16,7 @@ from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
 
 import starcal_ros
 from starcal_ros import api
+from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, StarObservations
@@ -167,6 +168,53 @@ def test_lines_of_sight_are_of_either_frame() -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
     with pytest.raises(ValueError, match="frame: 'icrf' is not"):
         starcal_ros.lines_of_sight(geometry, pixels, frame='icrf')  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize('frame', ['camera', 'star_tracker'])
+def test_a_direction_is_projected_from_either_frame(frame: api.Frame) -> None:
+    pixels = np.array([[0.0, 0.0], [100.0, 50.0], [639.0, 511.0]])
+    sights = starcal_ros.lines_of_sight(SCENARIO.truth, pixels, frame)
+    back = starcal_ros.project(SCENARIO.truth, 3.0 * sights, frame)
+    np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-8)  # as above
+
+
+@pytest.mark.parametrize(('frame', 'column'), [('camera', 1), ('star_tracker', 2)])
+def test_sigmas_of_lines_of_sight_are_those_of_the_table(
+    tiny_products: Path, frame: api.Frame, column: int
+) -> None:
+    calibration = starcal_ros.read_calibration(tiny_products)
+    pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
+    table = line_of_sight_table(
+        calibration.geometry.camera, calibration.map_covariance, pixels.reshape(-1, 2)
+    )
+    found = starcal_ros.line_of_sight_sigma_arcsec(calibration, pixels, frame)
+    expected = (table.shape_sigma_arcsec, table.sigma_arcsec)[column - 1].reshape(2, 2)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)  # rounding
+    # No uncertainty is along the line of sight itself.
+    covariance = starcal_ros.line_of_sight_covariance(calibration, pixels, frame)
+    sights = starcal_ros.lines_of_sight(calibration, pixels, frame)
+    along = np.einsum('...i,...ij,...j->...', sights, covariance, sights)
+    assert (np.abs(along) < 1e-9 * np.trace(covariance, axis1=-2, axis2=-1)).all()
+
+
+def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny_products: Path) -> None:
+    alone = dataclasses.replace(starcal_ros.read_calibration(tiny_products), parent_frame='')
+    for camera in (alone, alone.geometry.camera):
+        assert starcal_ros.lines_of_sight(camera, [1.0, 2.0]).shape == (3,)
+        with pytest.raises(ValueError, match='the camera alone has no alignment'):
+            starcal_ros.lines_of_sight(camera, [1.0, 2.0], 'star_tracker')
+
+
+def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products: Path) -> None:
+    one, same = (starcal_ros.read_calibration(tiny_products) for _ in range(2))
+    assert one == same and one != 'calibration'
+    assert one != dataclasses.replace(one, covariance=2 * one.covariance)
+    assert repr(one).count('\n') == 2 and len(repr(one)) < 300
+    text = dataclasses.replace(one, accepted=False, reasons=('a < b',)).summary()
+    assert 'refused by the gate' in text and 'refused: a < b' in text
+    fx, sigma = one.geometry.camera.parameters[0], one.sigma[0]
+    assert f'{fx:.3f}' in text and f'1-sigma {sigma:.2g}' in text
+    assert dataclasses.replace(one, reasons=('a < b',))._repr_html_().count('a &lt; b') == 1
 
 
 def test_records_are_not_changed_by_the_caller() -> None:

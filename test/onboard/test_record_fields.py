@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import dataclasses
 from dataclasses import dataclass
 import json
 import math
@@ -15,7 +16,15 @@ import pytest
 from sample_records import assert_same  # type: ignore[import-not-found]
 
 from starcal_ros.arrays import Floats
-from starcal_ros.record_fields import Count, Finite, json_object, read_record, Shape, Within
+from starcal_ros.record_fields import (
+    Count,
+    Finite,
+    json_object,
+    read_record,
+    Record,
+    Shape,
+    Within,
+)
 
 
 @dataclass(frozen=True)
@@ -112,3 +121,43 @@ def test_a_number_that_is_not_finite_is_null() -> None:
     content = json_object(Knot(np.array([[np.nan, np.inf]]), np.array([1])))
     assert content['places_px'] == [[None, None]]
     assert np.isnan(read_record(Knot, content).places_px).all()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Shown(Record):
+    """A record with arrays."""
+
+    name: str
+    value: float
+    numbers: np.ndarray
+    parts: tuple[object, ...] = ()
+
+
+ONE = Shown('one', math.nan, np.array([1.0, math.nan]), (np.zeros(2), 3))
+# What differs from ONE, and whether it is equal.
+COMPARED = {
+    'copy': ({'numbers': ONE.numbers.copy(), 'parts': (np.zeros(2), 3)}, True),
+    'number': ({'numbers': np.array([2.0, math.nan])}, False),
+    'shape': ({'numbers': np.array([[1.0, math.nan]])}, False),
+    'part': ({'parts': (np.ones(2), 3)}, False),
+    'value': ({'value': 1.0}, False),
+    'text': ({'name': 'two'}, False),
+}
+
+
+@pytest.mark.parametrize('name', COMPARED)
+def test_records_with_arrays_are_compared_by_their_numbers(name: str) -> None:
+    changes, expected = COMPARED[name]
+    other = dataclasses.replace(ONE, **changes)  # type: ignore[arg-type]
+    assert (other == ONE) is expected
+    assert ONE != 'one'
+
+
+def test_a_large_record_is_shown_in_three_lines() -> None:
+    large = Shown('<b>' + 'x' * 500, 1.0, np.zeros((300, 2)), tuple(range(1000)))
+    assert repr(large) == (
+        'Shown(name=str(...), value=1.0, numbers=<300 x 2 float64>, parts=<1000 items>)'
+    )
+    assert repr(dataclasses.replace(large, parts=(large,) * 3)).count('\n') <= 2
+    assert 'numbers=<300 x 2 float64>' in large.summary()
+    assert '&lt;300 x 2 float64&gt;' in large._repr_html_()

@@ -22,15 +22,8 @@ MANIFEST = ROOT / 'MANIFEST.in'
 # What is made here and is no source.
 MADE = ('.*cache*', '.hypothesis', '*.egg-info', '__pycache__', '_build', 'generated')
 SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
-OF_EXTRAS = (
-    'contourpy',
-    'dask',
-    'distributed',
-    'jinja2',
-    'pyarrow',
-    'sphinx',
-    'spiceypy',
-)
+OF_EXTRAS = ('dask', 'distributed', 'pyarrow', 'sphinx', 'spiceypy')
+OF_THE_REPORT = ('PIL', 'contourpy', 'jinja2')
 
 
 PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
@@ -124,11 +117,6 @@ def flight_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return installed(wheel, tmp_path_factory.mktemp('flight'), '')
 
 
-@pytest.fixture(scope='module')
-def report_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return installed(wheel, tmp_path_factory.mktemp('report'), 'report')
-
-
 @pytest.mark.packaging
 @pytest.mark.slow
 def test_the_source_archive_is_complete(sources: Path, unpacked: Path) -> None:
@@ -150,6 +138,7 @@ def test_the_source_archive_is_complete(sources: Path, unpacked: Path) -> None:
 @pytest.mark.packaging
 @pytest.mark.slow
 def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path) -> None:
+    """With the versions of this environment: in `make test VERSIONS=newest` those of today."""
     python = flight_install / 'bin/python'
     for name in OF_EXTRAS:
         assert run(python, '-c', f'import {name}', cwd=tmp_path).returncode == 1, name
@@ -158,32 +147,17 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
     done = run(starcal, 'calibrate', tiny, '--params', params, '-o', 'out', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert json.loads((tmp_path / 'out/calibration.json').read_text())['accepted']
-    assert "pip install '.[report]'" in done.stdout.splitlines()[-1]
-    for line, extra in (
-        (('report', 'out'), 'report'),
-        (('trend', '.', '-o', 'trend'), 'mission'),
-    ):
-        refused = run(starcal, *line, cwd=tmp_path)
-        assert refused.returncode == 2
-        assert f"python -m pip install '.[{extra}]'" in refused.stderr
-        assert refused.stderr.count('\n') == 1
-
-
-@pytest.mark.packaging
-@pytest.mark.slow
-def test_a_bag_is_calibrated_with_a_report(report_install: Path, tmp_path: Path) -> None:
-    """With the versions of this environment: in `make test VERSIONS=newest` those of today."""
-    tiny, bin_ = ROOT / 'bags/tiny', report_install / 'bin'
-    params = tiny / 'params.yaml'
-    done = run(bin_ / 'starcal', 'calibrate', tiny, '--params', params, '-o', 'out', cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')
+    refused = run(starcal, 'trend', '.', '-o', 'trend', cwd=tmp_path)
+    assert refused.returncode == 2
+    assert f"{python} -m pip install '.[mission]'" in refused.stderr
+    assert refused.stderr.count('\n') == 1
     assert 'look at out/report.html' in done.stdout
     assert '<svg' in (tmp_path / 'out/report.html').read_text()
     write = (
         'import sys, starcal_ros; found = starcal_ros.calibrate_bag(*sys.argv[1:]);'
         "starcal_ros.write_calibration(found, 'again.json')"
     )
-    done = run(bin_ / 'python', '-W', 'error', '-c', write, tiny, params, cwd=tmp_path)
+    done = run(python, '-W', 'error', '-c', write, tiny, params, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     made, again = (
         json.loads((tmp_path / name).read_text())
@@ -194,8 +168,8 @@ def test_a_bag_is_calibrated_with_a_report(report_install: Path, tmp_path: Path)
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_a_demo_without_ros_names_it(report_install: Path, tmp_path: Path) -> None:
-    refused = run(report_install / 'bin/starcal', 'demo', cwd=tmp_path)
+def test_a_demo_without_ros_names_it(flight_install: Path, tmp_path: Path) -> None:
+    refused = run(flight_install / 'bin/starcal', 'demo', cwd=tmp_path)
     assert refused.returncode == 2 and refused.stderr.count('\n') == 1
     assert 'rclpy is not installed' in refused.stderr and not any(tmp_path.iterdir())
 
@@ -205,7 +179,7 @@ def test_a_demo_without_ros_names_it(report_install: Path, tmp_path: Path) -> No
 def test_pip_lines_of_the_tutorial(sources: Path) -> None:
     """Pip accepts each line that installs from the clone, with every extra that it names."""
     lines = re.findall(r'`pip install ([^`]+)`', TUTORIAL.read_text())
-    assert '.' in lines and "'.[report]'" in lines
+    assert '.' in lines and "'.[mission]'" in lines
     pip, offline = (*PIP, 'install', '--dry-run'), (*ALONE, '--no-build-isolation')
     for line in lines:
         tried = run(*pip, *offline, *shlex.split(line), cwd=sources)
@@ -242,4 +216,4 @@ def test_the_nodes_import_nothing_of_the_extras() -> None:
     done = run(sys.executable, '-c', source, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert 'rclpy' in done.stdout.split()
-    assert not set(done.stdout.split()) & set(OF_EXTRAS)
+    assert not set(done.stdout.split()) & {*OF_EXTRAS, *OF_THE_REPORT}

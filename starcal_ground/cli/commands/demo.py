@@ -36,8 +36,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground import comparison
     from starcal_ground.cli import node_processes
+
+    node_processes.check_ros()
+
+    from starcal_ground import comparison
     from starcal_ground.cli.commands.compare import with_truth
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
     from starcal_ground.outputs import check_outputs, make_folder
@@ -47,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
 
-    node_processes.check_ros()
     make_folder(args.output)
     bag = tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())

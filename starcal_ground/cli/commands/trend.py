@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         terminal.print_text(f'failed: {row.path}: {row.error}')
     if args.parquet:
         terminal.print_text(f'written to {table.write_parquet()}')
-    terminal.print_text(f'{page.years:.2f} years; look at {page.path}')
+    terminal.print_text(f'{page.span}; look at {page.path}')
     if done.silent == fleet.MOST_SILENT:
         arguments.complain(
             f'{args.root}: no answer for {done.silent} files; run again when the store answers:'

@@ -44,26 +44,26 @@ _MRCAL = {
 
 def opencv_yaml(calibration: Calibration) -> exported.Content:
     """
-    YAML for ``cv2.FileStorage``: camera matrix, distortion, rotation.
+    YAML for ``cv2.FileStorage``: camera matrix, distortion, and the rotation of an alignment.
 
     ``distortion_coefficients`` are for ``cv2.projectPoints``, or for ``cv2.fisheye`` if
     ``lens_model`` is ``fisheye``.
     """
     camera, made = exported.fitted(calibration, calibration.geometry.camera.model, ('skew',))
     _, D = ros_distortion(camera.model, camera.distortion)
+    rotation = calibration.geometry.star_tracker_from_camera.inv().as_matrix()
+    aligned = calibration.has_alignment
     lines = [
         '%YAML:1.0',
         *_commented(exported.about(calibration, made)),
-        '# rotation: camera_from_star_tracker',
+        *(['# rotation: camera_from_star_tracker'] if aligned else []),
         '---',
         f'image_width: {camera.width}',
         f'image_height: {camera.height}',
         f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
-        *_opencv_matrix('camera_matrix', camera.matrix),
+        *_opencv_matrix('camera_matrix', camera.camera_matrix),
         *_opencv_matrix('distortion_coefficients', D[None, :]),
-        *_opencv_matrix(
-            'rotation', calibration.geometry.star_tracker_from_camera.inv().as_matrix()
-        ),
+        *(_opencv_matrix('rotation', rotation) if aligned else []),
         f'largest_error_px: {made.worst_px!r}',
     ]
     return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
@@ -73,8 +73,9 @@ def kalibr_yaml(calibration: Calibration, topic: str) -> exported.Content:
     """
     A camchain of kalibr with one camera.
 
-    The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment without
-    translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller error.
+    The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment, if there is one,
+    without translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller
+    error.
     """
     candidates = [
         (*exported.fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()
@@ -90,14 +91,15 @@ def kalibr_yaml(calibration: Calibration, topic: str) -> exported.Content:
             'intrinsics': [fx, fy, cx, cy],
             'distortion_model': word,
             'distortion_coeffs': D[:4].tolist(),
-            'T_cam_imu': T.tolist(),
+            **({'T_cam_imu': T.tolist()} if calibration.has_alignment else {}),
             'timeshift_cam_imu': 0.0,
             'rostopic': topic,
             'resolution': [camera.width, camera.height],
         }
     }
-    note = '# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker'
-    text = '\n'.join([*_commented(exported.about(calibration, made)), note, _yaml(content)])
+    note = ['# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker']
+    note *= calibration.has_alignment
+    text = '\n'.join([*_commented(exported.about(calibration, made)), *note, _yaml(content)])
     return dataclasses.replace(made, files={'camchain.yaml': text})
 
 
@@ -152,6 +154,8 @@ def giant_json(calibration: Calibration) -> exported.Content:
         'temperature_reference_degc': None if terms is None else terms.reference_degc,
         'star_tracker_from_camera_xyzw': (
             calibration.geometry.star_tracker_from_camera_xyzw.tolist()
+            if calibration.has_alignment
+            else None
         ),
     }
     return dataclasses.replace(

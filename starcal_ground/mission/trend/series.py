@@ -403,6 +403,7 @@ def _images(row: Row) -> tuple[int, int]:
 
 
 _ALIKE = 0.1  # largest difference to another camera, as a fraction of the step to it
+_OPEN = 'too few to tell'
 _SIGMAS = 5.0  # with ten parameters of a thousand cameras, chance does not reach it
 
 
@@ -416,8 +417,8 @@ class Overview:
     name : str
     kinds : tuple of str
         Kinds of its terms; temperature asks for nothing to be done.
-    is_stable : bool
-        False if the newest calibration differs from the active one.
+    is_stable : bool or None
+        False if the newest calibration differs from the active one; None if too few tell.
     after : int
         Index of the calibration before its most significant step; -1 without a step.
     time_ns : int array (n,)
@@ -431,7 +432,7 @@ class Overview:
 
     name: str
     kinds: tuple[str, ...]
-    is_stable: bool
+    is_stable: bool | None
     after: int
     time_ns: Indices
     values: Floats
@@ -441,19 +442,19 @@ class Overview:
     @property
     def needs_attention(self) -> bool:
         """True for a step, a drift or a newest calibration that differs."""
-        return self.verdict != 'sound'
+        return self.verdict not in ('sound', _OPEN)
 
     @property
     def verdict(self) -> str:
-        """Stepped, drifting, changed since the active calibration; or sound."""
+        """Stepped, drifting, changed since the active calibration; too few to tell; or sound."""
         words = {'step': 'stepped', 'drift': 'drifting'}
         reasons = [words[kind] for kind in self.kinds if kind in words]
-        reasons += [] if self.is_stable else ['changed']
-        return ', '.join(reasons) or 'sound'
+        reasons += ['changed'] if self.is_stable is False else []
+        return ', '.join(reasons) or (_OPEN if self.is_stable is None else 'sound')
 
 
 def overview_of(
-    name: str, rows: Sequence[Row], shown: Sequence[Series], is_stable: bool
+    name: str, rows: Sequence[Row], shown: Sequence[Series], is_stable: bool | None
 ) -> Overview:
     """Overview of the different calibrations of a camera, in order of time."""
     terms = findings(shown)

@@ -18,7 +18,7 @@ from starcal_ground.report.page import page_template
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.text import printable
+from starcal_ros.text import printable, significant
 
 TREND_FILE = 'trend.html'
 _LISTED = 200
@@ -36,11 +36,11 @@ _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axi
 
 @dataclass(frozen=True)
 class Page:
-    """Path of a page, calibrations on it and their span; failures, and of the first their rows."""
+    """Path of a page, calibrations on it, their span as text; failures, rows of the first."""
 
     path: Path
     calibrations: int
-    years: float
+    span: str
     failed: int
     failures: tuple[Row, ...]
 
@@ -96,7 +96,9 @@ def write_page(
     write_atomically(path, text)
     span_ns = max(times) - min(times) if times else 0
     years = span_ns / NANOSECONDS_PER_SECOND / trends.SECONDS_PER_YEAR
-    return Page(path, count, years, failed, tuple(failures))
+    long = f'{years:.2g} years' if years >= 1 else f'{significant(365.25 * years, 2)} days'
+    words = f'{count} calibration{"s" * (count != 1)}' + (f' over {long}' if span_ns else '')
+    return Page(path, count, words, failed, tuple(failures))
 
 
 def _order(one: _Judged) -> tuple[bool, int, str]:
@@ -110,7 +112,7 @@ def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
     active = trends.activations(group)
     shown = trends.series_of(rows, max_p_value)
     new = trends.changes(group, active[-1:])
-    is_stable, verdict = verdict_of(group, active, new, shown)
+    is_stable, verdict = verdict_of(rows, group, active, new, shown)
     px = new[-1].line_of_sight_px if new else math.nan
     line = (len(rows), utc_text(rows[-1].time_ns)[:10], px, verdict[1])
     return _Judged(trends.overview_of(name, rows, shown, is_stable), group, shown, line)
@@ -125,10 +127,10 @@ def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
     new = trends.changes(group, active)
     charts = [_change_chart(group, new)] if new else []
     charts += [_chart(one, rows) for one in shown]
-    is_stable, verdict = verdict_of(group, active, new, shown)
+    is_stable, verdict = verdict_of(rows, group, active, new, shown)
     return {
         'name': judged.overview.name,
-        'is_stable': is_stable,
+        'headline': _HEADLINES[is_stable],
         'verdict': (
             *verdict,
             f'Since its step it has the parameters of {swapped}.' * bool(swapped),
@@ -150,13 +152,26 @@ def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
     }
 
 
+_HEADLINES = {
+    True: ('', '✓ The active calibration holds'),
+    False: (' refused', '✕ The newest calibration differs'),
+    None: (' open', 'Too few calibrations to tell'),
+}
+"""Class and headline of a verdict."""
+
+
 def verdict_of(
     rows: Sequence[Row],
+    group: Sequence[Row],
     active: Sequence[trends.Active],
     new: Sequence[trends.Change],
     shown: Sequence[trends.Series],
-) -> tuple[bool, tuple[str, str]]:
-    """True while the active calibration holds, with sentences on that and on the changes."""
+) -> tuple[bool | None, tuple[str, str]]:
+    """
+    True while the active calibration holds, None if too few tell; with sentences on the changes.
+
+    ``rows`` are the different calibrations of a group.
+    """
     words = {'step': 'steps of', 'drift': 'drifts of', 'temperature': 'effects of temperature on'}
     changes = []
     for kind, word in words.items():
@@ -165,10 +180,16 @@ def verdict_of(
         )
         changes += [f'{word} {", ".join(names)}'] if names else []
     text = f'Found: {"; ".join(changes)}.' if changes else 'No step or drift was found.'
-    later = [change for change in new if active and change.against == active[-1].row]
+    if len(rows) < trends.FEWEST:
+        text = f'Steps and drifts need {trends.FEWEST} calibrations; there are {len(rows)}.'
+    if not active:
+        return None, ('None is active: the gate accepted none.', text)
+    if len(rows) < 2:
+        return None, ('There is none to compare the active calibration with.', text)
+    later = [change for change in new if change.against == active[-1].row]
     if not later:
-        return True, ('The active calibration is the newest one.' if active else '', text)
-    px = max(later, key=lambda change: rows[change.row].time_ns).line_of_sight_px
+        return True, ('The active calibration is the newest one.', text)
+    px = max(later, key=lambda change: group[change.row].time_ns).line_of_sight_px
     if px <= _RECALIBRATE_PX:
         judged = f'within {_RECALIBRATE_PX:g} px: the active one holds'
     else:

@@ -95,6 +95,29 @@ def test_coverage_is_a_picture_of_the_detector() -> None:
     assert text == ['most in a cell: 4', '··░░', '▓▓██']
 
 
+def test_health_and_gate_come_first_on_a_terminal_of_24_lines() -> None:
+    gate = tuple(
+        dataclasses.replace(check(k / 10, 1.0, passed=k < 8), name=f'quantity {k} of the camera')
+        for k in range(9)
+    )
+    refused = dataclasses.replace(calibration(), accepted=False, reasons=('over',), gate=gate)
+    health = {'calibrator': (0, 'collecting'), 'star_observer': (1, 'no image matches')}
+    received = Received(
+        last=observations(),
+        status=status(),
+        active=calibration(),
+        candidate=refused,
+        health=health,
+    )
+    first = shown(received).splitlines()[:24]
+    where = [
+        next(k for k, line in enumerate(first) if words in line)
+        for words in ('star_observer: warning', 'calibrator: ok', 'refused: over', 'quantity 8',
+                      'quantity 7', 'quantity 4', '─ images')
+    ]  # fmt: skip
+    assert where == sorted(where)
+
+
 def test_it_fits_a_terminal_of_80_columns() -> None:
     received = Received(
         last=observations(), status=status(), active=calibration(), candidate=calibration()

@@ -28,6 +28,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import read_calibration
+from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import load_catalog
 
@@ -92,6 +93,7 @@ def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_cl
     difference, sigma = difference_and_sigma_arcsec(calibration)
     assert not calibration.has_alignment
     assert difference < 2 * sigma
+    assert calibration.provenance[TIMES] == 'of the file: 10 of 10 images state none'
 
 
 @pytest.mark.slow

@@ -90,6 +90,14 @@ def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
     assert pair == pytest.approx(back, rel=1e-9)  # rounding
 
 
+def test_a_pointing_comes_back_only_where_no_other_helps_as_much(
+    setup: Setup, ensemble: Ensemble
+) -> None:
+    """Noise of the star tracker falls with any image; its slow error asks for other attitudes."""
+    places = [step.pointing for step in plan_pointings(ensemble, setup, Request(6)).steps]
+    assert len(set(places)) == 6
+
+
 @pytest.mark.slow
 def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(
     setup: Setup, ensemble: Ensemble

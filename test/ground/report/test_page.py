@@ -30,6 +30,7 @@ from starcal_ros.formats.products.product_files import (
     read_calibration,
     write_calibration,
 )
+from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.state import Activation
@@ -156,6 +157,22 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
     assert 'residual 2 px &amp; more is over the limit' in text
 
 
+def test_of_the_camera_alone_nothing_is_said_of_an_alignment(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    times = 'of the file: 10 of 10 images state none'
+    provenance = {**calibration.provenance, TIMES: times}
+    alone = dataclasses.replace(calibration, parent_frame='', provenance=provenance)
+    write_calibration(alone, tmp_path / CALIBRATION_FILE)
+    shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
+    text = page_of(tmp_path)
+    for words in ('Orientation of', 'x, y, z, w', 'may be activated', 'href="#alignment"',
+                  'Alignment: small rotation', ' on <code></code>', ' on </td>'):  # fmt: skip
+        assert words not in text, words
+    assert 'No alignment: the attitudes come from the stars' in text
+    # Those of the header and of the table to sign.
+    assert text.count(times) == 2 and '"tracker": []' in text
+
+
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
     assert len(calibration.gate) >= 15  # nine limits, and each unknown with a prior
@@ -271,6 +288,11 @@ addEventListener('load', () => {
     paper: getComputedStyle(document.body).backgroundColor,
     unnamed: document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label])').length,
     titles: document.querySelectorAll('#figure-images title').length,
+    contents: getComputedStyle(document.querySelector('nav')).position,
+    rows: new Set(
+      [...document.querySelectorAll('.charts.first figure')].map((f) => f.offsetTop)
+    ).size,
+    axes: document.querySelectorAll('#one-image svg text').length,
     loaded: [...document.images].every((image) => image.complete && image.naturalWidth > 0),
   };
   parent.postMessage(JSON.stringify(result), '*');
@@ -309,7 +331,7 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
 @pytest.mark.packaging
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
-@pytest.mark.parametrize(('width', 'dark'), [(400, False), (1600, True)])
+@pytest.mark.parametrize(('width', 'dark'), [(400, False), (1280, False), (1600, True)])
 def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -> None:
     measured, console = shown(page, tmp_path, width, dark)
     assert console == ''
@@ -324,5 +346,7 @@ def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -
         assert smallest >= 9, name  # px, from which print on a screen is readable
     assert measured['loaded'] and measured['unnamed'] == 0
     assert measured['titles'] == 10  # one for each image
+    assert measured['contents'] == 'sticky' and measured['rows'] == (3 if width == 400 else 1)
+    assert measured['axes'] > 10  # numbers of both axes, their names and the scale
     assert 'Image 1 of 10' in measured['before'][0] and measured['before'][1] > 100
     assert 'Image 2 of 10' in measured['after'][0] and measured['after'][1] > 100

@@ -30,7 +30,7 @@ from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObs
 
 SCENARIO = scenario('tiny', seed=4)
 PRIOR, TRUTH = SCENARIO.prior, SCENARIO.truth
-# A prediction has neither slow errors of the star tracker nor an unknown velocity.
+# A prediction has no unknown velocity.
 DEFAULT = CalibrationOptions(
     star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec,
     star_tracker_slow_arcsec=0.1,
@@ -57,7 +57,12 @@ def covariance(options: CalibrationOptions = OPTIONS) -> np.ndarray:
     return estimate_calibration(ensemble(), PRIOR, options).covariance
 
 
-@pytest.mark.parametrize('options', [OPTIONS, DEFAULT], ids=['eight', 'default'])
+SLOW_NOT_STATED = dataclasses.replace(DEFAULT, star_tracker_slow_arcsec=0.0)
+
+
+@pytest.mark.parametrize(
+    'options', [OPTIONS, DEFAULT, SLOW_NOT_STATED], ids=['eight', 'default', 'slow not stated']
+)
 def test_predicted_sigma_is_that_of_the_solve(options: CalibrationOptions) -> None:
     # At the prior instead of the solution, with centroid variances as given: 20 % is promised.
     found = predicted_sigma(ensemble(), PRIOR, options)
@@ -98,7 +103,8 @@ def test_the_order_of_names_is_that_of_the_parameters() -> None:
 
 def test_twice_the_images_have_half_the_variance() -> None:
     twice = Ensemble(ensemble().images * 2)
-    one, two = (predicted_sigma(e, PRIOR, OPTIONS) for e in (ensemble(), twice))
+    options = dataclasses.replace(OPTIONS, star_tracker_slow_arcsec=1e-6)  # images share it
+    one, two = (predicted_sigma(e, PRIOR, options) for e in (ensemble(), twice))
     np.testing.assert_allclose(two * np.sqrt(2), one, rtol=1e-9)
 
 

@@ -453,7 +453,7 @@ def test_parameters_cannot_be_changed_from_outside() -> None:
 def test_the_matrix_is_the_pinhole_part() -> None:
     camera = CAMERAS['pinhole'].replace(skew=7.0)
     e = np.array([[0.03, -0.02, 1.0], [-0.01, 0.05, 1.0]])
-    homogeneous = e @ camera.matrix.T
+    homogeneous = e @ camera.camera_matrix.T
     expected = homogeneous[:, :2] / homogeneous[:, 2:]
     np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-12)
 

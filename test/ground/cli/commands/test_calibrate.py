@@ -12,7 +12,10 @@ import pytest
 import yaml
 
 from starcal_ground.cli import main
-from starcal_ground.products import NOT_CALIBRATED_FILE
+from starcal_ground.outputs import OBSERVATIONS_FILE
+from starcal_ground.products import NOT_CALIBRATED_FILE, OBSERVATIONS_TOPIC, write_observations
+from starcal_ros.formats.bag.reader import read_observations
+from starcal_ros.records import refused_image
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 
@@ -40,7 +43,9 @@ def test_a_failure_replaces_an_older_calibration(
     assert 'Accepted' in (out / 'report.html').read_text()
     params = params_with(tmp_path, attitude_direction='inertial_to_st')
     assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
-    assert 'Set attitude_direction: st_to_inertial.' in capsys.readouterr().err
+    complaint = capsys.readouterr().err
+    assert 'Set attitude_direction: st_to_inertial.' in complaint
+    assert complaint.endswith(f'; look at {out}/report.html\n')
     record = json.loads((out / NOT_CALIBRATED_FILE).read_text())
     assert (record['calibrated'], record['cause']) == (False, 'attitude_direction')
     assert record['images_refused'] == {'no_match': 10}
@@ -57,6 +62,25 @@ def test_a_failure_replaces_an_older_calibration(
     assert main.main(again) == 0
     assert not (out / NOT_CALIBRATED_FILE).exists()
     assert 'Accepted' in (out / 'report.html').read_text()
+
+
+@pytest.mark.slow
+def test_the_reason_of_each_refusal_is_said(
+    tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = list(read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC))
+    one, two, *others = images
+    refused = [
+        refused_image(image.time_ns, image.width, image.height, 'no_match', 'in one part only')
+        for image in (one, two)
+    ]
+    (tmp_path / 'bag').mkdir()
+    write_observations([*refused, *others], tmp_path / 'bag', 'camera')
+    command = ['calibrate', str(tmp_path / 'bag'), '--params', str(TINY / 'params.yaml')]
+    main.main([*command, '-o', str(tmp_path / 'out'), '--no-report'])
+    words = '2 of 10 images refused, no_match: no rotation of the predicted stars explains'
+    said = capsys.readouterr().err
+    assert words in said and '(in one part only)' in said
 
 
 def broken(*_: object) -> None:

@@ -253,7 +253,28 @@ def test_a_camera_without_alignment_is_not_exported_with_one(kind: str, tmp_path
     alone = dataclasses.replace(calibration('plumb_bob'), parent_frame='')
     with pytest.raises(OptionError, match=f'--to {kind}: the calibration is of the camera alone'):
         export(alone, kind, tmp_path, None)
-    assert export(alone, 'opencv', tmp_path, None).files
+
+
+ROTATIONS = {
+    'opencv': 'rotation:',
+    'kalibr': 'T_cam_imu',
+    'giant': '"star_tracker_from_camera_xyzw": [',
+    'mrcal': "'extrinsics': [0.1",
+}
+
+
+@pytest.mark.parametrize('kind', ROTATIONS)
+def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(
+    kind: str, tmp_path: Path
+) -> None:
+    for rotation, frame in (([-0.1, 0.0, 0.0], 'star_tracker'), ([0.0, 0.0, 0.0], '')):
+        made = calibration('plumb_bob')
+        turned = dataclasses.replace(
+            made.geometry, star_tracker_from_camera_xyzw=Rotation.from_rotvec(rotation).as_quat()
+        )
+        made = dataclasses.replace(made, geometry=turned, parent_frame=frame)
+        text = export(made, kind, tmp_path, None).files[0].read_text()
+        assert (ROTATIONS[kind] in text) is bool(frame)
 
 
 CENTER = ('BORESIGHT_SAMPLE', 'BORESIGHT_LINE')

@@ -3,26 +3,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import pytest
 from trend_rows import made  # type: ignore[import-not-found]
 
-from starcal_ground.mission.trend.series import Active, Change
+from starcal_ground.mission.trend.series import Active, Change, overview_of
 from starcal_ground.mission.trend.trend_page import verdict_of
 
+# Days of calibrations, which one is active, change of each later one (px); then the verdict.
+VERDICTS: Mapping[str, tuple[Sequence[int], int | None, Sequence[float], bool | None, str]] = {
+    'close': ((1, 2, 3), 0, (7.0, 0.04), True, 'by up to 0.04 px, within 0.1 px: the active'),
+    'differs': ((1, 2, 3), 0, (7.0, 0.4), False, 'by up to 0.4 px, not within 0.1 px: consider'),
+    'newest': ((1, 2), 1, (), True, 'The active calibration is the newest one.'),
+    'alone': ((1,), 0, (), None, 'There is none to compare the active calibration with.'),
+    'refused': ((1, 2), None, (), None, 'None is active: the gate accepted none.'),
+    'nothing': ((1,), None, (), None, 'None is active: the gate accepted none.'),
+}
 
-@pytest.mark.parametrize(('size_px', 'holds'), [(0.04, True), (0.4, False)])
-def test_the_newest_calibration_decides(size_px: float, holds: bool) -> None:
-    rows = [made(day) for day in (1, 2, 3)]
-    active = [Active(0, rows[0].time_ns, 0, False)]
-    new = [Change(2, 0, size_px, 0.0), Change(1, 0, 7.0, 0.0)]
-    is_stable, (judged, found) = verdict_of(rows, active, new, [])
-    assert is_stable is holds
-    assert f'by up to {size_px:g} px' in judged and ('holds' in judged) is holds
-    assert found == 'No step or drift was found.'
+
+@pytest.mark.parametrize('name', VERDICTS)
+def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
+    days, place, sizes_px, expected, words = VERDICTS[name]
+    rows = [made(day) for day in days]
+    active = [] if place is None else [Active(place, rows[place].time_ns, 0, False)]
+    new = [Change(k, 0, size_px, 0.0) for k, size_px in enumerate(sizes_px, 1)]
+    is_stable, (judged, found) = verdict_of(rows, rows, active, new, [])
+    assert is_stable is expected and words in judged
+    assert found == f'Steps and drifts need 6 calibrations; there are {len(rows)}.'
+    overview = overview_of('camera', rows, [], is_stable)
+    assert overview.needs_attention is (expected is False)
 
 
-def test_an_active_calibration_that_is_the_newest_holds() -> None:
-    rows = [made(day) for day in (1, 2)]
-    active = [Active(1, rows[1].time_ns, 0, True)]
-    is_stable, (judged, _) = verdict_of(rows, active, [Change(1, 0, 9.0, 0.0)], [])
-    assert is_stable and judged == 'The active calibration is the newest one.'
+def test_steps_are_looked_for_in_many() -> None:
+    rows = [made(day) for day in range(1, 8)]
+    assert verdict_of(rows, rows, [], [], [])[1][1] == 'No step or drift was found.'
