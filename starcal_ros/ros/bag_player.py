@@ -23,15 +23,8 @@ from starcal_ros.formats.messages import message_codec
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import PlayerOptions
+from starcal_ros.ros import node
 from starcal_ros.ros.inputs import LATCHED
-from starcal_ros.ros.node import (
-    end_quietly,
-    Executor,
-    is_overdue,
-    message_class,
-    shut_down,
-    until_told_to_end,
-)
 from starcal_ros.ros.parameters import OptionParameters
 from starcal_ros.ros.printable_log import PrintableLog
 
@@ -69,7 +62,7 @@ class BagPlayer(PrintableLog):
             if self.own.clock and topic.name == '/clock':
                 continue  # the player publishes its own
             try:
-                kind = message_class(topic.type_name)
+                kind = node.message_class(topic.type_name)
             except ImportError:
                 text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
                 self.get_logger().warning(text)
@@ -203,7 +196,7 @@ class BagPlayer(PrintableLog):
             time.sleep(min(left_s, _POLL_S))
 
     def _check_shutdown(self) -> None:
-        if not self.context.ok() or is_overdue():
+        if not self.context.ok() or node.is_overdue():
             raise ExternalShutdownException
 
     def _tell_time(self, time_ns: int) -> None:
@@ -229,7 +222,7 @@ def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
 
 
-def _listen(executor: Executor) -> None:
+def _listen(executor: node.Executor) -> None:
     """
     Answer messages until ROS is shut down.
 
@@ -253,24 +246,24 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     player: BagPlayer | None = None
     listener: threading.Thread | None = None
-    executor: Executor | None = None  # destroyed after the end, as in `run`
+    executor: node.Executor | None = None  # destroyed after the end, as in `run`
 
     def work() -> int:
         nonlocal player, listener, executor
         player = BagPlayer()
-        executor = Executor(2)  # parameters, observations
+        executor = node.Executor(2)  # parameters, observations
         executor.add_node(player)
         listener = threading.Thread(target=_listen, args=[executor])
         listener.start()
         return player.play()
 
     def end() -> None:
-        shut_down()
+        node.shut_down()
         if listener is not None:
             listener.join()
-        end_quietly(player)
+        node.end_quietly(player)
 
-    return until_told_to_end(NAME, args, work, end)
+    return node.until_told_to_end(NAME, args, work, end)
 
 
 if __name__ == '__main__':
