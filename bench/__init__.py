@@ -6,6 +6,6 @@ NAMES = ('solver', 'measure', 'calibrate', 'observer', 'gate', 'onboard')
 
 LONG = (
     *('accuracy', 'trust', 'worlds', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
-    *('soak', 'transport', 'fleet', 'plan', 'peers'),
+    *('soak', 'fleet', 'plan', 'peers'),
 )
 """Those that take some minutes: run when they are named."""
