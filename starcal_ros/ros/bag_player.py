@@ -20,7 +20,6 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages import message_codec
-from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import PlayerOptions
 from starcal_ros.ros import node
@@ -40,8 +39,8 @@ _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS do
 _SETTLED_S = 0.5
 _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (
-    codec.CALIBRATION_TYPE,
-    codec.STATUS_TYPE,
+    message_codec.CALIBRATION_TYPE,
+    message_codec.STATUS_TYPE,
     message_codec.CAMERA_INFO_TYPE,
 )
 
@@ -56,7 +55,9 @@ class BagPlayer(PrintableLog):
             raise BagError('bag: path of the bag to play is missing')
         self._topics = reader.topics([self.own.bag])
         # A star observer reads the raw images or the compressed ones.
-        self._images = set(self._of(codec.IMAGE_TYPE) or self._of(codec.COMPRESSED_TYPE))
+        self._images = set(
+            self._of(message_codec.IMAGE_TYPE) or self._of(message_codec.COMPRESSED_TYPE)
+        )
         self._players = {}
         for topic in self._topics:
             if self.own.clock and topic.name == '/clock':
@@ -82,7 +83,7 @@ class BagPlayer(PrintableLog):
         self._observed_count = 0
         # Observations in the bag itself must not pace the player or count as subscribers.
         kinds = {topic.type_name for topic in self._topics}
-        self._paced = bool(self._images) and codec.OBSERVATIONS_TYPE not in kinds
+        self._paced = bool(self._images) and message_codec.OBSERVATIONS_TYPE not in kinds
         if self._paced:
             self._observations = self.create_subscription(
                 ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
@@ -129,9 +130,9 @@ class BagPlayer(PrintableLog):
 
     def _wait_for_subscribers(self) -> None:
         """Wait until the topics that matter have subscribers and no more come, or the timeout."""
-        attitudes = self._of(codec.ATTITUDE_TYPE)
+        attitudes = self._of(message_codec.ATTITUDE_TYPE)
         # Of other types, one holds the attitudes, and the others may be there for anything.
-        others = [] if attitudes else self._of(*codec.ATTITUDE_TYPES)
+        others = [] if attitudes else self._of(*message_codec.ATTITUDE_TYPES)
         needed = [*self._images, *attitudes] or list(self._players)
         other = self.own.wait_for_topic
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
