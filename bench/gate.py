@@ -35,7 +35,7 @@ GOOD, SPOILT = 200, 40  # campaigns per size, per case
 
 @dataclass(frozen=True)
 class Spoil:
-    """What is wrong: with the field of stars, with each of its observations, with some stars."""
+    """Mistakes in the field of stars, in each of its observations, and the share of wrong stars."""
 
     field: Callable[[StarField, np.random.Generator], StarField] = lambda field, rng: field
     image: Callable[[StarObservations], StarObservations] = lambda image: image
