@@ -35,7 +35,7 @@ GOOD, SPOILT = 200, 40  # campaigns per size, per case
 
 @dataclass(frozen=True)
 class Spoil:
-    """Mistakes in the field of stars, in each of its observations, and the share of wrong stars."""
+    """Mistakes in the field of stars and in each of its observations; share of wrong stars."""
 
     field: Callable[[StarField, np.random.Generator], StarField] = lambda field, rng: field
     image: Callable[[StarObservations], StarObservations] = lambda image: image
