@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +24,7 @@ from starcal_ros.camera import project
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from studies.trials import draw_star_field, observe, pointing_error_arcsec, StarField
 
 SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # number of images, stars per image
@@ -31,7 +32,14 @@ TRACKER_ARCSEC = (5.0, 20.0, 40.0)
 OUTLIER_SHARE = 0.01
 GOOD, SPOILT = 200, 40  # campaigns per size, per case
 
-Spoil = Callable[[StarField, float, np.random.Generator], Ensemble]
+
+@dataclass(frozen=True)
+class Spoil:
+    """Mistakes in the field of stars and in each of its observations; share of wrong stars."""
+
+    field: Callable[[StarField, np.random.Generator], StarField] = lambda field, rng: field
+    image: Callable[[StarObservations], StarObservations] = lambda image: image
+    outlier_share: float = OUTLIER_SHARE
 
 
 def run(quick: bool) -> Iterator[Table]:
@@ -43,7 +51,7 @@ def run(quick: bool) -> Iterator[Table]:
     )
     for images, stars in SIZES:
         count = 10 if quick else GOOD
-        judged = [_judged(setup, images, stars, k, observed) for k in range(count)]
+        judged = [_judged(setup, images, stars, k, Spoil()) for k in range(count)]
         for k, (reasons, _) in enumerate(judged):
             if reasons:
                 print(f'refused: {images} x {stars}, {k}: {reasons}')
@@ -68,11 +76,6 @@ def run(quick: bool) -> Iterator[Table]:
     yield spoilt
 
 
-def observed(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """Observations of a field with nothing wrong but one misidentified star in a hundred."""
-    return observe(field, tracker, OUTLIER_SHARE)
-
-
 def _judged(
     setup: Setup, images: int, stars: int, k: int, spoil: Spoil
 ) -> tuple[list[str], float]:
@@ -80,7 +83,8 @@ def _judged(
     rng = np.random.default_rng([images, stars, k])
     tracker_arcsec = TRACKER_ARCSEC[k % len(TRACKER_ARCSEC)]
     field = draw_star_field(rng, images, stars)
-    ensemble = spoil(field, tracker_arcsec, rng)
+    seen = observe(spoil.field(field, rng), tracker_arcsec, spoil.outlier_share)
+    ensemble = Ensemble(tuple(map(spoil.image, seen.images)))
     assumed_arcsec = (tracker_arcsec,) * 3
     options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=assumed_arcsec)
     setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
@@ -114,7 +118,7 @@ def _turned(geometry: CameraGeometry, arcsec: float, rng: np.random.Generator) -
     return dataclasses.replace(geometry, star_tracker_from_camera_xyzw=alignment.as_quat())
 
 
-def _focus_drifts(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _focus_drifts(field: StarField, rng: np.random.Generator) -> StarField:
     """Focal length drifts by 0.3 % from the first image to the last."""
     for k in range(len(field.pixel_px)):
         factor = 1 + 3e-3 * k / (len(field.pixel_px) - 1)
@@ -122,86 +126,75 @@ def _focus_drifts(field: StarField, tracker: float, rng: np.random.Generator) ->
         fx, skew, fy = camera.intrinsics[:3] * factor
         moved = dataclasses.replace(field.truth, camera=camera.replace(fx=fx, skew=skew, fy=fy))
         field = _seen_by(field, moved, slice(k, k + 1))
-    return observe(field, tracker, OUTLIER_SHARE)
+    return field
 
 
-def _alignment_jumps(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _alignment_jumps(field: StarField, rng: np.random.Generator) -> StarField:
     half = slice(len(field.pixel_px) // 2, None)
     field = _seen_by(field, _turned(field.truth, 180.0, rng), half)
-    return observe(field, tracker, OUTLIER_SHARE)
+    return field
 
 
-def _two_alignments(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _two_alignments(field: StarField, rng: np.random.Generator) -> StarField:
     other = _turned(field.truth, 1800.0, rng)
     for k in rng.permutation(len(field.pixel_px))[::2]:
         field = _seen_by(field, other, slice(k, k + 1))
-    return observe(field, tracker, OUTLIER_SHARE)
+    return field
 
 
-def _attitude_inverted(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    images = observe(field, tracker, OUTLIER_SHARE).images
-    inverse = [image.icrf_from_star_tracker_xyzw * [-1, -1, -1, 1] for image in images]
-    return Ensemble(
-        tuple(
-            dataclasses.replace(image, icrf_from_star_tracker_xyzw=xyzw)
-            for image, xyzw in zip(images, inverse, strict=True)
-        )
-    )
+def _attitude_inverted(image: StarObservations) -> StarObservations:
+    xyzw = image.icrf_from_star_tracker_xyzw * [-1, -1, -1, 1]
+    return dataclasses.replace(image, icrf_from_star_tracker_xyzw=xyzw)
 
 
-def _equinox_of_date(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _equinox_of_date(field: StarField, rng: np.random.Generator) -> StarField:
     """Catalog directions of equinox 2026 used as ICRF: 26 years at 50.3 arcsec."""
     obliquity = Rotation.from_euler('x', 23.44, degrees=True)
     along_ecliptic = Rotation.from_euler('z', 26 * 50.3 / 3600, degrees=True)
     precession = obliquity * along_ecliptic * obliquity.inv()
     turned = precession.apply(field.direction_icrf.reshape(-1, 3))
     turned = turned.reshape(field.direction_icrf.shape)
-    return observe(dataclasses.replace(field, direction_icrf=turned), tracker, OUTLIER_SHARE)
+    return dataclasses.replace(field, direction_icrf=turned)
 
 
-def _old_places(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _old_places(field: StarField, rng: np.random.Generator) -> StarField:
     """No proper motion since 1950: 76 years of 50 mas per axis, as for bright stars."""
     motion_rad = rng.normal(0.0, 76 * 0.05 * np.pi / 648000, field.direction_icrf.shape)
     moved = field.direction_icrf + motion_rad
     moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
-    return observe(dataclasses.replace(field, direction_icrf=moved), tracker, OUTLIER_SHARE)
+    return dataclasses.replace(field, direction_icrf=moved)
 
 
-def _focal_scaled(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _focal_scaled(field: StarField, rng: np.random.Generator) -> StarField:
     """Pixels of an image scaled by 5 % about the principal point."""
     camera = field.truth.camera
     center = camera.intrinsics[3:]
     pixels = center + 1.05 * (field.pixel_px - center)
-    return observe(dataclasses.replace(field, pixel_px=pixels), tracker, OUTLIER_SHARE)
+    return dataclasses.replace(field, pixel_px=pixels)
 
 
-def _mirrored(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _mirrored(field: StarField, rng: np.random.Generator) -> StarField:
     """Image mirrored left to right."""
     pixels = field.pixel_px.copy()
     pixels[..., 0] = field.truth.camera.width - 1 - pixels[..., 0]
-    return observe(dataclasses.replace(field, pixel_px=pixels), tracker, OUTLIER_SHARE)
+    return dataclasses.replace(field, pixel_px=pixels)
 
 
-def _many_wrong_stars(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    return observe(field, tracker, 0.4)
-
-
-def _one_corner(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+def _one_corner(image: StarObservations) -> StarObservations:
     """Stars only in one quarter of the detector."""
-    middle = np.array([field.truth.camera.width / 2, field.truth.camera.height / 2])
-    images = observe(field, tracker, OUTLIER_SHARE).images
-    return Ensemble(tuple(one.select(np.all(one.measured_px < middle, axis=1)) for one in images))
+    middle = np.array([image.width / 2, image.height / 2])
+    return image.select(np.all(image.measured_px < middle, axis=1))
 
 
 CASES: dict[str, Spoil] = {
-    'focal length drifts by 0.3 %': _focus_drifts,
-    'alignment jumps by 180 arcsec halfway': _alignment_jumps,
-    'half of the images, random, rotated by 0.5 deg': _two_alignments,
-    'attitude of the wrong direction': _attitude_inverted,
-    'catalog of the wrong equinox': _equinox_of_date,
-    'no proper motion for 76 years': _old_places,
-    'image scaled by 5 %': _focal_scaled,
-    'image mirrored': _mirrored,
-    '40 % of the stars misidentified': _many_wrong_stars,
-    'stars in one corner only': _one_corner,
+    'focal length drifts by 0.3 %': Spoil(_focus_drifts),
+    'alignment jumps by 180 arcsec halfway': Spoil(_alignment_jumps),
+    'half of the images, random, rotated by 0.5 deg': Spoil(_two_alignments),
+    'attitude of the wrong direction': Spoil(image=_attitude_inverted),
+    'catalog of the wrong equinox': Spoil(_equinox_of_date),
+    'no proper motion for 76 years': Spoil(_old_places),
+    'image scaled by 5 %': Spoil(_focal_scaled),
+    'image mirrored': Spoil(_mirrored),
+    '40 % of the stars misidentified': Spoil(outlier_share=0.4),
+    'stars in one corner only': Spoil(image=_one_corner),
 }

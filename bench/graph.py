@@ -16,9 +16,11 @@ import time
 from typing import Any
 
 from bench.frames import Frame
+from bench.trials import environment
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
 from starcal_ros.ros.node import make_message
 
+PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
 START_S = 60.0  # a node starts in 2 s; much slower on a busy machine
 
 
@@ -39,6 +41,13 @@ def _free_domain() -> int:
             probe.bind(('', 7410 + 250 * domain))
             return domain
     raise RuntimeError('no free ROS domain on this machine')
+
+
+def profile(name: str) -> contextlib.AbstractContextManager[None]:
+    """Context manager: processes started within it use stock Fast DDS or the package's profile."""
+    files = {f'{dds}_DEFAULT_PROFILES_FILE': str(PROFILE) for dds in ('FASTRTPS', 'FASTDDS')}
+    values = {**files, 'RMW_FASTRTPS_USE_QOS_FROM_XML': '1'} if name != 'stock' else {}
+    return environment(**values)
 
 
 def start(

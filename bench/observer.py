@@ -19,7 +19,7 @@ import tempfile
 import time
 from typing import Any
 
-from bench import graph, transport
+from bench import graph
 from bench.frames import Frame, paper_scenario, render_frame, write_set_up
 from bench.table import Table
 from bench.trials import memory_mb
@@ -56,7 +56,7 @@ def run(quick: bool) -> Iterator[Table]:
     frames = [render_frame(scenario, index) for index in range(2 if quick else FRAMES)]
     for profile, rate_hz in RUNS[:1] if quick else RUNS:
         print(f'observer: {rate_hz:g} frames a second, Fast DDS {profile}', flush=True)
-        with tempfile.TemporaryDirectory() as folder, transport.profile(profile):
+        with tempfile.TemporaryDirectory() as folder, graph.profile(profile):
             params = write_set_up(scenario, Path(folder), magnitude_limit=MAGNITUDE_LIMIT)
             table.add(profile, rate_hz, *_feed(params, frames, rate_hz, 10 if quick else 120))
     yield table

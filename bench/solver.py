@@ -19,20 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.competitors import (
-    Answer,
-    Case,
-    covariance_of,
-    estimate_starcal,
-    FREE,
-    make_case,
-    make_ensemble,
-    SIGMA_PX,
-    solve_ceres,
-    solve_opencv,
-    solve_scipy,
-    solve_starcal,
-)
+from bench import competitors
 from bench.table import Table, verdict
 from bench.trials import in_processes, memory_mb
 from starcal_ros.estimation.star_equations import normal_blocks, RESIDUAL, ROTATION
@@ -43,16 +30,16 @@ TARGETS_FROM = 100  # images; below, Python overhead dominates
 TARGETS = {'pyceres': 20.0, 'scipy': 10.0, 'opencv': 12.0}
 TARGET_MEMORY_MB = 40.0
 
-SOLVERS: dict[str, tuple[str, Callable[[Case], Answer]]] = {
-    'starcal': ('starcal, search alone', solve_starcal),
-    'estimate': ('starcal, whole estimate', estimate_starcal),
-    'pyceres': ('Ceres (pyceres), DENSE_SCHUR', solve_ceres),
-    'scipy': ('SciPy trf, sparse Jacobian', solve_scipy),
-    'opencv': ('OpenCV calibrateCamera', solve_opencv),
+SOLVERS: dict[str, tuple[str, Callable[[competitors.Case], competitors.Answer]]] = {
+    'starcal': ('starcal, search alone', competitors.solve_starcal),
+    'estimate': ('starcal, whole estimate', competitors.estimate_starcal),
+    'pyceres': ('Ceres (pyceres), DENSE_SCHUR', competitors.solve_ceres),
+    'scipy': ('SciPy trf, sparse Jacobian', competitors.solve_scipy),
+    'opencv': ('OpenCV calibrateCamera', competitors.solve_opencv),
 }
 
 
-def cost_of(case: Case, answer: Answer, steps: int = 0) -> float:
+def cost_of(case: competitors.Case, answer: competitors.Answer, steps: int = 0) -> float:
     """Least-squares cost of a result, after Gauss-Newton steps of the rotations only."""
     rotations = Rotation.from_matrix(answer.camera_from_icrf)
     held = (case.measurements, 'plumb_bob', answer.parameters)
@@ -80,13 +67,13 @@ class Result:
 
     best_s: float
     peak_mb: float
-    answer: Answer
+    answer: competitors.Answer
 
 
-def _solve_apart(name: str, case: Case, pipe: Any) -> None:
+def _solve_apart(name: str, case: competitors.Case, pipe: Any) -> None:
     """In a separate process: send the result through the pipe."""
     _, solve = SOLVERS[name]
-    solve(make_case(Ensemble(case.ensemble.images[:5]), case.prior))
+    solve(competitors.make_case(Ensemble(case.ensemble.images[:5]), case.prior))
     Path('/proc/self/clear_refs').write_text('5')  # the peak counts from now (man 5 proc)
     before_mb = memory_mb('self')
     start_s = time.perf_counter()
@@ -95,7 +82,7 @@ def _solve_apart(name: str, case: Case, pipe: Any) -> None:
     pipe.send(Result(took_s, memory_mb('self', 'VmHWM') - before_mb, answer))
 
 
-def solve_apart(name: str, case: Case) -> Result | None:
+def solve_apart(name: str, case: competitors.Case) -> Result | None:
     """Result of a solver in a separate process; None after the time limit."""
     context = multiprocessing.get_context('spawn')
     receiver, sender = context.Pipe(duplex=False)
@@ -111,7 +98,7 @@ def solve_apart(name: str, case: Case) -> Result | None:
         process.join()
 
 
-def solve_all(case: Case, names: list[str], repeats: int) -> dict[str, Result]:
+def solve_all(case: competitors.Case, names: list[str], repeats: int) -> dict[str, Result]:
     """Results of the solvers within the time limit."""
     apart = {name: solve_apart(name, case) for name in names}
     results = {name: result for name, result in apart.items() if result}
@@ -123,10 +110,12 @@ def solve_all(case: Case, names: list[str], repeats: int) -> dict[str, Result]:
     return results
 
 
-def add_rows(table: Table, case: Case, names: list[str], results: dict[str, Result]) -> None:
+def add_rows(
+    table: Table, case: competitors.Case, names: list[str], results: dict[str, Result]
+) -> None:
     """Add a row for each solver, relative to starcal."""
     ours, m = results['starcal'], case.table.image_count
-    sigma = np.sqrt(np.diag(covariance_of(case, ours.answer, scaled=False)))
+    sigma = np.sqrt(np.diag(competitors.covariance_of(case, ours.answer, scaled=False)))
     least = cost_of(case, ours.answer)
     for name in names:
         label, result = SOLVERS[name][0], results.get(name)
@@ -135,7 +124,7 @@ def add_rows(table: Table, case: Case, names: list[str], results: dict[str, Resu
         if result is None:
             table.add(m, label, None, None, f'> {ratio:.0f}', judged, None, None, None)
             continue
-        off = (result.answer.parameters - ours.answer.parameters)[FREE] / sigma
+        off = (result.answer.parameters - ours.answer.parameters)[competitors.FREE] / sigma
         cost = cost_of(case, result.answer, 3 if name == 'opencv' else 0)
         # The complete estimate rejects and reweights stars, so its cost is not comparable.
         cost_off = None if name == 'estimate' else cost / least - 1.0
@@ -161,7 +150,7 @@ def measure(quick: bool) -> Table:
     sizes = (6,) if quick else (15, 359, 2000)
     repeats = 1 if quick else 3
     table = Table(
-        f'Solvers, {SIGMA_PX} px noise, 8 camera parameters and m rotations free',
+        f'Solvers, {competitors.SIGMA_PX} px noise, 8 camera parameters and m rotations free',
         ('m', 'solver', 'iterations', 'ms', 'by ours', 'target', 'cost off', 'sigma off', 'MB'),
         notes=[
             'by ours: its time over that of our search.  cost off: final cost over ours, less 1.',
@@ -173,7 +162,7 @@ def measure(quick: bool) -> Table:
     names = [name for name in SOLVERS if name != 'pyceres' or importlib.util.find_spec(name)]
     for m in sizes:
         print(f'solver: m = {m}', flush=True)
-        case = make_case(*make_ensemble(m))
+        case = competitors.make_case(*competitors.make_ensemble(m))
         results = solve_all(case, names, repeats)
         add_rows(table, case, names, results)
         for name in [name for name in names if name not in results]:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import time
 from typing import TypeVar
 
+from starcal_ground.cli.terminal import table_lines
+
 ResultT = TypeVar('ResultT')
 Cell = str | int | float | bool | None
 
@@ -26,21 +28,10 @@ class Table:
         self.rows.append(cells)
 
     def text(self) -> str:
-        """Aligned columns: text to the left, numbers to the right."""
-        shown = [list(self.columns), *([_shown(cell) for cell in row] for row in self.rows)]
-        widths = [max(len(row[k]) for row in shown) for k in range(len(self.columns))]
-        words = [
-            all(isinstance(row[k], str | bool | None) for row in self.rows)
-            for k in range(len(self.columns))
-        ]
-        lines = [self.title]
-        for row in shown:
-            cells = [
-                cell.ljust(width) if left else cell.rjust(width)
-                for cell, width, left in zip(row, widths, words, strict=True)
-            ]
-            lines.append('  ' + '  '.join(cells).rstrip())
-        return '\n'.join([*lines, *(f'  {note}' for note in self.notes), ''])
+        """Aligned columns, the first to the left."""
+        rows = [[_shown(cell) for cell in row] for row in self.rows]
+        lines = table_lines(self.columns, rows)
+        return '\n'.join([self.title, *(f'  {line}' for line in (*lines, *self.notes)), ''])
 
     def content(self) -> dict[str, object]:
         """The table as a JSON object."""

@@ -16,18 +16,7 @@ from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import MessageWriter
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
-    IMAGE_TYPE,
-    Make,
-    make_header,
-    Message,
-    OBSERVATIONS_TYPE,
-    quaternion_to_message,
-    TEMPERATURE_TYPE,
-    vector_to_message,
-    VELOCITY_TYPE,
-)
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.record_messages import observations_to_message
 from starcal_ros.records import Image, StarObservations
 
@@ -87,7 +76,7 @@ class BagWriter:
         there = [path for end in _OF_BAGS for path in self.file.parent.glob(end)]
         return [self.file, self._metadata_file, *there]
 
-    def write(self, topic: str, type_name: str, time_ns: int, message: Message) -> None:
+    def write(self, topic: str, type_name: str, time_ns: int, message: codec.Message) -> None:
         """Write a message; raises BagError where the disk is full or a field cannot hold it."""
         with errors_as(BagError, self.file, 'written'):
             self.messages.write(topic, type_name, time_ns, message)
@@ -95,40 +84,40 @@ class BagWriter:
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
         message = image_to_message(image, frame_id, make_message)
-        self.write(topic, IMAGE_TYPE, image.time_ns, message)
+        self.write(topic, codec.IMAGE_TYPE, image.time_ns, message)
 
     def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
         """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
         message = attitude_to_message(time_ns, xyzw, frame_id, make_message)
-        self.write(topic, ATTITUDE_TYPE, time_ns, message)
+        self.write(topic, codec.ATTITUDE_TYPE, time_ns, message)
 
     def write_velocity(
         self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
     ) -> None:
         """Write a geometry_msgs/TwistStamped."""
         message = velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
-        self.write(topic, VELOCITY_TYPE, time_ns, message)
+        self.write(topic, codec.VELOCITY_TYPE, time_ns, message)
 
     def write_temperature(
         self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
     ) -> None:
         """Write a sensor_msgs/Temperature."""
         message = temperature_to_message(time_ns, temperature_degc, frame_id, make_message)
-        self.write(topic, TEMPERATURE_TYPE, time_ns, message)
+        self.write(topic, codec.TEMPERATURE_TYPE, time_ns, message)
 
     def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
         """Write a starcal/StarObservations."""
         message = observations_to_message(record, frame_id, make_message)
-        self.write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
+        self.write(topic, codec.OBSERVATIONS_TYPE, record.time_ns, message)
 
 
-def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
+def image_to_message(image: Image, frame_id: str, make: codec.Make) -> codec.Message:
     """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
     pixels = np.ascontiguousarray(image.pixels)
     height, width = pixels.shape
     return make(
-        IMAGE_TYPE,
-        header=make_header(image.time_ns, frame_id, make),
+        codec.IMAGE_TYPE,
+        header=codec.make_header(image.time_ns, frame_id, make),
         height=height,
         width=width,
         encoding='mono8' if pixels.itemsize == 1 else 'mono16',
@@ -139,36 +128,38 @@ def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
 
 
 def attitude_to_message(
-    time_ns: int, quaternion_xyzw: Floats, frame_id: str, make: Make
-) -> Message:
+    time_ns: int, quaternion_xyzw: Floats, frame_id: str, make: codec.Make
+) -> codec.Message:
     """Return a geometry_msgs/QuaternionStamped; ``frame_id`` is the inertial frame."""
     return make(
-        ATTITUDE_TYPE,
-        header=make_header(time_ns, frame_id, make),
-        quaternion=quaternion_to_message(quaternion_xyzw, make),
+        codec.ATTITUDE_TYPE,
+        header=codec.make_header(time_ns, frame_id, make),
+        quaternion=codec.quaternion_to_message(quaternion_xyzw, make),
     )
 
 
-def velocity_to_message(time_ns: int, velocity_m_s: Floats, frame_id: str, make: Make) -> Message:
+def velocity_to_message(
+    time_ns: int, velocity_m_s: Floats, frame_id: str, make: codec.Make
+) -> codec.Message:
     """Return a geometry_msgs/TwistStamped without rotation."""
     return make(
-        VELOCITY_TYPE,
-        header=make_header(time_ns, frame_id, make),
+        codec.VELOCITY_TYPE,
+        header=codec.make_header(time_ns, frame_id, make),
         twist=make(
             'geometry_msgs/msg/Twist',
-            linear=vector_to_message(velocity_m_s, make),
-            angular=vector_to_message(np.zeros(3), make),
+            linear=codec.vector_to_message(velocity_m_s, make),
+            angular=codec.vector_to_message(np.zeros(3), make),
         ),
     )
 
 
 def temperature_to_message(
-    time_ns: int, temperature_degc: float, frame_id: str, make: Make
-) -> Message:
+    time_ns: int, temperature_degc: float, frame_id: str, make: codec.Make
+) -> codec.Message:
     """Return a sensor_msgs/Temperature; its variance is 0, which means unknown in ROS."""
     return make(
-        TEMPERATURE_TYPE,
-        header=make_header(time_ns, frame_id, make),
+        codec.TEMPERATURE_TYPE,
+        header=codec.make_header(time_ns, frame_id, make),
         temperature=float(temperature_degc),
         variance=0.0,
     )

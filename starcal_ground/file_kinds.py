@@ -16,13 +16,7 @@ import shlex
 from starcal_ros.errors import NotABag, StarcalError
 from starcal_ros.formats.bag.typestore import typestore
 from starcal_ros.formats.image_headers import is_fits
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPES,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    TEMPERATURE_TYPE,
-    VELOCITY_TYPE,
-)
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
 
 _START_BYTES = 512
@@ -32,7 +26,13 @@ _OF_IMAGES = (
 )
 # Topics of other types may be unknown to the converter, which then stops.
 _CONVERTED = frozenset(
-    [IMAGE_TYPE, COMPRESSED_TYPE, *ATTITUDE_TYPES, VELOCITY_TYPE, TEMPERATURE_TYPE]
+    [
+        codec.IMAGE_TYPE,
+        codec.COMPRESSED_TYPE,
+        *codec.ATTITUDE_TYPES,
+        codec.VELOCITY_TYPE,
+        codec.TEMPERATURE_TYPE,
+    ]
 )
 
 

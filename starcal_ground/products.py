@@ -23,13 +23,8 @@ from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
-from starcal_ros.formats.products.product_files import (
-    CALIBRATION_FILE,
-    read_json,
-    write_atomically,
-    write_calibration,
-)
 from starcal_ros.record_fields import json_object, plain_record, read_record
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
 from starcal_ros.untrusted import json_value, read_archive
@@ -38,7 +33,7 @@ OBSERVATIONS_TOPIC = '/observations'
 CAMERA_INFO_FILE = 'camera_info.yaml'
 RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
-    CALIBRATION_FILE,
+    product_files.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
     OBSERVATIONS_FILE,
     RESIDUALS_FILE,
@@ -52,7 +47,7 @@ def write_products(
     calibration: Calibration, folder: Path, residuals: Residuals | None = None
 ) -> None:
     """Write a calibration, its camera and residuals, if given; raises ProductError."""
-    write_calibration(calibration, folder / CALIBRATION_FILE)
+    product_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
     name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
     if residuals is not None:
@@ -87,7 +82,7 @@ def write_camera_info(
         ),
     }
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    write_atomically(path, text)
+    product_files.write_atomically(path, text)
 
 
 def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
@@ -109,7 +104,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
     np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **plain_record(residuals))
-    write_atomically(path, memory.getvalue())
+    product_files.write_atomically(path, memory.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
@@ -150,8 +145,10 @@ class NotCalibrated:
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """Write the record of a failure and remove earlier products; raises ProductError."""
     content = {'calibrated': False, **json_object(record)}
-    write_atomically(folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n')
-    for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
+    product_files.write_atomically(
+        folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n'
+    )
+    for name in (product_files.CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
         with errors_as(ProductError, folder / name, 'removed'):
             (folder / name).unlink(missing_ok=True)
 
@@ -161,7 +158,7 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
     path = folder / NOT_CALIBRATED_FILE
     if not path.is_file():
         return None
-    content = read_json(path)
+    content = product_files.read_json(path)
     try:
         return read_record(NotCalibrated, content)
     except ValueError as error:

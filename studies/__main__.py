@@ -23,7 +23,7 @@ from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.formats.products.product_files import write_atomically
-from studies import monte_carlo, paper, study_figures, summary
+from studies import monte_carlo, paper, study_figures
 from studies.monte_carlo import Design, Row
 from studies.workers import processors, run_each
 
@@ -90,15 +90,15 @@ def _monte_carlo(args: argparse.Namespace) -> None:
         assumed_arcsec=args.tracker_assumed,
     )
     start_s = time.monotonic()
-    result = summary.conclude(design, _rows(design, args))
+    result = monte_carlo.conclude(design, _rows(design, args))
     path = args.output / f'{design.study}.json'
-    write_atomically(path, summary.content(result, _software()))
+    write_atomically(path, monte_carlo.content(result, _software()))
     write_atomically(path.with_suffix('.svg'), study_figures.svg(result))
     print(
         f'{design.study}: {title}; {design.trials} trials, seed {design.seed},'
         f' {time.monotonic() - start_s:.1f} s'
     )
-    terminal.print_table(*summary.table(result), left=0)
+    terminal.print_table(*monte_carlo.table(result), left=0)
     print(f'written to {path} and {path.with_suffix(".svg").name}')
 
 
@@ -131,7 +131,9 @@ def _paper(args: argparse.Namespace) -> None:
     frame = functools.partial(paper.observe_frame_of, args.seed, images)
     with terminal.progress_bar(images, 'frames') as advance:
         observations = run_each(frame, range(images), args.workers, advance)
-    result = paper.study(observations, summary.conclude(table1, _rows(table1, args)), args.seed)
+    result = paper.study(
+        observations, monte_carlo.conclude(table1, _rows(table1, args)), args.seed
+    )
     for name, svg in paper.svgs(result).items():
         write_atomically(args.output / 'images' / f'paper_{name}.svg', svg)
     path = args.output / 'paper.md'

@@ -3,51 +3,38 @@
 Monte Carlo studies of calibrations with known truth.
 
 The random numbers of a trial depend only on (seed, study, trial), so the rows of a study do not
-depend on the number of workers or the order of the trials.  Lengths are pixels at the focal length
-(28 arcsec) unless the name has another unit.
+depend on the number of workers or the order of the trials.  All studies run the same trials and
+summarise them in the same way; they differ in their cells and in what is shown.  Lengths are
+pixels at the focal length (28 arcsec) unless the name has another unit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import itertools
+import json
 import math
 import zlib
 
 import numpy as np
+from scipy.stats import chi2
 
-from starcal_ground.simulation.centroids import true_observations
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import parameter_difference
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
-from studies.term_removal import removal_study
-from studies.trials import (
-    bound,
-    calibration_options,
-    draw_scenario,
-    draw_star_field,
-    ESTIMATED,
-    information_blocks,
-    map_bound_px,
-    normalised_error_squared,
-    observe,
-    pointing_bound_arcsec,
-    pointing_error_arcsec,
-    StarField,
-    unused_residual_px,
-)
+from starcal_ros.records import ALIGNMENT_NAMES
+from studies import trials
+from studies.trials import ESTIMATED, rms, StarField
 
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02
-UNUSED_IMAGES = 20
 ENOUGH = 1.01  # limit on the residual of unused images relative to that with the true camera
-NIGHT_S = 3590.0  # from the first image to the last (paper: 359 at ten seconds)
+CONFIDENCE = 0.99
 
 
 @dataclass(frozen=True)
@@ -56,6 +43,7 @@ class Design:
     Design of a study, which has one cell for each combination of the lists.
 
     ``assumed_arcsec`` is the star tracker sigma that the calibration assumes; None: the true one.
+    ``unused`` images are not calibrated with; their residual is measured.
     """
 
     study: str
@@ -64,15 +52,15 @@ class Design:
     stars: tuple[int, ...]
     tracker_arcsec: tuple[float, ...]
     methods: tuple[str, ...]
+    outlier_shares: tuple[float, ...] = (0.0,)
+    unused: int = 0
     assumed_arcsec: float | None = None
     seed: int = 1
 
-    def assumed(self, tracker_arcsec: float) -> float:
-        """Star tracker sigma that the calibration assumes, given the true one."""
-        return tracker_arcsec if self.assumed_arcsec is None else self.assumed_arcsec
 
-
+_COUNTS = (2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 60)
 _METHODS = ('per_image', 'single', 'hierarchical')  # in the order of the paper
+_TWO = ('per_image', 'hierarchical')
 STUDIES: Mapping[str, tuple[str, Design]] = {
     'table1': (
         'map error of each method against star tracker noise (Table 1)',
@@ -80,26 +68,29 @@ STUDIES: Mapping[str, tuple[str, Design]] = {
     ),
     'images': (
         'number of images needed (Fig. 7)',
-        Design(
-            'images',
-            100,
-            (2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 60),
-            (80,),
-            (20.0,),
-            ('per_image', 'hierarchical'),
-        ),
-    ),
-    'terms': (
-        'residual as terms are removed one after another (Fig. 8)',
-        Design('terms', 20, (15,), (), (20.0,), ('per_image',)),
+        Design('images', 100, _COUNTS, (80,), (20.0,), _TWO, unused=20),
     ),
     'coverage': (
         'errors relative to the reported covariance',
-        Design('coverage', 200, (16,), (80,), (20.0,), ('per_image', 'hierarchical')),
+        Design('coverage', 200, (16,), (80,), (20.0,), _TWO, (0.0, OUTLIER_SHARE)),
     ),
 }
 """Name -> title and default design."""
 
+_KEY = ('images', 'stars', 'tracker_arcsec', 'outlier_share', 'method')
+_ERRORS = ('trials', 'map_px', 'map_px_sigma', 'to_bound')
+_SHOWN: Mapping[str, tuple[str, ...]] = {
+    'table1': (
+        *('to_own_bound', 'to_per_image_bound'),
+        *('pointing_arcsec', 'pointing_to_bound', 'normalised'),
+    ),
+    'images': ('unused_px', 'unused_to_true'),
+    'coverage': (
+        *('to_reported', 'normalised', 'low', 'high', 'inside'),
+        *('worst_bias', 'worst_bias_sigmas', 'widest', 'widest_rms_sigmas'),
+    ),
+}
+"""Columns of the printed table beside `_KEY` and `_ERRORS`."""
 
 _LIMITS = {
     'trials': (1, 10**6),
@@ -113,7 +104,7 @@ _OPTIONS = {'tracker_arcsec': 'tracker', 'assumed_arcsec': 'tracker-assumed'}  #
 
 
 def check(design: Design) -> None:
-    """Raise OptionError for values out of range, duplicates, and a list that the study ignores."""
+    """Raise OptionError for values out of range and duplicates."""
     for name, (low, high) in _LIMITS.items():
         values = getattr(design, name)
         for value in values if isinstance(values, tuple) else (values,):
@@ -121,10 +112,6 @@ def check(design: Design) -> None:
                 raise OptionError(
                     f'--{_OPTIONS.get(name, name)}: {value:g} is not within {low:g} to {high:g}'
                 )
-    if design.study == 'terms' and design.stars:
-        raise OptionError(
-            '--stars: not applicable to the study terms, which uses the stars of the catalog'
-        )
     for name in ('images', 'stars', 'tracker_arcsec', 'methods'):
         values = getattr(design, name)
         if len(set(values)) < len(values):
@@ -136,145 +123,176 @@ def check(design: Design) -> None:
 def run_trial(design: Design, trial: int) -> tuple[Row, ...]:
     """Rows of one trial, one for each cell and method; none if no calibration was possible."""
     rng = np.random.default_rng([design.seed, zlib.crc32(design.study.encode()), trial])
-    rows = _TRIALS[design.study](design, rng)
-    return tuple({'trial': trial, **row} for row in rows)
-
-
-def _cells(design: Design, field: StarField) -> Iterable[tuple[Row, StarField]]:
-    """Numbers of images and stars of each cell, and the corresponding subset of a field."""
-    for images, stars in itertools.product(design.images, design.stars):
-        yield {'images': images, 'stars': stars}, field.part(0, images, stars)
-
-
-def _solutions(
-    design: Design, cell: Row, ensemble: Ensemble, field: StarField, tracker_arcsec: float
-) -> Iterable[tuple[Row, Estimate]]:
-    """Key with errors, and estimate, of each method that has enough observations."""
-    for method in design.methods:
-        options = calibration_options(method, design.assumed(tracker_arcsec))
-        try:
-            estimate = estimate_calibration(ensemble, field.prior, options)
-        except TooFewObservations:
-            continue
-        yield (
-            {
-                **cell,
-                'tracker_arcsec': tracker_arcsec,
-                'method': method,
-                'map_px': map_error_px(estimate.geometry.camera, field.truth.camera),
-                'pointing_arcsec': pointing_error_arcsec(estimate.geometry, field.truth),
-                'normalised': normalised_error_squared(estimate, field.truth),
-                'converged': int(estimate.termination == 'converged'),
-            },
-            estimate,
-        )
-
-
-def _table1_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """Each method at each star tracker noise, with the bound under its own assumptions."""
-    field = draw_star_field(rng, max(design.images), max(design.stars))
-    camera = field.truth.camera
-    for cell, part in _cells(design, field):
-        blocks = information_blocks(part)
-        own = {m: map_bound_px(camera, bound(m, blocks, 0.0)) for m in ('per_image', 'single')}
-        for tracker in design.tracker_arcsec:
-            best = bound('hierarchical', blocks, tracker)
-            own['hierarchical'] = map_bound_px(camera, best)
-            pointing = pointing_bound_arcsec(camera, best)
-            ensemble = observe(part, tracker)
-            for row, _ in _solutions(design, cell, ensemble, field, tracker):
-                yield {
-                    **row,
-                    'own_bound_px': own[str(row['method'])],
-                    'per_image_bound_px': own['per_image'],
-                    'bound_px': own['hierarchical'],
-                    'pointing_bound_arcsec': pointing,
-                }
-
-
-def _images_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """Increasing numbers of images of one field, tested on unused images."""
     most = max(design.images)
-    field = draw_star_field(rng, most + UNUSED_IMAGES, max(design.stars))
-    camera = field.truth.camera
-    for cell, part in _cells(design, field):
-        unused = field.part(most, UNUSED_IMAGES, part.outlier_draw.shape[1])
-        floor = unused_residual_px(camera, unused)
-        blocks = information_blocks(part)
-        for tracker in design.tracker_arcsec:
-            least = map_bound_px(camera, bound('hierarchical', blocks, tracker))
-            ensemble = observe(part, tracker)
-            for row, estimate in _solutions(design, cell, ensemble, field, tracker):
-                yield {
-                    **row,
-                    'bound_px': least,
-                    'unused_px': unused_residual_px(estimate.geometry.camera, unused),
-                    'unused_true_px': floor,
-                }
+    field = trials.draw_star_field(rng, most + design.unused, max(design.stars))
+    rows: list[Row] = []
+    for images, stars in itertools.product(design.images, design.stars):
+        part = field.part(0, images, stars)
+        unused = field.part(most, design.unused, stars) if design.unused else None
+        cell: Row = {'trial': trial, 'images': images, 'stars': stars}
+        rows += [{**cell, **row} for row in _cell(design, part, unused)]
+    return tuple(rows)
 
 
-def _terms_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """One night as in the paper: stars drift through the field of a camera fixed to the Earth."""
-    drawn = draw_scenario(rng)
-    for images, tracker, method in itertools.product(
-        design.images, design.tracker_arcsec, design.methods
-    ):
-        night = dataclasses.replace(
-            drawn,
-            image_count=images,
-            cadence_s=NIGHT_S / (images - 1),
-            star_tracker_sigma_arcsec=(tracker, tracker, tracker),
-        )
-        options = calibration_options(method, design.assumed(tracker), estimate=PARAMETER_NAMES)
-        estimate = estimate_calibration(true_observations(night), night.prior, options)
-        for step, removal in enumerate(removal_study(estimate)):
-            std_u, std_v = removal.residual_std_px
+def _cell(design: Design, part: StarField, unused: StarField | None) -> Iterator[Row]:
+    """Errors of each method at each star tracker noise, and the bounds of its assumptions."""
+    camera, blocks = part.truth.camera, trials.information_blocks(part)
+    own = {
+        method: trials.map_bound_px(camera, trials.bound(method, blocks, 0.0))
+        for method in ('per_image', 'single')
+    }
+    for tracker, share in itertools.product(design.tracker_arcsec, design.outlier_shares):
+        least = trials.bound('hierarchical', blocks, tracker)
+        own['hierarchical'] = trials.map_bound_px(camera, least)
+        ensemble = trials.observe(part, tracker, share)
+        for method in design.methods:
+            assumed = tracker if design.assumed_arcsec is None else design.assumed_arcsec
+            options = trials.calibration_options(method, assumed)
+            try:
+                estimate = estimate_calibration(ensemble, part.prior, options)
+            except TooFewObservations:
+                continue
             yield {
-                'images': images,
                 'tracker_arcsec': tracker,
+                'outlier_share': share,
                 'method': method,
-                'step': step,
-                'removed': removal.removed,
-                'wald': removal.wald,
-                'residual_rms_px': removal.residual_rms_px,
-                'residual_std_u_px': std_u,
-                'residual_std_v_px': std_v,
-                'map_change_px': removal.map_change_px,
+                **_errors(estimate, part, unused),
+                'own_bound_px': own[method],
+                'per_image_bound_px': own['per_image'],
+                'bound_px': own['hierarchical'],
+                'pointing_bound_arcsec': trials.pointing_bound_arcsec(camera, least),
             }
 
 
-def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """Errors in units of the reported sigma, with and without outliers."""
-    field = draw_star_field(rng, max(design.images), max(design.stars))
-    camera = field.truth.camera
-    for cell, part in _cells(design, field):
-        blocks = information_blocks(part)
-        least = {
-            tracker: map_bound_px(camera, bound('hierarchical', blocks, tracker))
-            for tracker in design.tracker_arcsec
+def _errors(estimate: Estimate, part: StarField, unused: StarField | None) -> Row:
+    """Errors of an estimate, those of its parameters in units of their reported sigmas."""
+    found, truth = estimate.geometry, part.truth
+    sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
+    error = parameter_difference(found, truth)[ESTIMATED]
+    names = found.camera.parameter_names + ALIGNMENT_NAMES
+    row: Row = {
+        'map_px': map_error_px(found.camera, truth.camera),
+        'pointing_arcsec': trials.pointing_error_arcsec(found, truth),
+        'normalised': trials.normalised_error_squared(estimate, truth),
+        'converged': int(estimate.termination == 'converged'),
+        'reported_px': trials.map_bound_px(found.camera, estimate.map_covariance),
+        'rejected': int((~estimate.kept).sum()),
+        **{
+            f'{names[k]}_sigmas': float(e / s)
+            for k, e, s in zip(ESTIMATED, error, sigma, strict=True)
+        },
+    }
+    if unused:
+        row['unused_px'] = trials.unused_residual_px(found.camera, unused)
+        row['unused_true_px'] = trials.unused_residual_px(truth.camera, unused)
+    return row
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Result of a study: rows of its trials in order, and their summary."""
+
+    design: Design
+    rows: tuple[Row, ...]
+    summary: tuple[Row, ...]
+
+
+def conclude(design: Design, rows: Iterable[Row]) -> StudyResult:
+    """
+    Result of a study from the rows of all its trials, in any order.
+
+    Raises TooFewObservations when no calibration was possible in any cell.
+    """
+    ordered = tuple(sorted(rows, key=lambda row: row['trial']))
+    if not ordered:
+        raise TooFewObservations(
+            f'no calibration was possible in {design.trials} trials of {design.study}: '
+            'increase --images or --stars'
+        )
+    return StudyResult(design, ordered, tuple(_summary(ordered)))
+
+
+def content(result: StudyResult, software: str) -> str:
+    """JSON text of a result: design, summary rows, and all trials as columns."""
+    columns = dict.fromkeys(name for row in result.rows for name in row)
+    parameters = dataclasses.asdict(result.design)
+    content = {
+        'software': software,
+        'study': parameters.pop('study'),
+        'seed': parameters.pop('seed'),
+        'parameters': parameters,
+        'summary': result.summary,
+        'trials': {name: [row.get(name) for row in result.rows] for name in columns},
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + '\n'
+
+
+def groups(rows: Sequence[Row], names: Sequence[str]) -> Iterator[tuple[Row, list[Row]]]:
+    """Group rows by the named columns, in order of first appearance."""
+    members: dict[tuple[int | float | str, ...], list[Row]] = {}
+    for row in rows:
+        members.setdefault(tuple(row[name] for name in names), []).append(row)
+    for key, same in members.items():
+        yield dict(zip(names, key, strict=True)), same
+
+
+def column(rows: Sequence[Row], name: str) -> Floats:
+    """Column of numbers of some rows."""
+    return np.array([row[name] for row in rows], np.float64)
+
+
+def _ratio(rows: Sequence[Row], name: str, to: str) -> float:
+    return rms(column(rows, name)) / rms(column(rows, to))
+
+
+def _summary(rows: Sequence[Row]) -> Iterator[Row]:
+    """RMS errors of each cell and method over the trials, relative to bounds and covariances."""
+    names = [name for name in rows[0] if name.endswith('_sigmas')]
+    for key, cell in groups(rows, _KEY):
+        n, squares = len(cell), column(cell, 'map_px') ** 2
+        # 0 for a single trial.
+        relative = 0.5 * squares.std(ddof=1) / squares.mean() / math.sqrt(n) if n > 1 else 0.0
+        # Of the mean of n chi^2 variables.
+        tail = (1 - CONFIDENCE) / 2
+        low, high = (chi2.ppf([tail, 1 - tail], len(ESTIMATED) * n) / n).tolist()
+        normalised = float(column(cell, 'normalised').mean())
+        bias = {name: float(column(cell, name).mean()) for name in names}
+        spread = {name: rms(column(cell, name)) for name in names}
+        worst = max(names, key=lambda name: abs(bias[name]))
+        widest = max(names, key=lambda name: spread[name])
+        row = {
+            **key,
+            'trials': n,
+            'map_px': rms(column(cell, 'map_px')),
+            'map_px_sigma': math.sqrt(squares.mean()) * float(relative),
+            'to_bound': _ratio(cell, 'map_px', 'bound_px'),
+            'to_own_bound': _ratio(cell, 'map_px', 'own_bound_px'),
+            'to_per_image_bound': _ratio(cell, 'map_px', 'per_image_bound_px'),
+            'to_reported': _ratio(cell, 'map_px', 'reported_px'),
+            'pointing_arcsec': rms(column(cell, 'pointing_arcsec')),
+            'pointing_to_bound': _ratio(cell, 'pointing_arcsec', 'pointing_bound_arcsec'),
+            'normalised': normalised,
+            'low': low,
+            'high': high,
+            'inside': int(low <= normalised <= high),
+            'worst_bias': worst.removesuffix('_sigmas'),
+            'worst_bias_sigmas': bias[worst],
+            'widest': widest.removesuffix('_sigmas'),
+            'widest_rms_sigmas': spread[widest],
+            **{f'bias_{name}': value for name, value in bias.items()},
+            **{f'rms_{name}': value for name, value in spread.items()},
         }
-        for tracker, share in itertools.product(design.tracker_arcsec, (0.0, OUTLIER_SHARE)):
-            ensemble = observe(part, tracker, share)
-            key: Row = {**cell, 'outlier_share': share}
-            for row, estimate in _solutions(design, key, ensemble, field, tracker):
-                sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
-                error = parameter_difference(estimate.geometry, field.truth)[ESTIMATED]
-                names = estimate.geometry.camera.parameter_names + ALIGNMENT_NAMES
-                yield {
-                    **row,
-                    'reported_px': map_bound_px(estimate.geometry.camera, estimate.map_covariance),
-                    'bound_px': least[tracker],
-                    'rejected': int((~estimate.kept).sum()),
-                    **{
-                        f'{names[k]}_sigmas': float(e / s)
-                        for k, e, s in zip(ESTIMATED, error, sigma, strict=True)
-                    },
-                }
+        if 'unused_px' in cell[0]:
+            row['unused_px'] = rms(column(cell, 'unused_px'))
+            row['unused_to_true'] = _ratio(cell, 'unused_px', 'unused_true_px')
+        yield row
 
 
-_TRIALS: Mapping[str, Callable[[Design, np.random.Generator], Iterable[Row]]] = {
-    'table1': _table1_trial,
-    'images': _images_trial,
-    'terms': _terms_trial,
-    'coverage': _coverage_trial,
-}
+def table(result: StudyResult) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the summary: what the study is about."""
+    names = [*_KEY, *_ERRORS, *_SHOWN[result.design.study]]
+    return names, [[_words(row[name]) for name in names] for row in result.summary]
+
+
+def _words(value: int | float | str) -> str:
+    return f'{value:.4g}' if isinstance(value, float) else str(value)

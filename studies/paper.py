@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from starcal_ground.report import svg
 from starcal_ground.report.detector_figures import (
     distortion_contours,
     distortion_vectors,
     star_cloud,
 )
 from starcal_ground.report.figures import outline
-from starcal_ground.report.svg import Curve, Drawing, GRID, INK, Panel, plot, SERIES, sheet
+from starcal_ground.report.svg import Curve, Drawing, Panel, plot, SERIES, sheet
 from starcal_ground.simulation.rendering import fixed_pattern, render
 from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.arrays import Floats
@@ -48,9 +49,7 @@ from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
-from studies.monte_carlo import Design, Row
-from studies.study_figures import removed_terms, term_worth
-from studies.summary import StudyResult
+from studies.monte_carlo import Design, Row, StudyResult
 from studies.term_removal import removal_study, TermRemoval
 from studies.trials import PAPER_ESTIMATE, rms
 
@@ -314,7 +313,7 @@ def _images(found: PaperStudy) -> Drawing:
         for values, colour, name in zip(spread.T, SERIES, 'uv', strict=False)
     ]
     used = f'{len(found.used)} images used'
-    curves.append(Curve([], [], GRID, used, width=4.0))
+    curves.append(Curve([], [], svg.GRID, used, width=4.0))
 
     def lines(panel: Panel) -> None:
         for at in found.used:
@@ -331,7 +330,7 @@ def _histogram(found: PaperStudy) -> Drawing:
         for values, colour, name in zip(residual_px.T, SERIES, 'uv', strict=False)
     ]
     normal = norm.pdf(edges, scale=float(residual_px.std()))
-    curves.append(Curve(edges, normal, INK, 'normal distribution', width=1.0, dash='5 3'))
+    curves.append(Curve(edges, normal, svg.INK, 'normal distribution', width=1.0, dash='5 3'))
     return plot(curves, 'residual (px)', 'density', x=(-1.0, 1.0), y=(0.0, None))
 
 
@@ -354,16 +353,51 @@ def _counts(found: PaperStudy) -> Drawing:
     ]
     noise = [found.noise_rms_px, found.noise_rms_px]
     curves.append(
-        Curve([number[0], number[-1]], noise, INK, 'with the true camera', dash='5 3', width=1.0)
+        Curve(
+            [number[0], number[-1]], noise, svg.INK, 'with the true camera', dash='5 3', width=1.0
+        )
     )
     return plot(curves, 'images used', 'rms (px)', log='xy',
                 under=lambda panel: panel.upright(CALIBRATED_WITH, width=5.0))  # fmt: skip
 
 
 def _terms(found: PaperStudy) -> Drawing:
-    removals = found.removals
-    gone = [removal.removed for removal in removals[1:]]
+    """Terms removed after each step, and the residuals and the change of the map."""
+    gone = [removal.removed for removal in found.removals[1:]]
     order = [*gone, *(name for name in PARAMETER_NAMES if name not in gone)]
-    share = [[float(name in gone[:step]) for name in order] for step in range(len(removals))]
-    table = removed_terms(np.array(share), order, 'coloured: removed from the calibration')
-    return sheet([[table, term_worth(removals)]])
+    height, steps = 60.0 + 26.0 * len(found.removals), len(found.removals)
+    x = svg.Scale(-0.5, len(order) - 0.5, 62, svg.WIDTH - 12)
+    panel = Panel(x, svg.Scale(-0.5, steps - 0.5, 28, height - 24))
+    for step in range(steps):
+        for term in range(step):
+            panel.box((term - 0.47, term + 0.47), (step - 0.45, step + 0.45), SERIES[1], 0.9)
+    x_ticks = [(float(k), name) for k, name in enumerate(order)]
+    y_ticks = [(float(k), str(k)) for k in range(steps)]
+    panel.axes('', 'terms removed', x_ticks, y_ticks, is_framed=True)
+    panel.outside.append(svg.words(62, 16, 'coloured: removed from the calibration', 'start'))
+    return sheet([[panel.drawing(height), _removals(found.removals)]])
+
+
+def _removals(removals: Sequence[TermRemoval]) -> Drawing:
+    """Residuals, and change of the map, after each removal; shaded: terms not significant."""
+    steps = np.arange(len(removals), dtype=float)
+    std_u, std_v = np.array([removal.residual_std_px for removal in removals]).T
+    change_px = np.array([removal.map_change_px for removal in removals])
+    curves = [
+        Curve(steps, np.where(values > 0, values, np.nan), colour, label, mark)
+        for values, label, colour, mark in (
+            (std_u, 'residual, std of u', SERIES[0], 'circle'),
+            (std_v, 'residual, std of v', SERIES[1], 'square'),
+            (np.r_[np.nan, change_px[1:]], 'change of the map, rms', SERIES[2], 'triangle'),
+        )
+    ]
+    insignificant = max((k for k, removal in enumerate(removals) if removal.negligible), default=0)
+
+    def shade(panel: Panel) -> None:
+        if insignificant:
+            panel.band(-0.5, insignificant + 0.5, is_vertical=True)
+
+    names = ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
+    ends, ticks = (-0.5, len(names) - 0.5), list(zip(steps.tolist(), names, strict=True))
+    return plot(curves, 'removed, one by one', 'px', x=ends, log='y', x_ticks=ticks,
+                is_left=True, under=shade)  # fmt: skip

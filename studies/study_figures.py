@@ -9,23 +9,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from starcal_ground.report.figures import outline
-from starcal_ground.report.svg import (
-    Curve,
-    Drawing,
-    INK,
-    Panel,
-    plot,
-    Scale,
-    SERIES,
-    sheet,
-    WIDTH,
-    words,
-)
-from starcal_ros.arrays import Floats
-from starcal_ros.camera import PARAMETER_NAMES
-from studies.monte_carlo import ENOUGH, Row, UNUSED_IMAGES
-from studies.summary import column, StudyResult
-from studies.term_removal import TermRemoval
+from starcal_ground.report.svg import Curve, Drawing, INK, Panel, plot, SERIES, sheet
+from studies.monte_carlo import column, ENOUGH, groups, Row, StudyResult
 from studies.trials import ESTIMATED
 
 # Colour, mark, and width that keeps coinciding lines visible.
@@ -51,10 +36,8 @@ def _where(rows: Sequence[Row], **values: object) -> list[Row]:
 
 def _cells(result: StudyResult, *names: str) -> Iterator[tuple[Row, list[Row], list[Row]]]:
     """Distinct values of columns of the summary, its rows with them, and the trials with them."""
-    keys = [{name: row[name] for name in names} for row in result.summary]
-    for k, key in enumerate(keys):
-        if key not in keys[:k]:
-            yield key, _where(result.summary, **key), _where(result.rows, **key)
+    for key, cell in groups(result.summary, names):
+        yield key, cell, _where(result.rows, **key)
 
 
 def _by_method(
@@ -111,57 +94,11 @@ def _images(result: StudyResult) -> Rows:
                 for curves, label, words in (
                     (left, 'map error, rms (0.001 px)', title),
                     (right, 'above that of the true camera (%)',
-                     f'residual of {UNUSED_IMAGES} unused images'),
+                     f'residual of {result.design.unused} unused images'),
                 )
             ]
         )  # fmt: skip
     return rows
-
-
-def _terms(result: StudyResult) -> Rows:
-    """Terms removed after each step (as the paper's Fig. 8), and the residual."""
-    rows = []
-    for key, cell, trials in _cells(result, 'images', 'tracker_arcsec', 'method'):
-        steps = [int(row['step']) for row in cell]
-        gone = np.array(
-            [
-                [
-                    np.mean([row['removed'] == name for row in trials if int(row['step']) <= step])
-                    * (step + 1)
-                    for name in PARAMETER_NAMES
-                ]
-                for step in steps
-            ]
-        )
-        order = np.argsort(-gone.sum(axis=0), kind='stable')
-        names = [PARAMETER_NAMES[k] for k in order]
-        title = f'removed terms (% of nights); {key["method"]}, {key["images"]} images'
-        std_px = np.c_[column(cell, 'residual_std_u_px'), column(cell, 'residual_std_v_px')]
-        curves = removal_curves(std_px, column(cell, 'map_change_px'), [str(k) for k in steps])
-        rows.append([removed_terms(gone[:, order], names, title), curves])
-    return rows
-
-
-def removed_terms(share: Floats, names: Sequence[str], title: str) -> Drawing:
-    """
-    Removed terms, coloured, after each step.
-
-    ``share`` (n, k) is that of the calibrations without the k-th term after each step, 0 to 1;
-    it is written as a percentage where the calibrations differ.
-    """
-    steps, terms = share.shape
-    height = 60.0 + 26.0 * steps
-    x, y = Scale(-0.5, terms - 0.5, 62, WIDTH - 12), Scale(-0.5, steps - 0.5, 28, height - 24)
-    panel = Panel(x, y)
-    for (row, term), part in np.ndenumerate(share):
-        panel.box((term - 0.47, term + 0.47), (row - 0.45, row + 0.45), SERIES[1], 0.9 * part)
-        if 0.005 < part < 0.995:
-            panel.text(term, row, f'{100 * part:.0f}')
-    x_ticks = [(float(k), name) for k, name in enumerate(names)]
-    y_ticks = [(float(k), str(k)) for k in range(steps)]
-    panel.axes('', 'terms removed', x_ticks, y_ticks, is_framed=True)
-    panel.outside.append(words(62, 16, title, 'start'))
-    return panel.drawing(height)
 
 
 def _coverage(result: StudyResult) -> Rows:
@@ -215,45 +152,5 @@ def _coverage(result: StudyResult) -> Rows:
 _FIGURES: Mapping[str, Callable[[StudyResult], Rows]] = {
     'table1': _table1,
     'images': _images,
-    'terms': _terms,
     'coverage': _coverage,
 }
-
-
-def term_worth(removals: Sequence[TermRemoval]) -> Drawing:
-    """Residuals and map as terms are removed one after the other (paper, Fig. 8)."""
-    return removal_curves(
-        np.array([removal.residual_std_px for removal in removals]),
-        np.array([removal.map_change_px for removal in removals]),
-        ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])],
-        max((k for k, removal in enumerate(removals) if removal.negligible), default=0),
-    )
-
-
-def removal_curves(
-    std_px: Floats, map_change_px: Floats, names: Sequence[str], insignificant: int = 0
-) -> Drawing:
-    """
-    Residuals and change of the map after each removal of a term.
-
-    ``std_px`` (n, 2) are the standard deviations of the residuals along u and v, first with all
-    terms; ``map_change_px`` (n,) the RMS change of the distortion map, of which the first is not
-    shown; ``names`` (n,) the terms.  Up to the removal ``insignificant`` the background is shaded.
-    """
-    steps = np.arange(len(names), dtype=float)
-    values = np.c_[std_px, np.r_[np.nan, map_change_px[1:]]].T
-    labels = ('residual, std of u', 'residual, std of v', 'change of the map, rms')
-    marks = ('circle', 'square', 'triangle')
-    curves = [
-        Curve(steps, np.where(one > 0, one, np.nan), colour, label, mark)
-        for one, label, colour, mark in zip(values, labels, SERIES, marks, strict=True)
-    ]
-
-    def shade(panel: Panel) -> None:
-        if insignificant:
-            panel.band(-0.5, insignificant + 0.5, is_vertical=True)
-
-    ends = -0.5, len(names) - 0.5
-    ticks = list(zip(steps.tolist(), names, strict=True))
-    return plot(curves, 'removed, one by one', 'px', x=ends, log='y', x_ticks=ticks,
-                is_left=True, under=shade)  # fmt: skip

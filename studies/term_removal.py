@@ -35,6 +35,13 @@ class TermRemoval:
 
     Attributes
     ----------
+    residual_rms_px : float
+        Per axis, over the stars of the calibration with all terms.
+    residual_std_px : (float, float)
+        Standard deviation along u and along v.
+    map_change_px : float
+        RMS change over the detector against the calibration with all terms, common rotation
+        removed.
     removed : str
         The term; empty for the calibration with all of them.
     significance : float
@@ -47,23 +54,16 @@ class TermRemoval:
     negligible : bool
         Whether this term and all removed before it may be dropped: the p-value of the rise is over
         1 %.
-    residual_rms_px : float
-        Per axis, over the same stars.
-    residual_std_px : (float, float)
-        Standard deviation along u and along v.
-    map_change_px : float
-        RMS change over the detector against the calibration with all terms, common rotation
-        removed.
     """
 
-    removed: str
-    significance: float
-    wald: float
-    chi2_rise: float
-    negligible: bool
     residual_rms_px: float
     residual_std_px: tuple[float, float]
     map_change_px: float
+    removed: str = ''
+    significance: float = 0.0
+    wald: float = 0.0
+    chi2_rise: float = 0.0
+    negligible: bool = True
 
 
 def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
@@ -85,7 +85,7 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     sigmas = _sigmas(problem, solution)
     variance = np.diag(estimate.covariance)[problem.free]
     alone = _distances(problem, estimate.geometry.camera.parameters, variance)
-    removals = [_removal(estimate, problem, solution.state, '', 0.0, 0.0, 0.0, negligible=True)]
+    removals = [_residuals(estimate, problem, solution.state)]
     while sigmas:
         least = min(sigmas, key=lambda name: abs(sigmas[name]))
         k = names.index(least)
@@ -99,14 +99,12 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
         rise = 2.0 * (solution.normal.cost - cost)
         rise += _of_prior(names, estimate.linear.problem, problem)
         removals.append(
-            _removal(
-                estimate,
-                problem,
-                solution.state,
-                least,
-                alone[least],
-                sigmas[least] ** 2,
-                rise,
+            dataclasses.replace(
+                _residuals(estimate, problem, solution.state),
+                removed=least,
+                significance=alone[least],
+                wald=sigmas[least] ** 2,
+                chi2_rise=rise,
                 negligible=bool(chdtrc(len(removals), rise) > _SIGNIFICANT),
             )
         )
@@ -159,31 +157,17 @@ def _of_prior(names: tuple[str, ...], before: Problem, after: Problem) -> float:
     return float(np.sum(np.square(np.array(off) / before.prior_sigma[removed])))
 
 
-def _removal(
-    estimate: Estimate,
-    problem: Problem,
-    state: State,
-    removed: str,
-    significance: float,
-    wald: float,
-    rise: float,
-    negligible: bool,
-) -> TermRemoval:
+def _residuals(estimate: Estimate, problem: Problem, state: State) -> TermRemoval:
+    """Residuals and map of a state; of which term, the caller adds."""
     rotations = state.camera_from_icrf.as_matrix()
     parameters = image_parameters(problem, state)
     residual_px = residuals_px(estimate.table, problem.model, parameters, rotations)
     residual_px = residual_px[estimate.kept]
     std_u, std_v = residual_px.std(axis=0)
     camera = estimate.geometry.camera
+    changed = dataclasses.replace(camera, parameters=state.parameters)
     return TermRemoval(
-        removed=removed,
-        significance=significance,
-        wald=wald,
-        chi2_rise=rise,
-        negligible=negligible,
         residual_rms_px=float(np.sqrt(np.mean(residual_px**2))),
         residual_std_px=(float(std_u), float(std_v)),
-        map_change_px=map_error_px(
-            dataclasses.replace(camera, parameters=state.parameters), camera
-        ),
+        map_change_px=map_error_px(changed, camera),
     )

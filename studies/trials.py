@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation.centroids import scaled_inverse
-from starcal_ground.simulation.scenario import Scenario, scenario
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import chi_squared, lines_of_sight, parameter_difference
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
@@ -83,14 +83,9 @@ class StarField:
         )
 
 
-def draw_scenario(rng: np.random.Generator) -> Scenario:
-    """The paper's campaign with a random truth and a random post-launch prior error."""
-    return scenario('paper', int(rng.integers(2**31)))
-
-
 def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarField:
     """Random star field of the paper's camera (2592 x 2048, 35 mm) with all its errors."""
-    drawn = draw_scenario(rng)
+    drawn = scenario('paper', int(rng.integers(2**31)))
     camera = drawn.truth.camera
     rotations = Rotation.from_quat(rng.normal(size=(images, 4)))
     pixels = rng.uniform(0.0, 1.0, (images, stars, 2)) * [camera.width - 1, camera.height - 1]

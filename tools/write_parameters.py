@@ -10,12 +10,7 @@ import textwrap
 from typing import Any
 
 from starcal_ros.options import option_fields
-from starcal_ros.pipeline.setup import (
-    CalibratorOptions,
-    NodeOptions,
-    ObserverOptions,
-    OPTION_CLASSES,
-)
+from starcal_ros.pipeline import setup
 
 FILE = Path(__file__).parents[1] / 'config' / 'starcal.yaml'
 HEAD = """\
@@ -38,9 +33,9 @@ def main() -> None:
 def parameter_file() -> str:
     """Return the content of the file."""
     sections = {
-        '/**': (*OPTION_CLASSES, NodeOptions),
-        '/**/star_observer': (ObserverOptions,),
-        '/**/calibrator': (CalibratorOptions,),
+        '/**': (*setup.OPTION_CLASSES, setup.NodeOptions),
+        '/**/star_observer': (setup.ObserverOptions,),
+        '/**/calibrator': (setup.CalibratorOptions,),
     }
     parts = [
         f'{name}:\n  ros__parameters:\n' + '\n'.join(groups(classes))

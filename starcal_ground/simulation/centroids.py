@@ -14,16 +14,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import pixel_stamps
-from starcal_ground.simulation.scenario import (
-    attitude_samples,
-    CENTROID_STREAM,
-    Detector,
-    random_stream,
-    Scenario,
-    Scene,
-    scenes,
-)
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
@@ -40,7 +32,7 @@ def bound_names(camera: CameraModel) -> tuple[str, ...]:
 
 
 def true_observations(
-    scenario: Scenario,
+    scenario: synthetic.Scenario,
     centroid_sigma_px: float | None = None,
     centroid_noise: bool = True,
     attitude_noise: bool = True,
@@ -56,12 +48,12 @@ def true_observations(
         False: no errors are added; the covariances stay the same.
     """
     images = []
-    for index, shown in enumerate(scenes(scenario, attitude_noise)):
+    for index, shown in enumerate(synthetic.scenes(scenario, attitude_noise)):
         covariance, snr, keep = scene_bound(scenario, shown)
         if centroid_sigma_px is not None:
             covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
         # Drawn before the selection, so that the error of a star does not depend on other stars.
-        rng = random_stream(scenario.seed, CENTROID_STREAM, index)
+        rng = synthetic.random_stream(scenario.seed, synthetic.CENTROID_STREAM, index)
         error = rng.normal(size=shown.pixel_px.shape) * centroid_noise
         root = np.linalg.cholesky(covariance)
         measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
@@ -69,7 +61,7 @@ def true_observations(
         # A rate is exact where all samples have one error.
         has_own = scenario.star_tracker_hz > 0
         tracker_sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD * has_own
-        samples = attitude_samples(scenario, index)
+        samples = synthetic.attitude_samples(scenario, index)
         rate = rate_of(samples, shown.time_ns, tracker_sigma_rad)
         images.append(with_rate(observed, *rate))
     return Ensemble(tuple(images))
@@ -84,7 +76,9 @@ def with_rate(
     )
 
 
-def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def scene_bound(
+    scenario: synthetic.Scenario, shown: synthetic.Scene
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
     camera = scenario.truth.camera
     covariance, snr = centroid_bound(
@@ -95,7 +89,11 @@ def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArr
 
 
 def observations(
-    scenario: Scenario, shown: Scene, measured_px: Floats, covariance: Floats, snr: Floats
+    scenario: synthetic.Scenario,
+    shown: synthetic.Scene,
+    measured_px: Floats,
+    covariance: Floats,
+    snr: Floats,
 ) -> StarObservations:
     """Observations of all stars of a scene by their centroids (n, 2) and covariances (n, 2, 2)."""
     camera, detector = scenario.truth.camera, scenario.detector
@@ -121,7 +119,7 @@ def observations(
 
 
 def centroid_bound(
-    pixels_px: Floats, flux_electrons: Floats, detector: Detector, shape: tuple[int, int]
+    pixels_px: Floats, flux_electrons: Floats, detector: synthetic.Detector, shape: tuple[int, int]
 ) -> tuple[Floats, Floats]:
     """
     Cramer-Rao bound of the centroids of single stars, flux free and background fixed.
@@ -161,7 +159,7 @@ def centroid_bound(
     return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
 
 
-def cramer_rao_covariance(scenario: Scenario) -> Floats:
+def cramer_rao_covariance(scenario: synthetic.Scenario) -> Floats:
     """
     Cramer-Rao bound of the covariance of the camera parameters named by `bound_names`.
 
@@ -171,7 +169,7 @@ def cramer_rao_covariance(scenario: Scenario) -> Floats:
     camera = scenario.truth.camera
     columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
     information = np.zeros((len(columns), len(columns)))
-    for shown in scenes(scenario):
+    for shown in synthetic.scenes(scenario):
         covariance, _, keep = scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
         information += camera_information(camera, in_camera, covariance[keep], columns)

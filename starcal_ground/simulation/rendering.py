@@ -16,16 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from starcal_ground.simulation.scenario import (
-    Detector,
-    PATTERN_STREAM,
-    PIXEL_STREAM,
-    random_stream,
-    Scenario,
-    Scene,
-    scene,
-    stamp_half_px,
-)
+from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.records import Image
 
@@ -45,7 +36,7 @@ def pixel_stamps(
         Derivative of the share by the center, 1/px.
     """
     sigma_px = np.broadcast_to(np.asarray(psf_sigma_px, np.float64), centers_px.shape)
-    half = stamp_half_px(float(sigma_px.max(initial=0.1)))
+    half = synthetic.stamp_half_px(float(sigma_px.max(initial=0.1)))
     edges = np.arange(-half, half + 2) - 0.5
     nearest = np.rint(centers_px).astype(np.int64)
     width = math.sqrt(2) * sigma_px[:, None]
@@ -70,10 +61,10 @@ def star_electrons(
     return np.asarray(electrons, np.float64)
 
 
-def fixed_pattern(scenario: Scenario) -> Floats:
+def fixed_pattern(scenario: synthetic.Scenario) -> Floats:
     """Mean dark and sky signal (height, width), electrons; equal for all images."""
     detector, camera = scenario.detector, scenario.truth.camera
-    rng = random_stream(scenario.seed, PATTERN_STREAM)
+    rng = synthetic.random_stream(scenario.seed, synthetic.PATTERN_STREAM)
     pattern = np.full(camera.height * camera.width, detector.background_electrons)
     hot = rng.choice(pattern.size, round(detector.hot_fraction * pattern.size), replace=False)
     pattern[hot] += rng.exponential(detector.hot_electrons, hot.size)
@@ -81,7 +72,7 @@ def fixed_pattern(scenario: Scenario) -> Floats:
 
 
 def cosmic_ray_electrons(
-    detector: Detector, shape: tuple[int, int], rng: np.random.Generator
+    detector: synthetic.Detector, shape: tuple[int, int], rng: np.random.Generator
 ) -> Floats:
     """Signal (height, width) of cosmic rays: tracks of random position, length and charge."""
     height, width = shape
@@ -100,7 +91,9 @@ def cosmic_ray_electrons(
     return np.asarray(electrons, np.float64)
 
 
-def expose(mean_electrons: Floats, detector: Detector, rng: np.random.Generator) -> Pixels:
+def expose(
+    mean_electrons: Floats, detector: synthetic.Detector, rng: np.random.Generator
+) -> Pixels:
     """One exposure of a mean signal with photon noise, read noise and quantisation."""
     electrons = rng.poisson(mean_electrons) + rng.normal(
         0.0, detector.read_noise_electrons, mean_electrons.shape
@@ -110,11 +103,13 @@ def expose(mean_electrons: Floats, detector: Detector, rng: np.random.Generator)
     return counts.astype(np.uint8) if detector.bits <= 8 else counts.astype(np.uint16)
 
 
-def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None = None) -> Image:
+def render(
+    scenario: synthetic.Scenario, shown: synthetic.Scene, index: int, pattern: Floats | None = None
+) -> Image:
     """Image of a scene; pass the `fixed_pattern` to render many images faster."""
     detector, camera = scenario.detector, scenario.truth.camera
     shape = (camera.height, camera.width)
-    rng = random_stream(scenario.seed, PIXEL_STREAM, index)
+    rng = synthetic.random_stream(scenario.seed, synthetic.PIXEL_STREAM, index)
     mean = fixed_pattern(scenario) if pattern is None else pattern
     mean = mean + star_electrons(
         shown.pixel_px, shown.flux_electrons, detector.psf_sigma_at(shown.pixel_px, shape), shape
@@ -123,8 +118,8 @@ def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None 
     return Image(shown.time_ns, expose(mean, detector, rng))
 
 
-def images(scenario: Scenario) -> Iterator[Image]:
+def images(scenario: synthetic.Scenario) -> Iterator[Image]:
     """All images of a scenario, rendered on demand."""
     pattern = fixed_pattern(scenario)
     for index in range(scenario.image_count):
-        yield render(scenario, scene(scenario, index), index, pattern)
+        yield render(scenario, synthetic.scene(scenario, index), index, pattern)

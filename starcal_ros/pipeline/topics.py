@@ -12,15 +12,7 @@ from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import Frame, read_frames
 from starcal_ros.formats.bag.reader import Topics as Topics
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
-    ATTITUDE_TYPES,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    OBSERVATIONS_TYPE,
-    TEMPERATURE_TYPE,
-    VELOCITY_TYPE,
-)
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
@@ -33,8 +25,8 @@ _CAMERA_ALONE = 'starcal calibrate --camera-alone estimates the camera without a
 Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
-_RAW = IMAGE_TYPE
-_IMAGE_TYPES = {_RAW, COMPRESSED_TYPE}
+_RAW = codec.IMAGE_TYPE
+_IMAGE_TYPES = {_RAW, codec.COMPRESSED_TYPE}
 _WITHOUT = {
     'image': 'record the images, or make a bag of image files with starcal import',
     'attitude': (
@@ -54,21 +46,21 @@ def choose_topics(paths: Sequence[Path], requested: Topics, setup: Setup | None 
     """
     there = reader.topics(paths)
     kinds = {topic.type_name for topic in there}
-    only_recorded = not kinds & _IMAGE_TYPES and OBSERVATIONS_TYPE in kinds
+    only_recorded = not kinds & _IMAGE_TYPES and codec.OBSERVATIONS_TYPE in kinds
     if requested.observations or (only_recorded and not requested.image):
-        kind = OBSERVATIONS_TYPE
+        kind = codec.OBSERVATIONS_TYPE
         return Topics(observations=_choose(paths, kind, requested.observations, 'observations'))
     image = choose_image_topic(paths, requested)
     attitude, more = _choose_attitudes(paths, there, requested.attitude, setup)
     velocity, temperature = requested.velocity, requested.temperature
-    if velocity or VELOCITY_TYPE in kinds:
-        velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
+    if velocity or codec.VELOCITY_TYPE in kinds:
+        velocity = _choose(paths, codec.VELOCITY_TYPE, velocity, 'velocity')
     options = setup.calibration if setup else None
     used = options and (options.focal_temperature_order or options.alignment_temperature)
-    thermometers = sum(topic.type_name == TEMPERATURE_TYPE for topic in there)
+    thermometers = sum(topic.type_name == codec.TEMPERATURE_TYPE for topic in there)
     # A spacecraft has many: the topic must be unique only if the calibration uses it.
     if temperature or thermometers == 1 or (thermometers and used):
-        temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
+        temperature = _choose(paths, codec.TEMPERATURE_TYPE, temperature, 'temperature')
     return Topics(image, attitude, velocity, temperature, more_attitudes=more)
 
 
@@ -87,7 +79,9 @@ def _choose_attitudes(
 
     A star tracker may drop out, but not all of them.
     """
-    kinds = {topic.name: topic.type_name for topic in there if topic.type_name in ATTITUDE_TYPES}
+    kinds = {
+        topic.name: topic.type_name for topic in there if topic.type_name in codec.ATTITUDE_TYPES
+    }
     named = [f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings] if setup else []
     more = tuple(name if name in kinds else '' for name in named)
     for name in set(named) - set(more):
@@ -103,7 +97,7 @@ def _choose_attitudes(
         )
         return '', more
     # Poses, transforms and orientations of an Imu may be those of anything else.
-    likely = [name for name in first if kinds[name] == ATTITUDE_TYPE] or first
+    likely = [name for name in first if kinds[name] == codec.ATTITUDE_TYPE] or first
     if len(likely) > 1 and not requested:
         listed = ', '.join(f'{name} ({kinds[name].rpartition("/")[2]})' for name in likely)
         raise BagError(
@@ -113,7 +107,7 @@ def _choose_attitudes(
     name = requested or ''.join(likely)
     own = [kind for topic, kind in kinds.items() if topic.lstrip('/') == name.lstrip('/')]
     try:
-        return _choose(paths, own[0] if own else ATTITUDE_TYPE, name, 'attitude'), more
+        return _choose(paths, own[0] if own else codec.ATTITUDE_TYPE, name, 'attitude'), more
     except BagError as error:
         alone = '' if first else f'; {_CAMERA_ALONE}'
         raise BagError(f'{error}{_not_read(there, requested)}{alone}') from error
@@ -125,7 +119,7 @@ def _not_read(there: Sequence[reader.Topic], requested: str) -> str:
         f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}, which is not read: publish its'
         ' orientation as a QuaternionStamped or PoseStamped'
         for topic in there
-        if topic.type_name not in ATTITUDE_TYPES
+        if topic.type_name not in codec.ATTITUDE_TYPES
         and _LIKE_ATTITUDES.search(topic.type_name.rpartition('/')[2])
         and (not requested or topic.name.lstrip('/') == requested.lstrip('/'))
     )
@@ -245,7 +239,7 @@ def without_attitudes(
     has_images = bool(kinds & _IMAGE_TYPES)
     if camera_alone:
         return has_images
-    others = {*ATTITUDE_TYPES, OBSERVATIONS_TYPE}
+    others = {*codec.ATTITUDE_TYPES, codec.OBSERVATIONS_TYPE}
     return has_images and not (kinds & others or requested.attitude or stated_tracker(options))
 
 

@@ -41,13 +41,8 @@ from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.bag.writer import FileSpan, metadata_text, observations_bag, TopicSummary
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import record_messages
-from starcal_ros.formats.messages.message_codec import (
-    ALIGNMENT_TYPE,
-    CALIBRATION_TYPE,
-    CAMERA_INFO_TYPE,
-    OBSERVATIONS_TYPE,
-)
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE
@@ -238,7 +233,7 @@ class Archive:
         if not kept:
             return
         files = [FileSpan(image.path.name, stamp, stamp, 1) for stamp, image in kept]
-        topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, len(files))
+        topic = TopicSummary(TOPIC, codec.OBSERVATIONS_TYPE, len(files))
         with contextlib.suppress(OSError, ProductError):  # the images are whole without it
             self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
 
@@ -520,9 +515,9 @@ def check_publishable(calibration: Calibration) -> None:
     Raises ValueError naming the message.
     """
     for kind, make in (
-        (CALIBRATION_TYPE, record_messages.calibration_to_message),
-        (CAMERA_INFO_TYPE, record_messages.camera_info_to_message),
-        (ALIGNMENT_TYPE, record_messages.alignment_to_message),
+        (codec.CALIBRATION_TYPE, record_messages.calibration_to_message),
+        (codec.CAMERA_INFO_TYPE, record_messages.camera_info_to_message),
+        (codec.ALIGNMENT_TYPE, record_messages.alignment_to_message),
     ):
         try:
             with np.errstate(all='ignore'):

@@ -20,26 +20,10 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages import message_codec
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
-    ATTITUDE_TYPES,
-    CALIBRATION_TYPE,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    OBSERVATIONS_TYPE,
-    STATUS_TYPE,
-)
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import PlayerOptions
+from starcal_ros.ros import node
 from starcal_ros.ros.inputs import LATCHED
-from starcal_ros.ros.node import (
-    end_quietly,
-    Executor,
-    is_overdue,
-    message_class,
-    shut_down,
-    until_told_to_end,
-)
 from starcal_ros.ros.parameters import OptionParameters
 from starcal_ros.ros.printable_log import PrintableLog
 
@@ -55,8 +39,8 @@ _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS do
 _SETTLED_S = 0.5
 _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (
-    CALIBRATION_TYPE,
-    STATUS_TYPE,
+    message_codec.CALIBRATION_TYPE,
+    message_codec.STATUS_TYPE,
     message_codec.CAMERA_INFO_TYPE,
 )
 
@@ -71,13 +55,15 @@ class BagPlayer(PrintableLog):
             raise BagError('bag: path of the bag to play is missing')
         self._topics = reader.topics([self.own.bag])
         # A star observer reads the raw images or the compressed ones.
-        self._images = set(self._of(IMAGE_TYPE) or self._of(COMPRESSED_TYPE))
+        self._images = set(
+            self._of(message_codec.IMAGE_TYPE) or self._of(message_codec.COMPRESSED_TYPE)
+        )
         self._players = {}
         for topic in self._topics:
             if self.own.clock and topic.name == '/clock':
                 continue  # the player publishes its own
             try:
-                kind = message_class(topic.type_name)
+                kind = node.message_class(topic.type_name)
             except ImportError:
                 text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
                 self.get_logger().warning(text)
@@ -97,7 +83,7 @@ class BagPlayer(PrintableLog):
         self._observed_count = 0
         # Observations in the bag itself must not pace the player or count as subscribers.
         kinds = {topic.type_name for topic in self._topics}
-        self._paced = bool(self._images) and OBSERVATIONS_TYPE not in kinds
+        self._paced = bool(self._images) and message_codec.OBSERVATIONS_TYPE not in kinds
         if self._paced:
             self._observations = self.create_subscription(
                 ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
@@ -144,9 +130,9 @@ class BagPlayer(PrintableLog):
 
     def _wait_for_subscribers(self) -> None:
         """Wait until the topics that matter have subscribers and no more come, or the timeout."""
-        attitudes = self._of(ATTITUDE_TYPE)
+        attitudes = self._of(message_codec.ATTITUDE_TYPE)
         # Of other types, one holds the attitudes, and the others may be there for anything.
-        others = [] if attitudes else self._of(*ATTITUDE_TYPES)
+        others = [] if attitudes else self._of(*message_codec.ATTITUDE_TYPES)
         needed = [*self._images, *attitudes] or list(self._players)
         other = self.own.wait_for_topic
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
@@ -211,7 +197,7 @@ class BagPlayer(PrintableLog):
             time.sleep(min(left_s, _POLL_S))
 
     def _check_shutdown(self) -> None:
-        if not self.context.ok() or is_overdue():
+        if not self.context.ok() or node.is_overdue():
             raise ExternalShutdownException
 
     def _tell_time(self, time_ns: int) -> None:
@@ -237,7 +223,7 @@ def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
 
 
-def _listen(executor: Executor) -> None:
+def _listen(executor: node.Executor) -> None:
     """
     Answer messages until ROS is shut down.
 
@@ -261,24 +247,24 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     player: BagPlayer | None = None
     listener: threading.Thread | None = None
-    executor: Executor | None = None  # destroyed after the end, as in `run`
+    executor: node.Executor | None = None  # destroyed after the end, as in `run`
 
     def work() -> int:
         nonlocal player, listener, executor
         player = BagPlayer()
-        executor = Executor(2)  # parameters, observations
+        executor = node.Executor(2)  # parameters, observations
         executor.add_node(player)
         listener = threading.Thread(target=_listen, args=[executor])
         listener.start()
         return player.play()
 
     def end() -> None:
-        shut_down()
+        node.shut_down()
         if listener is not None:
             listener.join()
-        end_quietly(player)
+        node.end_quietly(player)
 
-    return until_told_to_end(NAME, args, work, end)
+    return node.until_told_to_end(NAME, args, work, end)
 
 
 if __name__ == '__main__':

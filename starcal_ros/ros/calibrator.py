@@ -35,18 +35,9 @@ from starcal_ros.formats.messages.record_messages import (
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import CalibratorOptions, load_setup
 from starcal_ros.records import IMAGE_REFUSALS
+from starcal_ros.ros import node
 from starcal_ros.ros.camera_info_client import CameraDriver
 from starcal_ros.ros.inputs import LATCHED
-from starcal_ros.ros.node import (
-    ERROR,
-    Health,
-    make_message,
-    message_class,
-    OK,
-    run,
-    StarcalNode,
-    WARN,
-)
 from starcal_ros.ros.state import Answer, CalibratorState
 
 NAME = 'calibrator'
@@ -61,7 +52,7 @@ _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a p
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
 
-class Calibrator(StarcalNode):
+class Calibrator(node.StarcalNode):
     """
     Collects observations and calibrates on request, in a worker thread.
 
@@ -116,7 +107,7 @@ class Calibrator(StarcalNode):
         self._own_transforms: list[Any] = []
         self._foreign_frames: set[str] = set()
         with contextlib.suppress(ImportError):  # tf2_msgs need not be installed
-            self._tf_static = latched(message_class(_TRANSFORMS), '/tf_static')
+            self._tf_static = latched(node.message_class(_TRANSFORMS), '/tf_static')
 
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
@@ -132,7 +123,7 @@ class Calibrator(StarcalNode):
         )
         if self._tf_static is not None:
             heard = self.create_subscription(
-                message_class(_TRANSFORMS),
+                node.message_class(_TRANSFORMS),
                 '/tf_static',
                 self.guarded(self._on_transforms),
                 _ALL_LATCHED,
@@ -166,7 +157,7 @@ class Calibrator(StarcalNode):
                 destroy(entity)
         self._state.close()
 
-    def health(self) -> Health:
+    def health(self) -> node.Health:
         """Diagnostics: ensemble, active calibration and the result of the last request."""
         state, last = self._state, self._last_answer
         ensemble, active = state.ensemble, state.active
@@ -194,23 +185,23 @@ class Calibrator(StarcalNode):
             'disk_free_mb': 'none' if free is None else free // 1_000_000,
         }
         if state.trouble:
-            return ERROR, f'state not saved, in memory only: {state.trouble}', numbers
+            return node.ERROR, f'state not saved, in memory only: {state.trouble}', numbers
         if state.withheld:
-            return WARN, '; '.join(state.withheld), numbers
+            return node.WARN, '; '.join(state.withheld), numbers
         if active is not None and active.forced:
-            return WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
+            return node.WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
         topic = self.resolve_topic_name('calibration')
         if self.count_publishers(topic) > 1:
-            return WARN, f'another node publishes {topic}', numbers
+            return node.WARN, f'another node publishes {topic}', numbers
         if foreign := self._foreign_transforms():
-            return WARN, foreign, numbers
+            return node.WARN, foreign, numbers
         if state.damage:
-            return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
+            return node.WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
         if driver is not None and driver.has_failed:
-            return WARN, f'camera driver not updated: {driver.outcome}', numbers
+            return node.WARN, f'camera driver not updated: {driver.outcome}', numbers
         if not last.success:
-            return WARN, last.message, numbers
-        return OK, 'collecting' if active is None else 'calibration active', numbers
+            return node.WARN, last.message, numbers
+        return node.OK, 'collecting' if active is None else 'calibration active', numbers
 
     def _foreign_transforms(self) -> str:
         """Return which transforms another node publishes as well; empty: none."""
@@ -251,7 +242,7 @@ class Calibrator(StarcalNode):
             return
         self._status_is_due.clear()  # first: a change during the rest leads to one more status
         message = status_to_message(
-            self._state.status(), self._setup.frames.camera_frame, make_message
+            self._state.status(), self._setup.frames.camera_frame, node.make_message
         )
         with self._publishing:
             if self.is_active:
@@ -267,7 +258,7 @@ class Calibrator(StarcalNode):
             )
         )
         if answer.calibration is not None:
-            response.calibration = calibration_to_message(answer.calibration, make_message)
+            response.calibration = calibration_to_message(answer.calibration, node.make_message)
         return self._publish_and_answer(answer, response)
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
@@ -290,11 +281,13 @@ class Calibrator(StarcalNode):
             camera = active.geometry.camera
             pixels = pixel_grid(camera, points, points)
             table = line_of_sight_table(camera, active.map_covariance, pixels)
-            response.header = make_header(active.active_since_ns, active.child_frame, make_message)
+            response.header = make_header(
+                active.active_since_ns, active.child_frame, node.make_message
+            )
             for name, column in table.columns().items():
                 setattr(response, name, array.array('d', column.tobytes()))
             response.sigma_budget = [
-                record_to_message(part, make_message) for part in active.sigma_budget
+                record_to_message(part, node.make_message) for part in active.sigma_budget
             ]
             response.success = True
             response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
@@ -326,7 +319,7 @@ class Calibrator(StarcalNode):
         elif answer.calibration is not None and answer.active:
             self._publish_active()
         elif answer.calibration is not None and not answer.success:
-            self._candidate.publish(calibration_to_message(answer.calibration, make_message))
+            self._candidate.publish(calibration_to_message(answer.calibration, node.make_message))
         self._last_answer = Answer(answer.success, answer.message)
         response.success, response.message = answer.success, answer.message
         return response
@@ -338,15 +331,15 @@ class Calibrator(StarcalNode):
             calibration = self._state.active_on_disk
             if calibration is None:
                 return
-            camera_info = camera_info_to_message(calibration, make_message)
-            alignment = alignment_to_message(calibration, make_message)
+            camera_info = camera_info_to_message(calibration, node.make_message)
+            alignment = alignment_to_message(calibration, node.make_message)
             self._camera_info.publish(camera_info)
             self._alignment.publish(alignment)
-            self._calibration.publish(calibration_to_message(calibration, make_message))
+            self._calibration.publish(calibration_to_message(calibration, node.make_message))
             if self._tf_static is not None:
-                transforms = [alignment, *mountings_to_messages(calibration, make_message)]
+                transforms = [alignment, *mountings_to_messages(calibration, node.make_message)]
                 self._own_transforms += transforms
-                self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
+                self._tf_static.publish(node.make_message(_TRANSFORMS, transforms=transforms))
             if self._driver is not None:
                 self._driver.hand_over(camera_info)
 
@@ -376,7 +369,7 @@ class Calibrator(StarcalNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the calibrator until shutdown; exit status 2 for bad parameters."""
-    return run(Calibrator, NAME, args)
+    return node.run(Calibrator, NAME, args)
 
 
 if __name__ == '__main__':

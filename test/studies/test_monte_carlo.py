@@ -29,9 +29,8 @@ from starcal_ros.errors import StarcalError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.records import CameraGeometry
 from studies import __main__ as studies
-from studies import monte_carlo, study_figures, summary, trials
-from studies.monte_carlo import Design, Row
-from studies.summary import StudyResult
+from studies import monte_carlo, study_figures, trials
+from studies.monte_carlo import Design, Row, StudyResult
 from studies.workers import run_each
 
 pytestmark = pytest.mark.slow
@@ -42,7 +41,6 @@ ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--s
 SMALL = {
     'table1': {'trials': 2, 'images': (4,), 'stars': (20, 30), 'tracker_arcsec': (0.0, 20.0)},
     'images': {'trials': 2, 'images': (2, 5), 'stars': (30,)},
-    'terms': {'trials': 2, 'images': (4,)},
     'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},
 }
 each_study = pytest.mark.parametrize('study', SMALL)
@@ -56,7 +54,7 @@ def small(study: str) -> Design:
 def here(design: Design) -> StudyResult:
     """Run in this process."""
     trial = functools.partial(monte_carlo.run_trial, design)
-    return summary.conclude(design, itertools.chain(*run_each(trial, range(design.trials))))
+    return monte_carlo.conclude(design, itertools.chain(*run_each(trial, range(design.trials))))
 
 
 def only(rows: tuple[Row, ...], **values: object) -> Row:
@@ -154,17 +152,17 @@ def test_a_trial_hangs_on_nothing_but_seed_study_and_number() -> None:
     ):
         assert monte_carlo.run_trial(design, 3)[0]['map_px'] != other[0]['map_px']
     rows = [row for trial in (3, 0, 2, 1) for row in monte_carlo.run_trial(design, trial)]
-    assert summary.conclude(design, rows) == here(design)
+    assert monte_carlo.conclude(design, rows) == here(design)
 
 
 @each_study
 def test_results_and_figure(study: str) -> None:
     found = here(small(study))
-    content = json.loads(summary.content(found, 'starcal 0'))
+    content = json.loads(monte_carlo.content(found, 'starcal 0'))
     assert content['study'] == study and content['parameters']['trials'] == found.design.trials
     assert {len(column) for column in content['trials'].values()} == {len(found.rows)}
     assert len(content['summary']) == len(found.summary)
-    header, rows = summary.table(found)
+    header, rows = monte_carlo.table(found)
     assert len(rows) == len(found.summary) and {len(row) for row in rows} == {len(header)}
     drawn = study_figures.svg(found)
     ElementTree.fromstring(drawn)
@@ -202,7 +200,7 @@ def test_hierarchical_gains_where_stars_are_few_and_the_star_tracker_good() -> N
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:
     methods, shares = ('per_image', 'hierarchical'), (0.0, monte_carlo.OUTLIER_SHARE)
-    found = here(Design('coverage', 40, (16,), (80,), (20.0,), methods))
+    found = here(Design('coverage', 40, (16,), (80,), (20.0,), methods, shares))
     for method, share in itertools.product(methods, shares):
         row = only(found.summary, method=method, outlier_share=share)
         low, high = chi2.ppf([0.005, 0.995], 11 * 40) / 40
@@ -244,7 +242,7 @@ def test_a_prior_far_off_leads_to_the_same_minimum(method: str, outlier_share: f
 
 
 def test_unused_images_fit_better_the_more_are_used() -> None:
-    found = here(Design('images', 10, (2, 15), (80,), (20.0,), ('per_image',)))
+    found = here(Design('images', 10, (2, 15), (80,), (20.0,), ('per_image',), unused=20))
     few, many = (float(only(found.summary, images=m)['unused_to_true']) for m in (2, 15))
     # 8 parameters from 2 n residuals add 8 / 2n to the variance, here 0.2 % to the rms at 15
     # images and 1.3 % at two; a map weighs the corners more than the stars do.
@@ -314,7 +312,7 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
     found = here(design)
     # Eight stars are under the ten that a calibration takes.
     assert [row['images'] for row in found.rows] == [4]
-    json.loads(summary.content(found, ''))
+    json.loads(monte_carlo.content(found, ''))
     with pytest.raises(TooFewObservations, match='no calibration was possible in 1 trials'):
         here(dataclasses.replace(design, images=(2,)))
 
@@ -329,7 +327,6 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--images', '1'], '--images: 1 is not within 2 to'),
         (['table1', '--images', '5', '5'], '--images: duplicate values: 5 5'),
         (['table1', '--stars', '2'], '--stars: 2'),
-        (['terms', '--stars', '20'], '--stars: not applicable to the study terms'),
         (['table1', '--tracker', '-3'], '-3 is not within 0 to 3600'),
         (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
         (['table1', '--tracker-assumed', '4000'], '4000 is not within'),

@@ -17,7 +17,7 @@ from starcal_ground.simulation import centroids as simulated_centroids
 from starcal_ground.simulation import scenario
 from starcal_ros.records import Ensemble
 from studies import __main__ as studies
-from studies import monte_carlo, paper, summary
+from studies import monte_carlo, paper
 from studies.paper import judge, PaperStudy, spread
 
 pytestmark = pytest.mark.slow
@@ -37,7 +37,7 @@ def ensemble() -> Ensemble:
 def found(ensemble: Ensemble) -> PaperStudy:
     design = monte_carlo.Design('table1', 2, (15,), (20,), (0.0, 20.0), ('per_image', 'single'))
     rows = itertools.chain(*(monte_carlo.run_trial(design, k) for k in range(design.trials)))
-    table1 = summary.conclude(design, rows)
+    table1 = monte_carlo.conclude(design, rows)
     return paper.study(ensemble.images, table1, seed=3)
 
 

@@ -24,15 +24,7 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.formats.bag.reader import (
-    Damage,
-    decode,
-    image_of,
-    log_damage,
-    RawMessage,
-    read_raw,
-    Topics,
-)
+from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
     latest_at,
@@ -69,7 +61,10 @@ class Telemetry:
     """Samples of attitude, velocity (m/s) and temperature (degrees Celsius), each by time."""
 
     def __init__(
-        self, topics: Topics, options: AttitudeOptions, on_damage: Damage = log_damage
+        self,
+        topics: reader.Topics,
+        options: AttitudeOptions,
+        on_damage: reader.Damage = reader.log_damage,
     ) -> None:
         self.attitudes = AttitudeHistory()
         self.more_attitudes = tuple(AttitudeHistory() for _ in topics.more_attitudes)
@@ -81,10 +76,10 @@ class Telemetry:
         self._newest_ns: dict[str, int] = {}
         self.velocities_left_out = 0  # not plausible; the first is reported
 
-    def add(self, raw: RawMessage) -> bool:
+    def add(self, raw: reader.RawMessage) -> bool:
         """Add a message, or report damage; False if its topic had a later stamp before."""
         try:
-            message = decode(raw)
+            message = reader.decode(raw)
         except BagError as error:
             self._on_damage(str(error))
             return True
@@ -153,22 +148,22 @@ class Telemetry:
 
 def read_telemetry(
     paths: Iterable[Path | str],
-    topics: Topics,
+    topics: reader.Topics,
     options: AttitudeOptions | None = None,
-    on_damage: Damage = log_damage,
+    on_damage: reader.Damage = reader.log_damage,
 ) -> Telemetry:
     """All telemetry of bags; attitudes that are not unit quaternions count as invalid."""
     telemetry = Telemetry(topics, options or AttitudeOptions(), on_damage)
-    for raw in read_raw(paths, topics.telemetry, on_damage):
+    for raw in reader.read_raw(paths, topics.telemetry, on_damage):
         telemetry.add(raw)
     return telemetry
 
 
 def read_frames(
     paths: Sequence[Path | str],
-    topics: Topics,
+    topics: reader.Topics,
     options: AttitudeOptions | None = None,
-    on_damage: Damage = log_damage,
+    on_damage: reader.Damage = reader.log_damage,
     size: tuple[int, int] | None = None,
     channel: str = '',
 ) -> Iterator[Frame | StarObservations]:
@@ -190,11 +185,11 @@ def read_frames(
     )
     waiting: deque[Image | StarObservations] = deque()
     taken: list[tuple[int, Floats]] = []
-    messages = read_raw(paths, [topics.image, *topics.telemetry], on_damage)
+    messages = reader.read_raw(paths, [topics.image, *topics.telemetry], on_damage)
     for raw in read_ahead(messages):
         in_order = True
         if raw.topic == topics.image:
-            waiting.append(image_of(raw, options.stamp_offset_s, size, channel))
+            waiting.append(reader.image_of(raw, options.stamp_offset_s, size, channel))
         elif not is_complete:
             in_order = telemetry.add(raw)
         if not is_complete and (not in_order or _is_too_much(waiting)):
@@ -226,7 +221,7 @@ def _with_telemetry(
 
 
 def _report_changed(
-    taken: Iterable[tuple[int, Floats]], telemetry: Telemetry, on_damage: Damage
+    taken: Iterable[tuple[int, Floats]], telemetry: Telemetry, on_damage: reader.Damage
 ) -> None:
     """Report images whose telemetry, now that all is read, is not that they were given."""
     changed = sum(
@@ -240,7 +235,7 @@ def _report_changed(
         )
 
 
-def read_ahead(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+def read_ahead(messages: Iterator[reader.RawMessage]) -> Iterator[reader.RawMessage]:
     """The same messages, read by another thread while those before them are in use."""
     with ThreadPoolExecutor(1, 'read-ahead') as thread:
         pending = thread.submit(_batch, messages)
@@ -250,9 +245,9 @@ def read_ahead(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
                 yield batch.popleft()
 
 
-def _batch(messages: Iterator[RawMessage]) -> deque[RawMessage]:
+def _batch(messages: Iterator[reader.RawMessage]) -> deque[reader.RawMessage]:
     """The next messages, up to a size; none at the end."""
-    batch: deque[RawMessage] = deque()
+    batch: deque[reader.RawMessage] = deque()
     size = 0
     for raw in messages:
         batch.append(raw)

@@ -14,23 +14,7 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.messages.message_codec import (
-    ALIGNMENT_TYPE,
-    CALIBRATION_TYPE,
-    CAMERA_INFO_TYPE,
-    flat_array,
-    Make,
-    make_header,
-    Message,
-    message_fields,
-    OBSERVATIONS_TYPE,
-    plain_message,
-    quaternion_to_message,
-    record_from_message,
-    record_to_message,
-    STATUS_TYPE,
-    vector_to_message,
-)
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.sensor_messages import refused_from_message
 from starcal_ros.record_fields import Named, plain_record, Quaternion, read_record
 from starcal_ros.records import (
@@ -49,21 +33,23 @@ _EXACT_VELOCITY = -1.0  # in messages: 0 is that of a sender that leaves it out
 _NOT_SENT = ('model_checks', 'statements')
 
 
-def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
+def observations_to_message(
+    record: StarObservations, frame_id: str, make: codec.Make
+) -> codec.Message:
     """Return a starcal/StarObservations; ``frame_id`` is the camera's."""
     values = plain_record(record)
     refused = values.pop('refused_stars')
     if values['velocity_sigma_m_s'] == 0:
         values['velocity_sigma_m_s'] = _EXACT_VELOCITY
     return make(
-        OBSERVATIONS_TYPE,
-        **message_fields(StarObservations, values, make, frame_id),
+        codec.OBSERVATIONS_TYPE,
+        **codec.message_fields(StarObservations, values, make, frame_id),
         refused_star_reasons=list(refused),
-        refused_star_counts=flat_array(list(refused.values()), np.uint32),
+        refused_star_counts=codec.flat_array(list(refused.values()), np.uint32),
     )
 
 
-def observations_from_message(message: Message) -> StarObservations:
+def observations_from_message(message: codec.Message) -> StarObservations:
     """
     Observations of a starcal/StarObservations.
 
@@ -73,7 +59,7 @@ def observations_from_message(message: Message) -> StarObservations:
     Raises ValueError when the arrays of the message do not fit each other or hold values that no
     star can have.
     """
-    values = plain_message(StarObservations, message)
+    values = codec.plain_message(StarObservations, message)
     reasons, counts = message.refused_star_reasons, message.refused_star_counts
     if len(reasons) != len(counts):
         raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
@@ -102,7 +88,7 @@ def _forget_zeros(values: dict[str, Any]) -> None:
     values['velocity_sigma_m_s'] = stated.get(velocity, velocity)
 
 
-def checked_observations(message: Message) -> StarObservations:
+def checked_observations(message: codec.Message) -> StarObservations:
     """
     Observations of a starcal/StarObservations, refused where they hold impossible values.
 
@@ -149,7 +135,7 @@ class Alignment:
     star_tracker_from_camera_xyzw: Annotated[Quaternion, Named('rotation')]
 
 
-def calibration_to_message(calibration: Calibration, make: Make) -> Message:
+def calibration_to_message(calibration: Calibration, make: codec.Make) -> codec.Message:
     """Return a starcal/Calibration: the record without the parts that nobody on board reads."""
     values = {k: v for k, v in plain_record(calibration).items() if k not in _NOT_SENT}
     geometry = values.pop('geometry')
@@ -157,54 +143,54 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
     camera = calibration.geometry.camera
     del geometry['camera']['field']  # the calibration holds it with its covariance
     return make(
-        CALIBRATION_TYPE,
-        **message_fields(Calibration, values, make, calibration.child_frame),
+        codec.CALIBRATION_TYPE,
+        **codec.message_fields(Calibration, values, make, calibration.child_frame),
         camera=make(
             'starcal/msg/CameraModel',
             parameter_names=list(camera.parameter_names),
-            **message_fields(CameraModel, geometry['camera'], make),
+            **codec.message_fields(CameraModel, geometry['camera'], make),
         ),
-        alignment=record_to_message(
+        alignment=codec.record_to_message(
             Alignment(*frames, geometry['star_tracker_from_camera_xyzw']), make
         ),
         parameter_names=list(calibration.parameter_names),
     )
 
 
-def calibration_from_message(message: Message) -> Calibration:
+def calibration_from_message(message: codec.Message) -> Calibration:
     """
     Calibration of a starcal/Calibration.
 
     Raises ValueError when the message does not hold a camera (an empty one does not), or its
     fields do not fit each other.
     """
-    camera = record_from_message(CameraModel, message.camera, 'camera')
+    camera = codec.record_from_message(CameraModel, message.camera, 'camera')
     for field, names, expected in (
         ('camera.parameter_names', message.camera.parameter_names, camera.parameter_names),
         ('parameter_names', message.parameter_names, camera.parameter_names + ALIGNMENT_NAMES),
     ):
         if tuple(names) != expected:
             raise ValueError(f'{field}: {", ".join(names) or "none"}, not {", ".join(expected)}')
-    alignment = record_from_message(Alignment, message.alignment, 'alignment')
+    alignment = codec.record_from_message(Alignment, message.alignment, 'alignment')
     nested = {
         'geometry': CameraGeometry(camera, alignment.star_tracker_from_camera_xyzw),
         'parent_frame': alignment.parent_frame,
         'child_frame': alignment.child_frame,
     }
-    values = plain_message(Calibration, message)
+    values = codec.plain_message(Calibration, message)
     calibration = read_record(Calibration, {**values, **nested})
     check_calibration(calibration)
     return calibration
 
 
-def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
+def camera_info_to_message(calibration: Calibration, make: codec.Make) -> codec.Message:
     """Return a sensor_msgs/CameraInfo: the best camera without skew, which readers ignore."""
     camera, _ = ros_fit(calibration.geometry.camera)
     fx, _, fy, cx, cy = camera.intrinsics
     distortion_model, D = ros_distortion(camera.model, camera.distortion)
     return make(
-        CAMERA_INFO_TYPE,
-        header=make_header(calibration.time_ns, calibration.child_frame, make),
+        codec.CAMERA_INFO_TYPE,
+        header=codec.make_header(calibration.time_ns, calibration.child_frame, make),
         height=camera.height,
         width=camera.width,
         distortion_model=distortion_model,
@@ -225,7 +211,7 @@ def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
     )
 
 
-def mountings_to_messages(calibration: Calibration, make: Make) -> list[Message]:
+def mountings_to_messages(calibration: Calibration, make: codec.Make) -> list[codec.Message]:
     """geometry_msgs/TransformStamped of each further star tracker in the frame of the first."""
     return [
         _in_star_tracker(calibration, tracker.frame, tracker.first_from_star_tracker_xyzw, make)
@@ -233,34 +219,34 @@ def mountings_to_messages(calibration: Calibration, make: Make) -> list[Message]
     ]
 
 
-def alignment_to_message(calibration: Calibration, make: Make) -> Message:
+def alignment_to_message(calibration: Calibration, make: codec.Make) -> codec.Message:
     """Return a geometry_msgs/TransformStamped: the camera frame in the star tracker frame."""
     rotation_xyzw = calibration.geometry.star_tracker_from_camera_xyzw
     return _in_star_tracker(calibration, calibration.child_frame, rotation_xyzw, make)
 
 
 def _in_star_tracker(
-    calibration: Calibration, frame: str, rotation_xyzw: Floats, make: Make
-) -> Message:
+    calibration: Calibration, frame: str, rotation_xyzw: Floats, make: codec.Make
+) -> codec.Message:
     """A frame of that orientation in the frame of the (first) star tracker."""
     return make(
-        ALIGNMENT_TYPE,
-        header=make_header(calibration.time_ns, calibration.parent_frame, make),
+        codec.ALIGNMENT_TYPE,
+        header=codec.make_header(calibration.time_ns, calibration.parent_frame, make),
         child_frame_id=frame,
         transform=make(
             'geometry_msgs/msg/Transform',
-            translation=vector_to_message(np.zeros(3), make),
-            rotation=quaternion_to_message(rotation_xyzw, make),
+            translation=codec.vector_to_message(np.zeros(3), make),
+            rotation=codec.quaternion_to_message(rotation_xyzw, make),
         ),
     )
 
 
-def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Message:
+def status_to_message(status: EnsembleStatus, frame_id: str, make: codec.Make) -> codec.Message:
     """Return a starcal/EnsembleStatus; ``frame_id`` is the camera's."""
     values = plain_record(status)
-    return make(STATUS_TYPE, **message_fields(EnsembleStatus, values, make, frame_id))
+    return make(codec.STATUS_TYPE, **codec.message_fields(EnsembleStatus, values, make, frame_id))
 
 
-def status_from_message(message: Message) -> EnsembleStatus:
+def status_from_message(message: codec.Message) -> EnsembleStatus:
     """Status of a starcal/EnsembleStatus; raises ValueError as `record_from_message`."""
-    return record_from_message(EnsembleStatus, message)
+    return codec.record_from_message(EnsembleStatus, message)

@@ -16,16 +16,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.image_headers import has_surplus, png_header, PNG_HEADER_BYTES
-from starcal_ros.formats.messages.message_codec import (
-    IMAGE_TYPE,
-    Make,
-    make_header,
-    Message,
-    nearest_stamp_ns,
-    offset_ns,
-    quaternion_from_message,
-    stamp_ns,
-)
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, refused_image, StarObservations
 
 _MOST_PIXELS = 2**27  # 256 MB of 16 bit, for a camera that is not known
@@ -50,7 +41,7 @@ _STAMP_NS = operator.itemgetter(0)
 _MAX_VELOCITY_M_S = 1e6
 
 
-def decode_image(message: Message, time_ns: int, channel: str = '') -> Image:
+def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Image:
     """
     Pixels of a sensor_msgs/Image in native byte order, without its row padding.
 
@@ -145,7 +136,7 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
 
 
 def image_from_message(
-    message: Message,
+    message: codec.Message,
     stamp_offset_s: float = 0.0,
     size: tuple[int, int] | None = None,
     channel: str = '',
@@ -158,8 +149,8 @@ def image_from_message(
 
     Raises ImageRefused ``bad_stamp``, ``bad_encoding``, ``bad_layout`` or ``wrong_size``.
     """
-    time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
-    if time_ns != nearest_stamp_ns(time_ns):
+    time_ns = codec.stamp_ns(message.header.stamp) + codec.offset_ns(stamp_offset_s)
+    if time_ns != codec.nearest_stamp_ns(time_ns):
         raise ImageRefused('bad_stamp', f'{time_ns} ns is not within the range of ROS stamps')
     if not hasattr(message, 'encoding'):
         return decode_png(message.data, time_ns, size)
@@ -167,12 +158,12 @@ def image_from_message(
 
 
 def refused_from_message(
-    message: Message, stamp_offset_s: float, refused: ImageRefused
+    message: codec.Message, stamp_offset_s: float, refused: ImageRefused
 ) -> StarObservations:
     """Return the record of a message of an image, or of its stars, that cannot be used."""
-    time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
+    time_ns = codec.stamp_ns(message.header.stamp) + codec.offset_ns(stamp_offset_s)
     return refused_image(
-        nearest_stamp_ns(time_ns),
+        codec.nearest_stamp_ns(time_ns),
         min(int(getattr(message, 'width', 0)), MAX_SIDE_PX),  # not in a compressed image
         min(int(getattr(message, 'height', 0)), MAX_SIDE_PX),
         refused.reason,
@@ -181,13 +172,13 @@ def refused_from_message(
 
 
 def color_image_to_message(
-    time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: Make
-) -> Message:
+    time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: codec.Make
+) -> codec.Message:
     """Return a sensor_msgs/Image bgr8 of a (height, width, 3) picture."""
     height, width, _ = bgr.shape
     return make(
-        IMAGE_TYPE,
-        header=make_header(time_ns, frame_id, make),
+        codec.IMAGE_TYPE,
+        header=codec.make_header(time_ns, frame_id, make),
         height=height,
         width=width,
         encoding='bgr8',
@@ -220,7 +211,7 @@ def site(letters: str, channel: str) -> tuple[int, int]:
     return i, j
 
 
-def attitude_from_message(message: Message) -> tuple[int, Floats]:
+def attitude_from_message(message: codec.Message) -> tuple[int, Floats]:
     """
     Stamp and (4,) xyzw of an attitude, as on the wire and unchecked.
 
@@ -236,11 +227,11 @@ def attitude_from_message(message: Message) -> tuple[int, Floats]:
     else:
         quaternion = message.orientation
         if message.orientation_covariance[0] == -1.0:
-            return stamp_ns(message.header.stamp), np.full(4, math.nan)
-    return stamp_ns(message.header.stamp), quaternion_from_message(quaternion)
+            return codec.stamp_ns(message.header.stamp), np.full(4, math.nan)
+    return codec.stamp_ns(message.header.stamp), codec.quaternion_from_message(quaternion)
 
 
-def velocity_from_message(message: Message) -> tuple[int, Floats]:
+def velocity_from_message(message: codec.Message) -> tuple[int, Floats]:
     """
     Stamp and (3,) m/s of a geometry_msgs/TwistStamped.
 
@@ -252,14 +243,14 @@ def velocity_from_message(message: Message) -> tuple[int, Floats]:
         raise ValueError(
             f'velocity {velocity_m_s.tolist()} m/s is not plausible for a spacecraft: left out'
         )
-    return stamp_ns(message.header.stamp), velocity_m_s
+    return codec.stamp_ns(message.header.stamp), velocity_m_s
 
 
-def temperature_from_message(message: Message) -> tuple[int, float]:
+def temperature_from_message(message: codec.Message) -> tuple[int, float]:
     """Stamp and degrees Celsius of a sensor_msgs/Temperature; NaN where it is not finite."""
     temperature_degc = float(message.temperature)
     known = math.isfinite(temperature_degc)
-    return stamp_ns(message.header.stamp), temperature_degc if known else math.nan
+    return codec.stamp_ns(message.header.stamp), temperature_degc if known else math.nan
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:

@@ -65,8 +65,8 @@ class _CameraInfo:
         return camera
 
 
-def _camera_of_mrcal(text: str) -> CameraModel:
-    """Return the camera of a .cameramodel of mrcal; its extrinsics are not read."""
+def _values_of_mrcal(text: str) -> Mapping[str, Any]:
+    """Keys of a camera YAML from a .cameramodel of mrcal; its extrinsics are not read."""
     content = ast.literal_eval(text[text.index('{') :])
     name, values = str(content['lensmodel']), [float(x) for x in content['intrinsics']]
     width, height = content['imagersize']
@@ -76,21 +76,19 @@ def _camera_of_mrcal(text: str) -> CameraModel:
     if len(values) != 4 + count:
         raise ValueError(f'intrinsics: {len(values)} numbers, {name} has {4 + count}')
     fx, fy, cx, cy = values[:4]
-    distortion_model = 'plumb_bob' if count <= 5 else 'rational_polynomial'
-    matrix = _Matrix((fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0))
-    padded = tuple(values[4:]) + (0.0,) * max(0, 5 - count)
-    return _CameraInfo(
-        int(width), int(height), matrix, _Coefficients(padded), distortion_model
-    ).camera()
+    K, D = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], values[4:] + [0.0] * max(0, 5 - count)
+    return _values(width, height, K, D, 'plumb_bob' if count <= 5 else 'rational_polynomial')
 
 
 def _camera_info_values(text: str) -> Mapping[str, Any]:
     """
     Keys of a ROS camera YAML, from one or from another form of the same camera.
 
-    These are a file of ``cv2.FileStorage``, a camchain of kalibr with one camera, and a printed
-    ``CameraInfo`` message.
+    These are a file of ``cv2.FileStorage``, a camchain of kalibr with one camera, a camera model
+    of mrcal, and a printed ``CameraInfo`` message.
     """
+    if _IS_MRCAL.search(text):
+        return _values_of_mrcal(text)
     if text.startswith('%YAML:1.0'):  # neither OpenCV's first line nor its tag is YAML
         text = text.partition('\n')[2].replace('!!opencv-matrix', '')
     content = yaml_value(text)
@@ -146,8 +144,6 @@ def read_camera_info(location: str | Path) -> CameraModel:
     path = resolve_url(location) if isinstance(location, str) else location
     text = read_text(path, PARAMETER_BYTES)
     try:
-        if _IS_MRCAL.search(text):
-            return _camera_of_mrcal(text)
         return read_record(_CameraInfo, _camera_info_values(text)).camera()
     except (ValueError, KeyError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         words = ' '.join(f'{error}'.split())
@@ -157,8 +153,7 @@ def read_camera_info(location: str | Path) -> CameraModel:
 def read_camera_name(location: str | Path) -> str:
     """The ``camera_name`` in a ROS camera YAML that `read_camera_info` accepts."""
     path = resolve_url(location) if isinstance(location, str) else location
-    text = read_text(path, PARAMETER_BYTES)
-    name = None if _IS_MRCAL.search(text) else _camera_info_values(text).get('camera_name')
+    name = _camera_info_values(read_text(path, PARAMETER_BYTES)).get('camera_name')
     return name if isinstance(name, str) and name else DEFAULT_CAMERA_NAME
 
 

@@ -289,6 +289,62 @@ def test_the_most_informative_images_are_kept() -> None:
     assert min(len(image) for image in kept.images) > 100
 
 
+def least_mean_variance(information: np.ndarray, count: int, unit: np.ndarray) -> float:
+    """
+    Lower bound of the mean variance from ``count`` of the images (m, k, k), in ``unit`` (k,)^2.
+
+    A-optimal design, relaxed to weights: convex, so a tangent at any weights is a lower bound.
+    Frank-Wolfe: the minimum of a tangent is a choice of ``count`` whole images.
+    """
+    scaled = information * unit[:, None] * unit[None, :]
+    weight = np.full(len(scaled), count / len(scaled))
+    best = 0.0
+    for step in range(400):  # a gap of some 0.1 %
+        inverse = np.linalg.inv(np.einsum('m,mij->ij', weight, scaled))
+        gradient = -np.einsum('ij,mjk,ki->m', inverse, scaled, inverse)
+        least = np.argsort(gradient)[:count]
+        best = max(best, np.trace(inverse) - gradient @ weight + gradient[least].sum())
+        vertex = np.isin(np.arange(len(scaled)), least)
+        weight += (vertex - weight) * 2.0 / (step + 2.0 + count)
+    return best / len(unit)
+
+
+@pytest.mark.parametrize(
+    ('m', 'count'),
+    [(30, 8), pytest.param(359, 60, marks=[pytest.mark.slow, pytest.mark.packaging])],
+)
+def test_images_kept_from_a_stream_are_nearly_the_best_choice(m: int, count: int) -> None:
+    """Within 5 % in sigma of what any choice reaches, and better than a random one."""
+    night = dataclasses.replace(
+        scenario('paper'), image_count=m, cadence_s=86000.0 / m, magnitude_limit=6.65
+    )
+    everything, prior = true_observations(night, 0.1), night.prior
+    options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0,) * 3, max_images=count)
+    whole = predicted_sigma(everything, prior, options)
+    information = image_information(everything.images, prior, options)
+    best = np.sqrt(least_mean_variance(information, count, whole))
+
+    def relative(sigma: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((sigma / whole) ** 2)))
+
+    streamed = Ensemble()
+    for image in everything.images:
+        streamed = keep_most_informative(streamed.add(image), prior, options)
+    kept = relative(predicted_sigma(streamed, prior, options))
+    rng = np.random.default_rng(1)
+    at_random = np.mean(
+        [
+            relative(np.sqrt(np.diag(np.linalg.inv(information[rows].sum(axis=0)))))
+            for rows in (rng.choice(m, count, replace=False) for _ in range(200))
+        ]
+    )
+    # A lower bound is under every choice; 1e-9 is its rounding.
+    assert best * (1.0 - 1e-9) < kept < 1.05 * best
+    at_once = predicted_sigma(keep_most_informative(everything, prior, options), prior, options)
+    assert best * (1.0 - 1e-9) < relative(at_once)
+    assert kept < at_random
+
+
 def test_the_image_that_is_left_out_is_worth_least() -> None:
     """By the definition, in units in which all unknowns are of one size."""
     images = tuple(
