@@ -28,7 +28,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.levenberg_marquardt import covariance
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.problem import Problem, State
+from starcal_ros.estimation.problem import cross_matrix, Problem, State
 from starcal_ros.estimation.search import minimise
 from starcal_ros.estimation.star_equations import arrange, Measurements, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
@@ -143,22 +143,17 @@ def estimate_starcal(case: Case) -> Answer:
 
 def _rotation_jacobian(theta: Floats) -> tuple[Floats, Floats]:
     """
-    Rotations (..., 3, 3) by passive angles (..., 3), and the small rotation (..., 3, 3) by them.
+    Rotations (m, 3, 3) by passive angles (m, 3), and the small rotation (m, 3, 3) by them.
 
     ``exp(-[theta + d]) = exp(-[L d]) exp(-[theta])``, L the left Jacobian of SO(3) at -theta.
     """
-    angle2 = np.maximum((theta**2).sum(axis=-1), 1e-24)[..., None, None]
-    angle = np.sqrt(angle2)
-    x, y, z = np.moveaxis(-theta, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    K = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    K2 = K @ K
+    angle2 = np.maximum((theta**2).sum(axis=-1), 1e-24)[:, None, None]
+    angle, K = np.sqrt(angle2), cross_matrix(-theta)
     # 1 - cos as a square, to keep precision at small angles.
     versine = 2.0 * np.sin(0.5 * angle) ** 2 / angle2
-    rotation = np.eye(3) + np.sin(angle) / angle * K + versine * K2
     cubic = np.where(angle2 < 1e-8, 1.0 / 6.0, (angle - np.sin(angle)) / (angle * angle2))
-    return rotation, np.eye(3) + versine * K + cubic * K2
+    L = np.eye(3) + versine * K + cubic * K @ K
+    return Rotation.from_rotvec(-theta).as_matrix(), L
 
 
 def solve_scipy(case: Case) -> Answer:
@@ -221,7 +216,7 @@ def solve_ceres(case: Case) -> Answer:
         def Evaluate(self, blocks: Any, residuals: Floats, jacobians: Any) -> bool:
             """Write residuals in sigma, and derivatives if requested."""
             parameters = case.with_free(blocks[0])
-            rotation, L = _rotation_jacobian(blocks[1])
+            (rotation,), (L,) = _rotation_jacobian(blocks[1][None])
             directions = self.base @ rotation.T
             if jacobians is None:
                 predicted_px = project_parameters('plumb_bob', parameters, directions)

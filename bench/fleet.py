@@ -98,25 +98,26 @@ def of_bags(folder: Path, count: int, alone: int) -> Table:
     rows = Rows(output).rows()
     efficiency = count * (before_s + after_s) / 2 / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
+    values: dict[str, float] = {
+        'one bag alone, before, s': before_s,
+        'one bag alone, after, s': after_s,
+        f'{count} bags, s': wall_s,
+        'efficiency': efficiency,
+        'clients killed with SIGKILL': 1,
+        'workers killed with SIGKILL': watch.killed,
+        'bags lost': sum(task.stamp not in stamps for task in found),
+        'bags counted twice': sum(n > 1 for n in stamps.values()),
+        'bags failed': sum(bool(row.error) for row in rows),
+        'calibrations lost or left over': len(
+            set(kept(output)) ^ {output / KEPT_FOLDER / kept_name(row) for row in rows}
+        ),
+    }
+    for who, of_row in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
+        tenth = max(1, len(of_row) // 10)
+        values[f'{who}, second tenth, MB'] = statistics.mean(of_row[tenth : 2 * tenth])
+        values[f'{who}, last tenth, MB'] = statistics.mean(of_row[-tenth:])
     title = f'starcal trend over {count} bags with {_WORKERS} workers'
-    made = Table(title, ('quantity', 'value'))
-    made.add('one bag alone, before, s', before_s)
-    made.add('one bag alone, after, s', after_s)
-    made.add(f'{count} bags, s', wall_s)
-    made.add('efficiency', efficiency)
-    made.add('clients killed with SIGKILL', 1)
-    made.add('workers killed with SIGKILL', watch.killed)
-    made.add('bags lost', sum(task.stamp not in stamps for task in found))
-    made.add('bags counted twice', sum(n > 1 for n in stamps.values()))
-    made.add('bags failed', sum(bool(row.error) for row in rows))
-    made.add(
-        'calibrations lost or left over',
-        len(set(kept(output)) ^ {output / KEPT_FOLDER / kept_name(row) for row in rows}),
-    )
-    for who, values in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
-        tenth = max(1, len(values) // 10)
-        made.add(f'{who}, second tenth, MB', statistics.mean(values[tenth : 2 * tenth]))
-        made.add(f'{who}, last tenth, MB', statistics.mean(values[-tenth:]))
+    made = Table(title, ('quantity', 'value'), list(values.items()))
     made.notes.append(f'efficiency {verdict(efficiency, LEAST_EFFICIENCY)}')
     return made
 

@@ -68,11 +68,9 @@ def start(
 
 
 @contextlib.contextmanager
-def running(
-    name: str, params: Path, log: Path, *values: str, node: str = ''
-) -> Iterator[subprocess.Popen[bytes]]:
+def running(name: str, params: Path, log: Path, *values: str) -> Iterator[subprocess.Popen[bytes]]:
     """Context manager of a node process; stops it at the end."""
-    process = start(name, params, log, *values, node=node)
+    process = start(name, params, log, *values)
     try:
         yield process
     finally:
@@ -148,14 +146,14 @@ class Client:
         qos = _qos(1 if latched else 5000, latched)
         return self.node.create_subscription(kind, topic, take, qos)
 
-    def publisher(self, kind: Any, topic: str, depth: int = 1000, latched: bool = False) -> Any:
+    def publisher(self, kind: Any, topic: str, depth: int = 1000) -> Any:
         """Publisher with at least one matched subscriber."""
-        publisher = self.node.create_publisher(kind, topic, _qos(depth, latched))
+        publisher = self.node.create_publisher(kind, topic, _qos(depth))
         self.until(publisher.get_subscription_count, f'a listener of {topic}')
         return publisher
 
 
-def _qos(depth: int, latched: bool) -> Any:
+def _qos(depth: int, latched: bool = False) -> Any:
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
