@@ -27,7 +27,7 @@ from bench.table import Table
 from bench.trials import in_processes, rms
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
-from starcal_ground.mission.ingest.gaia_catalog import catalog_file, integer_columns
+from starcal_ground.mission.ingest.deep_catalog import catalog_file, integer_columns
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic

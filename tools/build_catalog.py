@@ -41,9 +41,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from starcal_ground.mission.ingest.gaia_catalog import (
+from starcal_ground.mission.ingest.deep_catalog import (
     catalog_file,
     close_pairs,
+    index_stars,
     integer_columns,
     johnson_v,
     marked_close,
@@ -145,19 +146,11 @@ def read_solutions(content: bytes) -> Solutions:
 
 
 def read_tycho(path: Path) -> Places:
-    """Read positions at J2000 and VT from an Astrometry.net index: u32 steps in a unit cube."""
-    content = checked(path.name, path.read_bytes())
-    with fits.open(io.BytesIO(content)) as file:
-        table = {hdu.columns.names[0]: hdu.data for hdu in file[1:] if len(hdu.columns)}
-
-        def column(name: str, kind: str) -> NDArray[np.generic]:
-            return np.frombuffer(np.asarray(table[name]).tobytes(), kind)
-
-        box = column('kdtree_range_stars', '<f8').astype(np.float64)
-        steps = column('kdtree_data_stars', '<u4').astype(np.float64).reshape(-1, 3)
-        magnitude = column('MAG_VT', '>f4').astype(np.float64)
-    direction = box[:3] + steps / box[6]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    """Read positions at J2000 and VT from an Astrometry.net index."""
+    with fits.open(io.BytesIO(checked(path.name, path.read_bytes()))) as file:
+        stars = index_stars(file)
+    direction = erfa.s2c(*np.radians([stars['ra'], stars['dec']]))
+    magnitude = stars['mag_vt'].astype(np.float64)
     bright = magnitude < MAGNITUDE_LIMIT + 1.8
     return Places(direction[bright], magnitude[bright])
 

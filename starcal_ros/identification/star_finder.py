@@ -34,7 +34,7 @@ from starcal_ros.identification.prediction import (
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
-from starcal_ros.sky.astrometry import EARTH, SiteOptions, Velocity
+from starcal_ros.sky.astrometry import EARTH, julian_year, SiteOptions, Velocity
 from starcal_ros.sky.catalog import StarCatalog
 from starcal_ros.stars.centroiding import Centroids, measure_stars, with_faint
 from starcal_ros.stars.detection import (
@@ -246,6 +246,8 @@ def _observations(
     few = measured < _MIN_STARS
     if few:
         good = np.zeros_like(good)
+    sigma_rad = catalog.place_sigma_rad(index[good], julian_year(exposure.image.time_ns))
+    place_px2 = (sigma_rad * prediction.px_per_rad) ** 2
     return StarObservations(
         time_ns=exposure.image.time_ns,
         width=width,
@@ -258,7 +260,7 @@ def _observations(
         direction_icrf=prediction.direction_icrf[good],
         magnitude=catalog.magnitude[index][good].astype(np.float32),
         measured_px=centroids.xy_px[good],
-        covariance_px2=centroids.covariance_px2[good],
+        covariance_px2=centroids.covariance_px2[good] + np.outer(place_px2, [1.0, 0.0, 1.0]),
         flux_dn=centroids.flux_dn[good].astype(np.float32),
         snr=centroids.snr[good].astype(np.float32),
         refused_stars=dict(zip(names, counts.tolist(), strict=True)),
