@@ -25,6 +25,7 @@ from starcal_ros.errors import CatalogError
 from starcal_ros.untrusted import read_archive
 
 CATALOG_PATH = Path(__file__).parent / 'data' / 'star_catalog.npz'
+BUNDLED_MAGNITUDE = 9.0  # V, to which it has all stars
 CATALOG_FORMAT = 1
 CATALOG_EPOCH_JYEAR = 2016.0  # J2016.0 TCB, Gaia Collaboration 2023, A&A 674, A1
 
@@ -295,3 +296,16 @@ def cone(
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
     return rows
+
+
+def sky_circle(direction_icrs: Floats, radius_rad: float) -> str:
+    """Centre and radius of the sky within a radius of directions (n, 3), for a query."""
+    axis = direction_icrs.mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    apart_rad = np.arccos(np.clip(direction_icrs @ axis, -1.0, 1.0)).max()
+    ra_deg, dec_deg = (
+        math.degrees(math.atan2(axis[1], axis[0])) % 360.0,
+        math.degrees(math.asin(axis[2])),
+    )
+    radius_deg = math.degrees(apart_rad + radius_rad + CONE_MARGIN_RAD)
+    return f'RA {ra_deg:.2f}, Dec {dec_deg:+.2f}, radius {radius_deg:.2f} deg'
