@@ -7,6 +7,7 @@ from collections import Counter
 import dataclasses
 import os
 from pathlib import Path
+import re
 from typing import Any
 
 from astropy import units
@@ -221,6 +222,16 @@ def test_places_of_other_coordinates_are_named(tmp_path: Path, from_icrs: Any, w
     given.write(tmp_path / 'a.fits')
     with pytest.raises(CatalogError, match=words):
         deep_catalog(tmp_path / 'a.fits')
+
+
+def test_the_document_names_the_columns_of_each_source() -> None:
+    text = (Path(__file__).parents[4] / 'docs' / 'mission.md').read_text()
+    rows = dict(
+        re.findall(r'^\| ([^|]+) \| ((?:`[^|]+`(?:, )?)+) \| .*20\d\d', text, re.MULTILINE)
+    )
+    for title, names, _, _ in SOURCES:
+        ours = set(names.values()) - ({'ra', 'dec'} if title.endswith(('4100', '4200')) else set())
+        assert ours <= {name.strip('`') for name in rows[title].split(', ')}, title
 
 
 def test_a_field_without_bright_stars_is_taken_unchecked(tmp_path: Path) -> None:
