@@ -54,45 +54,40 @@ def _of_2mass(j: Floats, j_k: Floats) -> Floats:
 
 
 class _Source(NamedTuple):
-    """
-    Names of the columns of a source, in lower case, empty for one that it has not.
-
-    The colour is a column, or the first less the second.  ``jyear`` is the epoch of its places
-    without a column of it.  Stars without a number have one of their places.
-    """
+    """Columns of a source by their keys, lower case, and the epoch of places without a column."""
 
     title: str
-    number: str
-    ra: str
-    dec: str
-    pm_ra: str
-    pm_dec: str
-    parallax: str
-    magnitude: str
-    colour: tuple[str, ...]
-    epoch: str
+    columns: Mapping[str, str]
     jyear: float
     motion: MotionSource
     v: Callable[[Floats, Floats], Floats]
 
 
+def _source(title: str, names: str, jyear: float, motion: MotionSource, v: Any) -> _Source:
+    """A source whose columns are named in the order of the keys, - where it has none."""
+    keys = ('number', 'ra', 'dec', 'pm_ra', 'pm_dec', 'parallax', 'magnitude', 'colour', 'blue',
+            'red', 'epoch')  # fmt: skip
+    pairs = zip(keys, names.split(), strict=True)
+    return _Source(title, {key: name for key, name in pairs if name != '-'}, jyear, motion, v)
+
+
 _GAIA, _TYCHO, _NONE = MotionSource.GAIA, MotionSource.TYCHO, MotionSource.UNKNOWN
+# A source without a colour has the difference of two bands; stars without a number, their places.
 _SOURCES = (
-    _Source('Gaia, archive', 'source_id', 'ra', 'dec', 'pmra', 'pmdec', 'parallax',
-            'phot_g_mean_mag', ('bp_rp',), 'ref_epoch', 2016.0, _GAIA, johnson_v),
-    _Source('Gaia DR3, VizieR I/355', 'source', 'ra_icrs', 'de_icrs', 'pmra', 'pmde', 'plx',
-            'gmag', ('bp-rp',), '', 2016.0, _GAIA, johnson_v),
-    _Source('Gaia DR2, astrometry.net 5000', 'source_id', 'ra', 'dec', 'pmra', 'pmdec', 'parallax',
-            'phot_g_mean_mag', ('phot_bp_mean_mag', 'phot_rp_mean_mag'), 'ref_epoch', 2015.5,
-            _GAIA, johnson_v),
-    _Source('Tycho-2, VizieR I/259', '', 'ramdeg', 'demdeg', 'pmra', 'pmde', '',
-            'vtmag', ('btmag', 'vtmag'), '', 2000.0, _TYCHO, _of_tycho),
-    _Source('Tycho-2, astrometry.net 4100', '', 'ra', 'dec', '', '', '',
-            'mag_vt', (), '', 2000.0, _NONE, _of_tycho),
-    _Source('2MASS, VizieR II/246', '', 'raj2000', 'dej2000', '', '', '',
-            'jmag', ('jmag', 'kmag'), '', 2000.0, _NONE, _of_2mass),
-    _Source('2MASS, astrometry.net 4200', '', 'ra', 'dec', '', '', '',
-            'j_mag', (), '', 2000.0, _NONE, _of_2mass),
+    _source('Gaia, archive', 'source_id ra dec pmra pmdec parallax phot_g_mean_mag bp_rp - -'
+            ' ref_epoch', 2016.0, _GAIA, johnson_v),
+    _source('Gaia DR3, VizieR I/355', 'source ra_icrs de_icrs pmra pmde plx gmag bp-rp - - -',
+            2016.0, _GAIA, johnson_v),
+    _source('Gaia DR2, astrometry.net 5000', 'source_id ra dec pmra pmdec parallax phot_g_mean_mag'
+            ' - phot_bp_mean_mag phot_rp_mean_mag ref_epoch', 2015.5, _GAIA, johnson_v),
+    _source('Tycho-2, VizieR I/259', '- ramdeg demdeg pmra pmde - vtmag - btmag vtmag -',
+            2000.0, _TYCHO, _of_tycho),
+    _source('Tycho-2, astrometry.net 4100', '- ra dec - - - mag_vt - - - -',
+            2000.0, _NONE, _of_tycho),
+    _source('2MASS, VizieR II/246', '- raj2000 dej2000 - - - jmag - jmag kmag -',
+            2000.0, _NONE, _of_2mass),
+    _source('2MASS, astrometry.net 4200', '- ra dec - - - j_mag - - - -',
+            2000.0, _NONE, _of_2mass),
 )  # fmt: skip
 _J2000_JD = (2451545.0, 0.0)
 _FRAMES: Mapping[str, Callable[..., Any]] = {
@@ -112,7 +107,7 @@ _RANGES = {
     'colour': ('mag', -8.0, 12.0),
     'epoch': ('yr', 1980.0, 2050.0),
 }
-_NEEDED = ('ra', 'dec', 'magnitude')
+_NEEDED = ('number', 'ra', 'dec', 'magnitude')
 _MOST_COLUMNS = 1000  # gaia_source has 152
 _MOST_ROWS = 10_000_000  # of Parquet, whose rows may take no space in the file: V = 13 of all sky
 _PROCESSOR_S, _WALL_S = 60.0, 120.0  # three million rows of a VOTable in text
@@ -190,7 +185,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
     checked = _check(path, table, bundled)
     kept = ~np.isin(bundled.id, stars['id'])
     # Of stars without a number of Gaia, or with another one in the bundled catalog.
-    apart, _ = cKDTree(_at(bundled, table.jyear)[kept]).query(_direction(stars))
+    apart, _ = cKDTree(_at(bundled, table.jyear)[0][kept]).query(_direction(stars))
     new = apart > _SAME_STAR_RAD
     values = {
         name: np.concatenate([values[new], getattr(bundled, name)[kept]])
@@ -246,7 +241,7 @@ def _check(path: Path, table: _Table, bundled: sky_catalog.StarCatalog) -> int:
 
     Raises CatalogError where bright stars are missing, or are at different places.
     """
-    stars, then = table.stars, _at(bundled, table.jyear)
+    stars, (then, motion) = table.stars, _at(bundled, table.jyear)
     direction = _direction(stars)
     _, mine, theirs = np.intersect1d(stars['id'], bundled.id, return_indices=True)
     if len(mine) < _FEWEST:
@@ -256,33 +251,33 @@ def _check(path: Path, table: _Table, bundled: sky_catalog.StarCatalog) -> int:
             there = erfa.s2c(*to_icrs(stars['ra_rad'], stars['dec_rad']))
             if len(_alike(there, then, stars['magnitude'], bundled)[0]) >= _FEWEST:
                 off_deg = math.degrees(median(np.linalg.norm(there - direction, axis=1)))
-                raise CatalogError(
-                    f'{path}: its stars are {off_deg:.2f} degrees off those of the bundled'
-                    f' catalog: {frame}: give ICRS'
-                )
+                raise CatalogError(_off(path, f'{off_deg:.2f} degrees', f'{frame}: give ICRS'))
         raise CatalogError(
             f'{path}: none of its {len(direction)} stars is at the place of a star of the bundled'
             ' catalog, which has all to V = 9, and as bright: give ra and dec in degrees, ICRS,'
             ' magnitudes as in the source, and the bright stars of the field too'
         )
-    off = _on_sky(direction[mine] - then[theirs], then[theirs])
-    years, turned_rad, off_rad = 0.0, 0.0, median(np.hypot(*off.T)) if len(mine) else 0.0
+    off = direction[mine] - then[theirs]
+    off_rad = median(np.linalg.norm(off, axis=1)) if len(mine) else 0.0
+    years = turned_rad = 0.0
     if len(mine) >= _FEWEST:
-        years, turned_rad = _epoch_and_turn(off, then[theirs], bundled.select(theirs))
-    causes = {
-        f'of J{table.epoch + years:.1f}, not J{table.epoch:.1f}: state their epoch in a column'
-        ' ref_epoch': abs(years) / _MOST_YEARS,
-        f'turned by {turned_rad / ARCSECOND_RAD:.2f} arcsec: give ICRS, not another frame or'
-        ' equinox': turned_rad / _MOST_TURN_RAD,
-        'neither turned nor of another epoch as a whole': off_rad / _MOST_OFF_RAD,
-    }
-    cause = max(causes, key=lambda name: min(causes[name], 1e3))
-    if causes[cause] > 1.0:
-        raise CatalogError(
-            f'{path}: its stars are {off_rad / ARCSECOND_RAD:.2f} arcsec off those of the bundled'
-            f' catalog: {cause}'
-        )
+        years, turned_rad = _epoch_and_turn(off, then[theirs], motion[theirs])
+    epoch, turned_arcsec = table.epoch + years, turned_rad / ARCSECOND_RAD
+    epochs = f'of J{epoch:.1f}, not J{table.epoch:.1f}: state their epoch in a column ref_epoch'
+    turned = f'turned by {turned_arcsec:.2f} arcsec: give ICRS, not another frame or equinox'
+    share, cause = max(
+        (abs(years) / _MOST_YEARS, epochs),
+        (turned_rad / _MOST_TURN_RAD, turned),
+        (off_rad / _MOST_OFF_RAD / 1e3, 'neither turned nor of another epoch as a whole'),
+    )
+    if max(share, off_rad / _MOST_OFF_RAD) > 1.0:
+        raise CatalogError(_off(path, f'{off_rad / ARCSECOND_RAD:.2f} arcsec', cause))
     return len(mine)
+
+
+def _off(path: Path, by: str, cause: str) -> str:
+    """Return the sentence on a table whose stars are at other places."""
+    return f'{path}: its stars are {by} off those of the bundled catalog: {cause}'
 
 
 def _alike(
@@ -295,29 +290,29 @@ def _alike(
     return mine, row[mine]
 
 
-def _epoch_and_turn(
-    off: Floats, direction: Floats, bundled: sky_catalog.StarCatalog
-) -> tuple[float, float]:
+def _epoch_and_turn(off: Floats, direction: Floats, motion: Floats) -> tuple[float, float]:
     """
-    Error of the epoch, years, and rotation, rad, that offsets (n, 2) of stars show; else zeros.
+    Error of the epoch, years, and rotation, rad, that offsets (n, 3) of stars show; else zeros.
 
     A robust fit of both, which at five sigma or less are zero.
     """
-    motion = np.stack([bundled.pm_ra_cosdec_rad_per_year, bundled.pm_dec_rad_per_year], axis=-1)
-    turns = [_on_sky(np.cross(axis, direction), direction) for axis in np.eye(3)]
-    A = np.stack([motion, *turns], axis=-1).reshape(-1, 4)
+    A = np.stack([motion, *np.cross(np.eye(3)[:, None], direction)], axis=-1).reshape(-1, 4)
     scale = np.linalg.norm(A, axis=0) + 1e-30
-    b, weight = off.ravel(), np.ones(off.size)
+    A, b, weight = A / scale, off.ravel(), np.ones(off.size)
     for _ in range(10):
-        N = np.linalg.pinv((A / scale).T @ ((A / scale) * weight[:, None]), rcond=1e-9)
-        x = N @ ((A / scale).T @ (weight * b))
-        residual = b - A / scale @ x
-        sigma = max(1.5 * median(np.abs(residual)), 1e-3 * ARCSECOND_RAD)
+        N = np.linalg.pinv(A.T @ (A * weight[:, None]), rcond=1e-9)
+        x = N @ (A.T @ (weight * b))
+        residual = b - A @ x
+        # Of three axes one is along the line of sight.
+        sigma = max(2.0 * median(np.abs(residual)), 1e-3 * ARCSECOND_RAD)
         weight = 1.0 / (1.0 + (residual / (3.0 * sigma)) ** 2) ** 2
-    years = x[0] / scale[0] if abs(x[0]) > _SIGMAS * sigma * math.sqrt(N[0, 0]) else 0.0
-    turn = np.hypot(*(A[:, 1:] / scale[1:] @ x[1:]).reshape(-1, 2).T)
-    chi2 = x[1:] @ np.linalg.pinv(N[1:, 1:], rcond=1e-9) @ x[1:]
-    return float(years), float(median(turn)) if chi2 > (_SIGMAS * sigma) ** 2 else 0.0
+    turn = np.linalg.norm((A[:, 1:] @ x[1:]).reshape(-1, 3), axis=1)
+    chi2 = float(x[1:] @ np.linalg.pinv(N[1:, 1:], rcond=1e-9) @ x[1:])
+    has_epoch, has_turn = (
+        x[0] ** 2 > N[0, 0] * (_SIGMAS * sigma) ** 2,
+        chi2 > (_SIGMAS * sigma) ** 2,
+    )
+    return has_epoch * float(x[0] / scale[0]), has_turn * median(turn)
 
 
 def _covers(direction: Floats, bright: Floats) -> bool:
@@ -328,27 +323,12 @@ def _covers(direction: Floats, bright: Floats) -> bool:
     return bool((apart < max(float(np.quantile(nearest, 0.9)), _NEAR_RAD)).any())
 
 
-def _on_sky(vectors: Floats, direction: Floats) -> Floats:
-    """Parts (n, 2) of small vectors (n, 3) to the east and to the north at directions (n, 3)."""
-    east, north = _axes(direction)
-    return np.stack([(vectors * east).sum(axis=-1), (vectors * north).sum(axis=-1)], axis=-1)
-
-
-def _axes(direction: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors (n, 3) to the east and to the north."""
-    x, y, _ = direction.T
-    east: Floats = np.stack([-y, x, np.zeros(len(x))], axis=-1)
-    east /= np.maximum(np.linalg.norm(east, axis=1, keepdims=True), 1e-12)
-    return east, np.asarray(np.cross(direction, east))
-
-
-def _at(catalog: sky_catalog.StarCatalog, jyear: float) -> Floats:
-    """Unit vectors (n, 3) of the stars of a catalog in a Julian year."""
-    east, north = _axes(catalog.direction_icrs)
-    motion = east * catalog.pm_ra_cosdec_rad_per_year[:, None]
-    motion += north * catalog.pm_dec_rad_per_year[:, None]
-    there = catalog.direction_icrs + (jyear - catalog.epoch_jyear) * motion
-    return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True))
+def _at(catalog: sky_catalog.StarCatalog, jyear: float) -> tuple[Floats, Floats]:
+    """Directions (n, 3) of the stars of a catalog in a Julian year, and their motions in one."""
+    ra_rate = catalog.pm_ra_cosdec_rad_per_year / np.cos(catalog.dec_rad)
+    place = catalog.ra_rad, catalog.dec_rad, 1.0
+    pv = erfa.s2pv(*place, ra_rate, catalog.pm_dec_rad_per_year, 0.0)
+    return pv['p'] + (jyear - catalog.epoch_jyear) * pv['v'], pv['v']
 
 
 def _direction(stars: Mapping[str, NDArray[Any]]) -> Floats:
@@ -415,43 +395,36 @@ def _rows(path: Path) -> tuple[_Source, Indices, dict[str, Floats], dict[str, in
     table = _table(path)
     there = {name.lower(): name for name in table.colnames}
     source = max(_SOURCES, key=lambda row: _match(row, there))
-    lacking = [name for name in _needed(source) if name not in there]
-    if lacking:
+    names = source.columns
+    if lacking := [names[key] for key in _NEEDED if names.get(key, '') not in {'', *there}]:
         titles = '; '.join(row.title for row in _SOURCES)
         raise IngestError(f'{path}: no column {", ".join(lacking)}: give a table of {titles}')
 
-    def column(name: str, unit: str) -> Floats:
-        if name not in there:
+    def column(key: str, unit: str = 'mag') -> Floats:
+        name = there.get(names.get(key, ''), '')
+        if not name:
             return np.full(len(table), np.nan)
-        numbers = _numbers(path, table, there[name], 'iuf')
-        return _in_unit(numbers, table[there[name]].unit, unit)
+        return _in_unit(_numbers(path, table, name, 'iuf'), table[name].unit, unit)
 
-    values = {
-        key: column(getattr(source, key), unit)
-        for key, (unit, _, _) in _RANGES.items()
-        if key != 'colour'
-    }
-    colour = [column(name, 'mag') for name in source.colour] or [column('', 'mag')]
-    values['colour'] = colour[0] if len(colour) == 1 else colour[0] - colour[1]
+    values = {key: column(key, unit) for key, (unit, _, _) in _RANGES.items()}
+    if 'blue' in names:
+        values['colour'] = column('blue') - column('red')
     reasons: dict[str, Mask] = {}
-    if source.number:
-        number = _numbers(path, table, there[source.number], 'iu')
-        identifier = _masked.filled(number, 0)
+    if 'number' in names:
+        identifier = _masked.filled(_numbers(path, table, there[names['number']], 'iu'), 0)
         reasons['without a number'] = (identifier < 1) | (identifier > np.iinfo(np.int64).max)
     for key, (unit, low, high) in _RANGES.items():
-        name = ' - '.join(source.colour) if key == 'colour' else getattr(source, key)
+        name, value = names.get(key, key), values[key]
         if key in _NEEDED:
-            reasons[f'without {name}'] = np.isnan(values[key])
-        reasons[f'{name} outside {low:g} to {high:g} {unit}'] = (values[key] < low) | (
-            values[key] > high
-        )
+            reasons[f'without {name}'] = np.isnan(value)
+        reasons[f'{name} outside {low:g} to {high:g} {unit}'] = (value < low) | (value > high)
     kept, refused = np.ones(len(table), np.bool_), {}
     for reason, is_bad in reasons.items():
         refused[reason] = int((kept & is_bad).sum())
         kept &= ~is_bad
     rows = np.flatnonzero(kept)
     values = {key: value[rows] for key, value in values.items()}
-    stars = identifier[rows] if source.number else _numbers_of_places(values)
+    stars = identifier[rows] if 'number' in names else _numbers_of_places(values)
     first = np.unique(stars, return_index=True)[1]
     refused['with a number twice'] = len(rows) - len(first)
     refused = {reason: count for reason, count in refused.items() if count}
@@ -460,21 +433,11 @@ def _rows(path: Path) -> tuple[_Source, Indices, dict[str, Floats], dict[str, in
     return source, stars[first].astype(np.int64), {k: v[first] for k, v in values.items()}, refused
 
 
-def _needed(source: _Source) -> list[str]:
-    """Names of the columns without which a table is not of a source."""
-    return [name for name in (source.number, source.ra, source.dec, source.magnitude) if name]
-
-
-def _others(source: _Source) -> list[str]:
-    """Names of the other columns of a source."""
-    names = (source.pm_ra, source.pm_dec, source.parallax, source.epoch, *source.colour)
-    return [name for name in names if name]
-
-
 def _match(source: _Source, there: Mapping[str, str]) -> tuple[bool, int]:
     """Return whether a table has the columns that a source needs, and how many in all."""
-    needed = [name in there for name in _needed(source)]
-    return all(needed), sum(needed) + sum(name in there for name in _others(source))
+    names = source.columns
+    needed = all(names[key] in there for key in _NEEDED if key in names)
+    return needed, sum(name in there for name in names.values())
 
 
 def _numbers_of_places(values: Mapping[str, Floats]) -> Indices:
@@ -555,9 +518,9 @@ def _parquet(path: Path) -> dict[str, NDArray[Any]]:
     with parquet.ParquetFile(path) as file:
         if file.metadata.num_rows > _MOST_ROWS:
             raise ValueError(f'more than {_MOST_ROWS} rows')
-        known = {name for row in _SOURCES for name in (*_needed(row), *_others(row))}
+        known = {name for row in _SOURCES for name in row.columns.values()}
         names = [name for name in file.schema_arrow.names if name.lower() in known]
-        table, numbers = file.read(names), {row.number for row in _SOURCES}
+        table, numbers = file.read(names), {row.columns.get('number') for row in _SOURCES}
     return {
         name: (table[name].fill_null(0) if name.lower() in numbers else table[name]).to_numpy()
         for name in names
