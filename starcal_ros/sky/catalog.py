@@ -208,6 +208,8 @@ def _read_columns(path: Path) -> tuple[dict[str, NDArray[np.generic]], str]:
             )
     if column_digest(columns) != digest:
         raise CatalogError(f'{path}: star catalog is damaged (digest mismatch)')
+    if columns['motion_source'].max(initial=0) >= len(MotionSource):
+        raise CatalogError(f'{path}: star catalog has a motion_source of a later version')
     return columns, digest
 
 

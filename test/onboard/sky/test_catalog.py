@@ -16,6 +16,8 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError
 from starcal_ros.sky.catalog import (
     CATALOG_PATH,
+    column_digest,
+    COLUMN_TYPES,
     cone,
     CONE_MARGIN_RAD,
     load_catalog,
@@ -292,9 +294,12 @@ def test_altered_contents_are_refused(tmp_path: Path):
     path = tmp_path / 'stars.npz'
     ra = entries['ra'].copy()
     ra[1000] += 1
+    columns = {name: entries[name] for name in COLUMN_TYPES}
+    later = {**columns, 'motion_source': np.full_like(columns['motion_source'], 6)}
     for changed, match in (
         ({'format': np.array(2)}, 'format 2, this version reads 1'),
         ({'ra': ra}, 'digest'),
+        ({**later, 'digest': np.array(column_digest(later))}, 'motion_source of a later version'),
         ({'ra': ra[:-1]}, 'column ra'),
         ({'ra': ra.astype(np.float64)}, 'column ra is float64'),
     ):
