@@ -32,7 +32,7 @@ def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
     camera, params = folder / 'camera.yaml', folder / 'params.yaml'
     write_camera_info(scenario.prior.camera, camera)
     content = simulated_bag.parameters(scenario, f'file://{camera}')
-    content['/**']['ros__parameters'].update(values)  # type: ignore[index]
+    content['/**']['ros__parameters'].update(values)
     params.write_text(yaml.safe_dump(content))
     return params
 

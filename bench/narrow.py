@@ -18,7 +18,6 @@ import tempfile
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.frames import earth_velocity_m_s, load_set_up, observed, render_frame
@@ -27,13 +26,13 @@ from bench.table import Table
 from bench.trials import in_processes, rms
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
-from starcal_ground.mission.ingest.gaia_catalog import catalog_file, integer_columns
+from starcal_ground.mission.ingest.deep_catalog import catalog_file, integer_columns
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
+from starcal_ground.simulation.deep_sky import deep_sky, disc, log10_density
 from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import Inertial, Scenario
-from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
@@ -41,14 +40,13 @@ from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble, MapCovariance
-from starcal_ros.sky.catalog import load_catalog, MotionSource, StarCatalog
+from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE
 from studies.trials import map_bound_px
 
 SIZE, IMAGES, SEEDS = (800, 640), 14, 10
 FIELDS_DEG = (0.3, 0.5, 1.0, 2.5, 5.0)  # of the width
 _STARS = 20  # in a mean image
 _REGION_RAD = math.radians(5.0)
-_BUNDLED_MAG = 9.0
 _BELOW_LIMIT_MAG = 1.0  # rendered and in the catalog, too faint to be measured
 _MOST_MAG = 14.0
 
@@ -123,13 +121,13 @@ def scenario_of(field_deg: float, seed: int) -> Scenario:
     )
     per_deg2 = _STARS / (field_deg**2 * SIZE[1] / SIZE[0])
     depth = np.linspace(7.0, _MOST_MAG, 200)
-    limit = float(np.interp(math.log10(per_deg2), _log10_density(depth), depth))
+    limit = float(np.interp(math.log10(per_deg2), log10_density(depth), depth))
     axis, sky = rng.normal(size=3), None
     axis /= np.linalg.norm(axis)
-    if limit + _BELOW_LIMIT_MAG > _BUNDLED_MAG and field_deg < 2.0:
-        sky = deep_sky(axis, limit + _BELOW_LIMIT_MAG, rng)
-    limit = limit if sky else _BUNDLED_MAG - 0.1
-    apart = _disc(axis, IMAGES, 0.9 * _REGION_RAD if sky else math.pi, rng)
+    if limit + _BELOW_LIMIT_MAG > BUNDLED_MAGNITUDE and field_deg < 2.0:
+        sky = deep_sky(axis, _REGION_RAD, limit + _BELOW_LIMIT_MAG, rng)
+    limit = limit if sky else BUNDLED_MAGNITUDE - 0.1
+    apart = disc(axis, IMAGES, 0.9 * _REGION_RAD if sky else math.pi, rng)
     ra_deg, dec_deg = (
         np.degrees(np.arctan2(apart[:, 1], apart[:, 0])),
         np.degrees(np.arcsin(apart[:, 2])),
@@ -149,7 +147,7 @@ def scenario_of(field_deg: float, seed: int) -> Scenario:
         star_tracker_sigma_arcsec=(5.0, 5.0, 20.0),
         pointing=Inertial(tuple((a, b, c) for a, b, c in attitudes.tolist())),
         image_count=IMAGES,
-        magnitude_limit=limit + _BELOW_LIMIT_MAG if sky else _BUNDLED_MAG,
+        magnitude_limit=limit + _BELOW_LIMIT_MAG if sky else BUNDLED_MAGNITUDE,
         sky=sky,
     )
 
@@ -157,52 +155,6 @@ def scenario_of(field_deg: float, seed: int) -> Scenario:
 def mounting_sigma_rad(seed: int) -> float:
     """1-sigma of the mounting of a seed: 5 arcsec to 0.3 degrees."""
     return float(np.geomspace(5.0, 1080.0, SEEDS)[seed % SEEDS]) * ARCSECOND_RAD
-
-
-def _log10_density(magnitude: NDArray[np.floating]) -> Floats:
-    """Mean number of stars to a V magnitude per square degree, as Allen has it, to 10 %."""
-    fainter = magnitude - 9.0
-    return 0.48 + 0.45 * fainter - 0.007 * fainter**2
-
-
-def deep_sky(axis: Floats, faintest: float, rng: np.random.Generator) -> StarCatalog:
-    """The bundled catalog, and stars below it about an axis (3,)."""
-    depth = np.linspace(_BUNDLED_MAG, faintest, 500)
-    area_deg2 = 2 * math.pi * (1.0 - math.cos(_REGION_RAD)) * math.degrees(1.0) ** 2
-    # The densest tenth of the sky has three times the mean, the emptiest a third.
-    number = area_deg2 * 10 ** _log10_density(depth) * math.exp(rng.normal(0.0, 0.3))
-    count = rng.poisson(number[-1] - number[0])
-    magnitude = np.interp(rng.uniform(number[0], number[-1], count), number, depth)
-    direction = _disc(axis, count, _REGION_RAD, rng)
-    motion = rng.normal(0.0, 8e-3 * ARCSECOND_RAD, (count, 2))
-    bundled, ra_rad = load_catalog(), np.arctan2(direction[:, 1], direction[:, 0])
-    drawn = {
-        'id': np.arange(count) + 1,
-        'ra_rad': ra_rad % (2 * math.pi),
-        'dec_rad': np.arcsin(direction[:, 2]),
-        'pm_ra_cosdec_rad_per_year': motion[:, 0],
-        'pm_dec_rad_per_year': motion[:, 1],
-        'parallax_rad': np.zeros(count),
-        'magnitude': magnitude,
-        'colour_bp_rp': rng.normal(1.0, 0.3, count),
-        'motion_source': np.full(count, MotionSource.GAIA, np.uint8),
-        'close_pair': np.zeros(count, np.bool_),
-    }
-    columns = {name: np.concatenate([getattr(bundled, name), drawn[name]]) for name in drawn}
-    sky = dataclasses.replace(bundled, **columns)
-    return sky.select(np.argsort(sky.magnitude, kind='stable'))
-
-
-def _disc(axis: Floats, count: int, radius_rad: float, rng: np.random.Generator) -> Floats:
-    """Directions (count, 3), even over the disc about an axis."""
-    z = rng.uniform(math.cos(radius_rad), 1.0, count)
-    angle, r = rng.uniform(0.0, 2 * math.pi, count), np.sqrt(1.0 - z * z)
-    local = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
-    # The smallest rotation; SciPy 1.11 warns of a single pair of vectors in `align_vectors`.
-    about = np.cross([0.0, 0.0, 1.0], axis)
-    sine = float(np.linalg.norm(about))
-    turn = Rotation.from_rotvec(about * (math.atan2(sine, axis[2]) / max(sine, 1e-300)))
-    return np.asarray(turn.apply(local))
 
 
 def _write_catalog(given: Scenario, folder: Path) -> dict[str, object]:

@@ -32,7 +32,7 @@ TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 LONGEST = (
     *('test_colcon', 'test_bench', 'test_night_sky', 'test_calibrate', 'test_monte_carlo'),
     *('test_kills', 'test_output_files', 'test_untrusted_files', 'test_object_store'),
-    *('test_c_camera', 'test_gaia_catalog', 'test_set_up_mistakes', 'test_trend'),
+    *('test_c_camera', 'test_deep_catalog', 'test_set_up_mistakes', 'test_trend'),
     *('test_recording', 'test_diagnose', 'test_overview', 'test_docs'),
     *('test_hostile_messages', 'test_set_camera_info_client', 'test_ros_tools'),
 )

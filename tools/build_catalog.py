@@ -41,7 +41,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from starcal_ground.mission.ingest import gaia_catalog
+from starcal_ground.mission.ingest import deep_catalog
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import CATALOG_PATH, load_catalog, MAGNITUDE_UNIT, MotionSource
@@ -139,19 +139,11 @@ def read_solutions(content: bytes) -> Solutions:
 
 
 def read_tycho(path: Path) -> Places:
-    """Read positions at J2000 and VT from an Astrometry.net index: u32 steps in a unit cube."""
-    content = checked(path.name, path.read_bytes())
-    with fits.open(io.BytesIO(content)) as file:
-        table = {hdu.columns.names[0]: hdu.data for hdu in file[1:] if len(hdu.columns)}
-
-        def column(name: str, kind: str) -> NDArray[np.generic]:
-            return np.frombuffer(np.asarray(table[name]).tobytes(), kind)
-
-        box = column('kdtree_range_stars', '<f8').astype(np.float64)
-        steps = column('kdtree_data_stars', '<u4').astype(np.float64).reshape(-1, 3)
-        magnitude = column('MAG_VT', '>f4').astype(np.float64)
-    direction = box[:3] + steps / box[6]
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    """Read positions at J2000 and VT from an Astrometry.net index."""
+    with fits.open(io.BytesIO(checked(path.name, path.read_bytes()))) as file:
+        stars = deep_catalog.index_stars(file)
+    direction = erfa.s2c(*np.radians([stars['ra'], stars['dec']]))
+    magnitude = stars['mag_vt'].astype(np.float64)
     bright = magnitude < MAGNITUDE_LIMIT + 1.8
     return Places(direction[bright], magnitude[bright])
 
@@ -256,7 +248,7 @@ def merge(
     source = np.where(has_hip, MotionSource.HIPPARCOS, MotionSource.UNKNOWN).astype(np.uint8)
     # Gaia saturates for stars brighter than G = 4, or has none: use Hp there.
     magnitude, from_hp = (
-        gaia_catalog.johnson_v(g, colour),
+        deep_catalog.johnson_v(g, colour),
         johnson_v_from_hp(hipparcos.magnitude[hip], colour),
     )
     better = has_hip & (g < 4) & (np.abs(from_hp - magnitude) < 0.4) | np.isnan(g)
@@ -329,11 +321,11 @@ def mark_close(merged: Merged, tycho_left: Places) -> Mask:
     """Return a mask of stars with a neighbour within 20 arcsec and 5 magnitudes."""
     direction = np.concatenate([merged.direction, tycho_left.direction])
     magnitude = np.concatenate([merged.magnitude, tycho_left.magnitude])
-    pairs = gaia_catalog.close_pairs(direction)
+    pairs = deep_catalog.close_pairs(direction)
     # A Tycho-2 entry within 3 arcsec is the star itself.
     apart = np.linalg.norm(direction[pairs[:, 0]] - direction[pairs[:, 1]], axis=1)
     same = (pairs[:, 1] >= len(merged.id)) & (apart < SAME_STAR_RAD)
-    return gaia_catalog.marked_close(pairs[~same], magnitude)[: len(merged.id)]
+    return deep_catalog.marked_close(pairs[~same], magnitude)[: len(merged.id)]
 
 
 def columns_of(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic]]:
@@ -341,7 +333,7 @@ def columns_of(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic
     pv = np.zeros(len(merged.id), erfa.dt_pv)
     pv['p'], pv['v'] = merged.direction, merged.motion
     ra_rad, dec_rad, _, ra_rate, dec_rate, _ = erfa.pv2s(pv)
-    columns = gaia_catalog.integer_columns(
+    columns = deep_catalog.integer_columns(
         {
             'id': merged.id,
             'ra_rad': ra_rad,
@@ -412,7 +404,7 @@ def main() -> None:
     merged, used = merge(stars, gaia, hipparcos, tycho)
     left = Places(tycho.direction[~used], tycho.magnitude[~used])
     arguments.output.write_bytes(
-        gaia_catalog.catalog_file(columns_of(merged, mark_close(merged, left)))
+        deep_catalog.catalog_file(columns_of(merged, mark_close(merged, left)))
     )
     print(report(arguments.output, gaia, hipparcos, tycho))
     print(f'{arguments.output}: {arguments.output.stat().st_size} bytes')

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+import functools
 import math
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation.deep_sky import archive_table, deep_sky
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.camera.lens import fold_radius2, ideal_points
@@ -37,6 +39,8 @@ _STAMP_SIGMAS = 6.0  # half width of a stamp: 2e-9 of the light of a star is out
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 ATTITUDE_OFFSETS_S: tuple[float, ...] = (-0.75, -0.25, 0.25, 0.75)
 """Times of the star-tracker samples relative to an image: 2 Hz, none at the image itself."""
+MOUNTING_SIGMA_RAD = 150.0 * ARCSECOND_RAD
+"""1-sigma of each axis by which launch has turned the camera."""
 SAMPLES_S = 1.5
 """Time before and after an image with samples that have errors of their own."""
 
@@ -115,6 +119,7 @@ class Scenario:
     magnitude_limit: float = 9.0
     stars_per_image: int | None = None  # the brightest on the detector; None: all
     sky: StarCatalog | None = None  # sorted by magnitude; None: the bundled catalog
+    table: str | None = None  # of the sky, as of an archive; None: the bundled catalog will do
     star_tracker_hz: float = 0.0  # of samples with errors of their own; 0: at ATTITUDE_OFFSETS_S
 
     def time_ns(self, index: int) -> int:
@@ -161,6 +166,11 @@ _TINY_FIELDS = (
     (15.0, 60.0, 170.0),
     (110.0, -30.0, 60.0),
 )
+_NARROW_SKY = (288.0, 38.0, 2.0)  # right ascension, declination and radius, degrees
+_NARROW_FIELDS = tuple(
+    (288.0 + 2.0 * r * math.cos(2.4 * k), 38.0 + 1.6 * r * math.sin(2.4 * k), 70.0 * k)
+    for k, r in enumerate(np.sqrt(np.arange(0.5, 12.0) / 12.0).tolist())
+)
 _HOUSTON = EarthFixed(latitude_deg=29.76, longitude_deg=-95.37, roll_deg=20.0)
 _HERCULES_NS = 1778829600 * NANOSECONDS_PER_SECOND  # 2026-05-15 07:20 UTC: 16.5 h sidereal there
 _NIGHT: Mapping[str, Any] = {
@@ -182,6 +192,17 @@ SCENARIOS: Mapping[str, Mapping[str, Any]] = {
     },
     'small': {'size': (1296, 1024), 'cadence_s': 60.0, 'image_count': 24, 'start_s': 1200.0},
     'paper': {'size': (2592, 2048), 'cadence_s': 10.0, 'image_count': 359},
+    # A telescope whose stars are below the bundled catalog.
+    'narrow': {
+        'size': (640, 512),
+        'width_deg': 0.5,
+        'cadence_s': 60.0,
+        'image_count': 12,
+        'detector': Detector(zero_point_electrons=2e7, bits=14),
+        'star_tracker_sigma_arcsec': (5.0, 5.0, 20.0),
+        'pointing': Inertial(_NARROW_FIELDS),
+        'magnitude_limit': 13.5,
+    },
 }
 """Size of the detector and fields of the scenarios by name, in which they differ from a night."""
 
@@ -190,8 +211,10 @@ def scenario(name: str, seed: int = 1) -> Scenario:
     """
     Scenario by name; the seed determines its truth and all its noise.
 
-    The camera has a field of 20 x 16 degrees.  The prior is its calibration on the ground; launch
-    has changed it.  Raises ValueError if no scenario has that name.
+    The camera has a field of 20 x 16 degrees, half a degree in 'narrow'.  The prior is its
+    calibration on the ground; launch has changed it.
+
+    Raises ValueError if no scenario has that name.
     """
     if name not in SCENARIOS:
         raise ValueError(f'scenario: {name!r} is not one of {", ".join(SCENARIOS)}')
@@ -199,6 +222,9 @@ def scenario(name: str, seed: int = 1) -> Scenario:
     width, height = given.pop('size')
     rng = random_stream(seed, TRUTH_STREAM)
     focal_px = 35.0 / 0.0048 * width / 2592  # 35 mm lens; 4.8 um pixels at full resolution
+    if name == 'narrow':
+        focal_px = width / 2 / math.tan(math.radians(given.pop('width_deg')) / 2)
+        given['sky'], given['table'] = _narrow_sky(given['magnitude_limit'])
     nominal = CameraModel(
         width,
         height,
@@ -218,7 +244,7 @@ def scenario(name: str, seed: int = 1) -> Scenario:
     )
     # An arbitrary mounting in which no axis of the camera is parallel to one of the star tracker.
     mounting = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
-    shift = Rotation.from_rotvec(150.0 * ARCSECOND_RAD * rng.normal(size=3))
+    shift = Rotation.from_rotvec(MOUNTING_SIGMA_RAD * rng.normal(size=3))
     return Scenario(
         name=name,
         seed=seed,
@@ -227,6 +253,15 @@ def scenario(name: str, seed: int = 1) -> Scenario:
         start_ns=_HERCULES_NS + round(given.pop('start_s') * NANOSECONDS_PER_SECOND),
         **given,
     )
+
+
+@functools.cache
+def _narrow_sky(faintest: float) -> tuple[StarCatalog, str]:
+    """The sky of the scenario narrow, the same for all seeds, and the table of its region."""
+    ra_rad, dec_rad, radius_rad = np.radians(_NARROW_SKY).tolist()
+    axis, rng = erfa.s2c(ra_rad, dec_rad), np.random.default_rng(1)
+    sky = deep_sky(axis, radius_rad, faintest, rng, spread=0.0)
+    return sky, archive_table(sky, axis, radius_rad)
 
 
 def random_stream(seed: int, purpose: int, index: int = 0) -> np.random.Generator:

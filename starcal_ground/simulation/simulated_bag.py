@@ -24,7 +24,12 @@ from starcal_ground.outputs import check_outputs
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation.rendering import images
-from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenes
+from starcal_ground.simulation.scenario import (
+    attitude_samples,
+    MOUNTING_SIGMA_RAD,
+    Scenario,
+    scenes,
+)
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -121,6 +126,7 @@ def _as_before(changed: Floats, before: Pixels, full: float) -> Pixels:
 NO_MISTAKES = Mistakes()
 
 
+_BESIDE = ('truth.json', 'params.yaml', 'camera.yaml', 'gaia.csv')
 IMAGE_TOPIC = '/opnav/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'
 VELOCITY_TOPIC = '/spacecraft/velocity'
@@ -190,9 +196,9 @@ def write_bag(
     """
     Render a scenario to a bag, and write its truth and the files to calibrate it.
 
-    A bag folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; for a single file
-    ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and ``NAME_camera.yaml``. Raises
-    BagError when a file cannot be written, and ProductError as `check_outputs` does.
+    A bag folder holds ``truth.json``, ``params.yaml``, ``camera.yaml`` and, for a deep sky,
+    ``gaia.csv``; for a single file ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and
+    so on. Raises BagError when a file cannot be written, and ProductError as `check_outputs` does.
 
     Parameters
     ----------
@@ -205,13 +211,20 @@ def write_bag(
     """
     writer = BagWriter(path)
     if path.suffix == '.mcap':
-        beside = (f'{path.stem}.json', f'{path.stem}_params.yaml', f'{path.stem}_camera.yaml')
+        beside = (f'{path.stem}.json', *(f'{path.stem}_{name}' for name in _BESIDE[1:]))
     else:
-        beside = ('truth.json', 'params.yaml', 'camera.yaml')
-    truth, params, camera = (writer.file.with_name(name) for name in beside)
-    check_outputs((*writer.outputs(), truth, params, camera))
+        beside = _BESIDE
+    truth, params, camera, table = (writer.file.with_name(name) for name in beside)
+    tables = [] if scenario.table is None else [table]
+    check_outputs((*writer.outputs(), truth, params, camera, *tables))
     scenario = dataclasses.replace(scenario, prior=mistakes.prior(scenario.prior))
     content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
+    if scenario.table is not None:
+        content['/**']['ros__parameters'] |= {
+            'catalog': str(table.resolve().with_suffix('.npz')),
+            'magnitude_limit': scenario.magnitude_limit,
+            'prior_alignment_sigma_deg': math.degrees(MOUNTING_SIGMA_RAD),
+        }
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
     true = truth_content(scenario, writer.file.name)
     if mistakes != NO_MISTAKES:
@@ -229,6 +242,8 @@ def write_bag(
         # Just before the bag replaces an older one, so that all files are replaced together.
         write_atomically(truth, truth_text)
         write_camera_info(scenario.prior.camera, camera, 'opnav')
+        if scenario.table is not None:
+            write_atomically(table, scenario.table)
         write_atomically(params, text)
     return SimulatedBag(path, truth, params, camera)
 
@@ -241,7 +256,7 @@ def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistak
     writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
 
 
-def parameters(scenario: Scenario, camera_url: str) -> dict[str, object]:
+def parameters(scenario: Scenario, camera_url: str) -> dict[str, dict[str, dict[str, Any]]]:
     """Content of the ROS parameter file with the prior of a scenario."""
     values = {
         'camera_info_url': camera_url,

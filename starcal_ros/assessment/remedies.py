@@ -23,7 +23,7 @@ REMEDIES: Mapping[str, str] = {
     'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
     'glare': 'keep Sun, Moon and Earth out of the field',
     'not_in_catalog': (
-        'raise magnitude_limit, or give a catalog that covers these fields (starcal catalog)'
+        'raise magnitude_limit, or give starcal catalog a table of this sky (docs/mission.md)'
     ),
     'no_match': 'ask the diagnostics of the star observer, or starcal diagnose, for the cause',
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
@@ -50,7 +50,7 @@ REMEDIES: Mapping[str, str] = {
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
     'change from image to image': 'estimate with temperature, or calibrate each state alone',
-    'star places': 'take more images of other star fields',
+    'star places': 'take more images of other star fields, with a catalog that has proper motions',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',
     'star tracker noise': 'take more images',

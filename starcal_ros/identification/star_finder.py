@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Pixels
-from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
 from starcal_ros.identification.blending import separate
@@ -34,8 +34,8 @@ from starcal_ros.identification.prediction import (
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
-from starcal_ros.sky.astrometry import EARTH, SiteOptions, Velocity
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.sky.astrometry import EARTH, julian_year, SiteOptions, Velocity
+from starcal_ros.sky.catalog import sky_circle, StarCatalog
 from starcal_ros.stars.centroiding import Centroids, measure_stars, with_faint
 from starcal_ros.stars.detection import (
     Background,
@@ -246,6 +246,8 @@ def _observations(
     few = measured < _MIN_STARS
     if few:
         good = np.zeros_like(good)
+    sigma_rad = catalog.place_sigma_rad(index[good], julian_year(exposure.image.time_ns))
+    place_px2 = (sigma_rad * prediction.px_per_rad) ** 2
     return StarObservations(
         time_ns=exposure.image.time_ns,
         width=width,
@@ -258,7 +260,7 @@ def _observations(
         direction_icrf=prediction.direction_icrf[good],
         magnitude=catalog.magnitude[index][good].astype(np.float32),
         measured_px=centroids.xy_px[good],
-        covariance_px2=centroids.covariance_px2[good],
+        covariance_px2=centroids.covariance_px2[good] + np.outer(place_px2, [1.0, 0.0, 1.0]),
         flux_dn=centroids.flux_dn[good].astype(np.float32),
         snr=centroids.snr[good].astype(np.float32),
         refused_stars=dict(zip(names, counts.tolist(), strict=True)),
@@ -306,13 +308,11 @@ def _check_catalog(
     if in_field >= _FEWEST_IN_FIELD or count > _NEAREST:
         return
     attitude = geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
-    x, y, z = attitude.apply([0.0, 0.0, 1.0])
-    ra_deg, dec_deg = math.degrees(math.atan2(y, x)) % 360.0, math.degrees(math.asin(z))
+    sky = sky_circle(attitude.apply([[0.0, 0.0, 1.0]]), field_radius_rad(camera, reach_px))
     limit = search.identification.magnitude_limit
     raise ImageRefused(
         'not_in_catalog',
-        f'{in_field:.1f} catalog stars to V = {limit:g} in a field at RA {ra_deg:.2f}, Dec'
-        f' {dec_deg:+.2f} deg',
+        f'{in_field:.1f} catalog stars to V = {limit:g} in a field; needed: {sky}',
     )
 
 

@@ -53,7 +53,7 @@ from starcal_ros.pipeline import detector_frames
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions, Mounting
-from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog, StarCatalog
 from starcal_ros.stars.frame_checks import ScreeningOptions
 from starcal_ros.stars.hot_pixels import hot_in_dark, HotPixels, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import CentroidOptions
@@ -396,7 +396,9 @@ def load_setup(
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
-    check_field_of_stars(catalog, magnitude_limit, prior.camera)
+    # With all of the bundled catalog the images are refused, and their sky named.
+    if frames.catalog or magnitude_limit < BUNDLED_MAGNITUDE:
+        check_field_of_stars(catalog, magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
     dark = detector_frames.read_dark(frames.dark_frame, *size)
     flat = detector_frames.read_flat(frames.flat_field, *size)

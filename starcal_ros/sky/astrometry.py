@@ -131,6 +131,12 @@ def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
     return day_jd, rest_s / _DAY_S
 
 
+def julian_year(time_unix_ns: int) -> float:
+    """Julian epoch (TT) of a POSIX time in nanoseconds."""
+    day_jd, rest_days = tt_julian_date(time_unix_ns)
+    return 2000.0 + (day_jd - _J2000_JD + rest_days) / _JULIAN_YEAR_DAYS
+
+
 def earth_velocity_c(time_unix_ns: int) -> Floats:
     """Barycentric velocity (3,) of the Earth, axes of the ICRS, in units of the speed of light."""
     _, barycentric = erfa.epv00(*tt_julian_date(time_unix_ns))
@@ -171,7 +177,6 @@ def apparent_directions(
                 ' light speed'
             )
     sun_distance_au = float(np.linalg.norm(heliocentric['p']))
-    tdb_jyear = 2000.0 + (day_jd - _J2000_JD + rest_days) / _JULIAN_YEAR_DAYS
     natural = erfa.pmpx(
         stars.ra_rad,
         stars.dec_rad,
@@ -180,7 +185,7 @@ def apparent_directions(
         stars.pm_dec_rad_per_year,
         stars.parallax_rad / erfa.DAS2R,  # only parallax is in arcseconds
         0.0,
-        tdb_jyear - stars.epoch_jyear,
+        julian_year(time_unix_ns) - stars.epoch_jyear,
         barycentric['p'],
     )
     bent = erfa.ldsun(natural, heliocentric['p'] / sun_distance_au, sun_distance_au)

@@ -30,7 +30,8 @@ from starcal_ros.errors import OptionError
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add, number = command.add_argument, arguments.number
     arguments.add_output(command, 'BAG', 'bag folder or .mcap file to write', required=True)
-    what, names = 'scenario: tiny, small or paper', ('tiny', 'small', 'paper')
+    names = ('tiny', 'small', 'paper', 'narrow')
+    what = 'scenario: tiny, small, paper, or narrow, with stars below the bundled catalog'
     add('--scenario', required=True, choices=names, metavar='NAME', help=what)
     what, seed = 'seed of the truth and the noise (default: 1)', number(int, 0, 2**63 - 1)
     add('--seed', type=seed, default=1, metavar='N', help=what)
@@ -93,5 +94,8 @@ def run(args: argparse.Namespace) -> int:
         )
     print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
     print_text(f'truth {made.truth}')
+    if scenario.table is not None:
+        table = made.params.with_name(made.params.name.replace('params.yaml', 'gaia.csv'))
+        print_text(f'first: starcal catalog {table} -o {table.with_suffix(".npz")}')
     print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return arguments.EXIT_ACCEPTED

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from itertools import islice
 import math
 from pathlib import Path
+import re
 
+import erfa
 import numpy as np
 
 from starcal_ros.assessment.remedies import REMEDIES
@@ -26,8 +28,11 @@ from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeOptions
+from starcal_ros.sky.catalog import sky_circle
 
 _PLACES = 8  # in the sky that a sentence lists
+_CIRCLE = re.compile(r'RA (\S+), Dec (\S+), radius (\S+) deg')  # of `sky_circle`
+_ONE_QUERY_DEG = 5.0  # radius of the sky of all images that one table can have
 _MEASURED = 10  # images, for the reason of their refusal
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
 """Refusals after which the sky of an image cannot be held against the set-up."""
@@ -214,10 +219,16 @@ def refusals(records: Iterable[StarObservations]) -> tuple[Refused, ...]:
 
 
 def _detail(group: Sequence[StarObservations]) -> str:
-    """Detail of the first image of a refusal, or the places that a catalog has to cover."""
+    """Detail of the first image of a refusal, or the sky that a catalog has to cover for all."""
     details = list(dict.fromkeys(image.detail for image in group))
-    if group[0].refusal != 'not_in_catalog' or len(details) == 1:
+    places = np.array([match.groups() for text in details if (match := _CIRCLE.search(text))])
+    if group[0].refusal != 'not_in_catalog' or len(places) < 2:
         return details[0]
-    others = [detail[detail.index('RA ') :] for detail in details[1:_PLACES] if 'RA ' in detail]
-    more = f', and {len(details) - _PLACES} more' if len(details) > _PLACES else ''
+    ra_deg, dec_deg, radius_deg = places.astype(np.float64).T
+    direction = erfa.s2c(np.radians(ra_deg), np.radians(dec_deg))
+    together = sky_circle(direction, math.radians(radius_deg.max()))
+    if float(together.split()[-2]) < _ONE_QUERY_DEG:
+        return _CIRCLE.sub(f'{together}, of {len(group)} images', details[0])
+    others = [f'RA {ra}, Dec {dec}' for ra, dec, _ in places[1:_PLACES]]
+    more = f', and {len(places) - _PLACES} more' if len(places) > _PLACES else ''
     return f'{details[0]}; others at {"; ".join(others)}{more}'

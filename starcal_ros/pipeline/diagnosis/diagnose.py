@@ -27,12 +27,7 @@ from starcal_ros.pipeline.diagnosis.attitude_reading import (
     Reading,
     WireAttitudes,
 )
-from starcal_ros.pipeline.diagnosis.identified import (
-    FEWEST_SOURCES,
-    Identified,
-    identify_images,
-    Solved,
-)
+from starcal_ros.pipeline.diagnosis.identified import Identified, identify_images, Solved
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Image
@@ -43,6 +38,7 @@ CAUSES = (
     'focal_length', 'clock', 'smear', 'no_stars', 'not_linear', 'unknown',
 )  # fmt: skip
 IMAGES_OF_AN_ALIGNMENT = 3
+_FEW_SOURCES = 10  # in an image that nothing identifies: hot pixels are sources too
 
 _NO_PARAMETER = 'no parameter mends this: '
 _SAME_DATE_S = 86400.0  # aberration changes by 0.35 arcsec in a day
@@ -131,13 +127,13 @@ def _nothing_found(identified: Identified, setup: Setup) -> Diagnosis:
     looked = f'{len(looked_at)} images looked at, {count} star-like sources each'
     if 2 * len(streaks) > len(looked_at):
         return _smeared(float(np.median([length for length, _ in streaks])), looked)
-    if count < FEWEST_SOURCES:
+    if count < _FEW_SOURCES:
         level = float(np.median([s.background.level_dn for s in looked_at]))
         noise = float(np.median([s.background.noise_dn for s in looked_at]))
         return Diagnosis(
             'no_stars',
             count,
-            'The images show too few stars.',
+            f'The images show too few stars: {count} sources each, and five have to be stars.',
             (looked, f'background {level:.0f} DN with a noise of {noise:.1f} DN'),
             ('# no parameter mends this: expose for longer, or check that the lens sees the sky',),
         )
@@ -146,7 +142,7 @@ def _nothing_found(identified: Identified, setup: Setup) -> Diagnosis:
     return Diagnosis(
         'unknown',
         None,
-        'No image can be identified, and why was not identified.',
+        'No image can be identified, for a cause that is not known.',
         (
             looked,
             'no pattern of them was found in the sky, mirrored or not, in the time of the search',
@@ -322,7 +318,7 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
         evidence.append('prior_alignment is given with w first')
     sentence = (
         f'prior_alignment points {tilt_deg:.3g} degrees away from where the images show the'
-        f' camera, and is rolled by {roll_deg:.3g} degrees.'
+        f' camera, and is rolled by {roll_deg:.3g} degrees; prior_alignment_sigma_deg: {stated:g}.'
     )
     return [Diagnosis('prior_alignment', values, sentence, tuple(evidence), mend)]
 

@@ -515,7 +515,7 @@ def test_what_needs_ros_names_it(
     [
         ('starcal ca', ['calibrate', 'catalog']),
         ('starcal inspect --ima', ['--image-topic']),
-        ('starcal simulate --scenario ', ['paper', 'small', 'tiny']),
+        ('starcal simulate --scenario ', ['narrow', 'paper', 'small', 'tiny']),
         ('starcal import --channel g', ['green']),
         (f'starcal inspect {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],

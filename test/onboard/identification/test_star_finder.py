@@ -320,6 +320,22 @@ def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
     np.testing.assert_array_equal(after.measured_px[j], before.measured_px[i])
 
 
+def test_an_unknown_proper_motion_is_in_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten years of the usual motion in a camera of 100 arcsec a pixel, and nothing else."""
+    one, image = shown(0)
+    moved = observed(image, one.icrf_from_star_tracker_xyzw)
+    known = catalog()
+    unmoved = dataclasses.replace(known, motion_source=np.zeros_like(known.motion_source))
+    monkeypatch.setitem(globals(), 'catalog', lambda: unmoved)
+    still = observed(image, one.icrf_from_star_tracker_xyzw)
+    row = {number: k for k, number in enumerate(known.id.tolist())}
+    sigma_rad = unmoved.place_sigma_rad(np.array([row[n] for n in still.catalog_id]), 2026.4)
+    more_px2 = np.outer((sigma_rad * PRIOR.camera.parameters[0]) ** 2, [1.0, 0.0, 1.0])
+    assert still.measured_px.tolist() == moved.measured_px.tolist()
+    # Moved stars have that of a motion by difference.
+    assert still.covariance_px2 - moved.covariance_px2 == pytest.approx(more_px2, rel=0.05)
+
+
 def test_stars_with_an_unknown_companion_are_told_by_their_shape() -> None:
     # Each brighter star has a companion of half its light, 3 px away, that the catalog has not.
     one, _ = shown(4)

@@ -117,9 +117,8 @@ def test_a_catalog_of_another_region_is_said_to_be() -> None:
     one, image = shown(0.3, 1)
     exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
     options = IdentificationOptions(magnitude_limit=14.0, prior_alignment_sigma_deg=0.1)
-    where = (
-        r'not_in_catalog: 0\.\d catalog stars to V = 14 in a field at RA \d.*, Dec [+-]\d.* deg'
-    )
+    sky = r'needed: RA \d.*, Dec [+-]\d.*, radius 0\.\d+ deg'
+    where = rf'not_in_catalog: 0\.\d catalog stars to V = 14 in a field; {sky}'
     with pytest.raises(ImageRefused, match=where):
         observe_stars(
             exposure, given(0.3).truth, StarSearch(load_catalog(), identification=options)

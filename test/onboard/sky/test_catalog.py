@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError
 from starcal_ros.sky.catalog import (
     CATALOG_PATH,
+    column_digest,
+    COLUMN_TYPES,
     cone,
     CONE_MARGIN_RAD,
     load_catalog,
@@ -197,6 +200,42 @@ def test_cone_finds_what_brute_force_finds(catalog, radius_deg, limit):
         assert (np.diff(rows) > 0).all()
 
 
+@pytest.mark.parametrize(
+    ('source', 'magnitude', 'jyear', 'mas'),
+    [
+        (MotionSource.GAIA, 12.0, 2026.0, 1.0),
+        (MotionSource.DIFFERENCE, 8.0, 2026.0, 22.0),
+        (MotionSource.TYCHO, 10.0, 2026.5, 106.0),
+        (MotionSource.UNKNOWN, 9.0, 2016.0, 0.1),
+        (MotionSource.UNKNOWN, 9.0, 2026.0, 160.0),  # ten years of 16 mas
+        (MotionSource.UNKNOWN, 13.0, 2026.0, 83.5),  # fainter ones are farther, and slower
+        (MotionSource.UNKNOWN_J2000, 13.0, 2000.0, 80.0),
+        (MotionSource.UNKNOWN_J2000, 13.0, 2026.0, 231.5),
+    ],
+)
+def test_a_place_is_known_as_well_as_its_motion(
+    catalog, source: MotionSource, magnitude: float, jyear: float, mas: float
+) -> None:
+    star = dataclasses.replace(
+        catalog.select(slice(1)),
+        motion_source=np.array([source], np.uint8),
+        magnitude=np.array([magnitude]),
+    )
+    sigma_rad = star.place_sigma_rad(np.array([0]), jyear)
+    assert sigma_rad / MAS_RAD == pytest.approx([mas], rel=0.01)
+
+
+def test_the_usual_motion_is_that_of_two_thirds_of_the_stars(catalog) -> None:
+    """In each magnitude to 20 %, by stars whose motion is known."""
+    known = catalog.select(catalog.motion_source == MotionSource.GAIA)
+    unknown = dataclasses.replace(known, motion_source=0 * known.motion_source)
+    in_a_year = unknown.place_sigma_rad(np.arange(len(known)), 2017.0)
+    in_sigma = np.abs(known.pm_dec_rad_per_year) / in_a_year
+    for v in (5.0, 6.0):
+        rows = (known.magnitude > v) & (known.magnitude < v + 1.0)
+        assert np.quantile(in_sigma[rows], 0.683) == pytest.approx(1.2, abs=0.3)
+
+
 def test_cone_loses_no_fast_star(catalog):
     years = 35
     east = np.stack(
@@ -255,9 +294,12 @@ def test_altered_contents_are_refused(tmp_path: Path):
     path = tmp_path / 'stars.npz'
     ra = entries['ra'].copy()
     ra[1000] += 1
+    columns = {name: entries[name] for name in COLUMN_TYPES}
+    later = {**columns, 'motion_source': np.full_like(columns['motion_source'], 6)}
     for changed, match in (
         ({'format': np.array(2)}, 'format 2, this version reads 1'),
         ({'ra': ra}, 'digest'),
+        ({**later, 'digest': np.array(column_digest(later))}, 'motion_source of a later version'),
         ({'ra': ra[:-1]}, 'column ra'),
         ({'ra': ra.astype(np.float64)}, 'column ra is float64'),
     ):

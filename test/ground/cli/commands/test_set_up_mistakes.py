@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import dataclasses
 import json
 from pathlib import Path
+import re
 from typing import Any
 
 import cv2
@@ -15,6 +17,9 @@ import yaml
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli import main
+from starcal_ground.mission.ingest.deep_catalog import write_deep_catalog
+from starcal_ground.simulation import simulated_bag
+from starcal_ground.simulation.scenario import scenario
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
@@ -199,6 +204,21 @@ def test_a_mistake_of_the_parameters(
     for text in said(capsys, tmp_path, TINY, params(tmp_path, **changes)).values():
         for word in words:
             assert word in text
+
+
+def test_an_uncertainty_of_the_mounting_that_is_too_small(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A field of half a degree, off by another one, and stated to be known to 0.01 degrees."""
+    given = dataclasses.replace(scenario('narrow'), image_count=6)
+    mistakes = simulated_bag.Mistakes(alignment_error_deg=0.5)
+    made = simulated_bag.write_bag(given, tmp_path / 'bag', mistakes=mistakes)
+    write_deep_catalog(tmp_path / 'bag' / 'gaia.csv', tmp_path / 'bag' / 'gaia.npz')
+    text = made.params.read_text()
+    made.params.write_text(re.sub(r'(alignment_sigma_deg): .*', r'\1: 0.01', text))
+    found = said(capsys, tmp_path, made.bag, made.params, ['calibrate'])['calibrate']
+    assert re.search(r'points 0\.[45]\d+ degrees away .* prior_alignment_sigma_deg: 0\.01', found)
+    assert 'Set prior_alignment: [' in found
 
 
 def test_inspect_names_the_remedy_without_parameters(
