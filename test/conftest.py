@@ -18,7 +18,7 @@ import sys
 import time
 from typing import Any
 
-from forked_process import ForkedProcess  # type: ignore[import-not-found]
+from forked_process import ForkedChild, ForkedNode, ForkedProcess  # type: ignore[import-not-found]
 import pytest
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
@@ -152,7 +152,7 @@ class NodeProcess:
         self.process: ForkedProcess | subprocess.Popen[bytes]
         log.touch()
         if forked:
-            self.process = ForkedProcess(name, arguments, log)
+            self.process = ForkedNode(name, arguments, log)
             return
         with log.open('wb') as output:
             self.process = subprocess.Popen(
@@ -234,6 +234,12 @@ def start_node(
         process.end()
         if failed:
             print(f'{process.name}, exit status {process.process.returncode}:\n{process.said()}')
+
+
+@pytest.fixture
+def forked_readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readers of files from outside are forked from a process that has their imports."""
+    monkeypatch.setattr('starcal_ground.mission.ingest.mission_records.ChildProcess', ForkedChild)
 
 
 @pytest.fixture(scope='session')

@@ -30,7 +30,7 @@ from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.records import Image
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('forked_readers')]
 
 ALIGNMENT = yaml.safe_load((TINY / 'params.yaml').read_text())['/**']['ros__parameters'][
     'prior_alignment'
