@@ -1,32 +1,39 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Processes of nodes without the second of processor time that their imports take."""
+"""Processes without the second of processor time that their imports take."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 import faulthandler
 import multiprocessing
+from multiprocessing.connection import Connection
 import os
 from pathlib import Path
+import pickle
 import subprocess
 import sys
+from typing import Any
+
+from starcal_ros import processes
 
 FORKSERVER = multiprocessing.get_context('forkserver')
 FORKSERVER.set_forkserver_preload(
-    [f'starcal_ros.ros.{name}' for name in ('bag_player', 'calibrator', 'star_observer')]
+    [
+        *(f'starcal_ros.ros.{name}' for name in ('bag_player', 'calibrator', 'star_observer')),
+        *('starcal_ground.mission.ingest.recording', 'astropy.io.fits'),
+    ]
 )
 
 
 class ForkedProcess:
     """
-    A node in a process forked from one that has imported all nodes.
+    A process forked from one that has imported all that is needed.
 
     That one has no threads and no part in ROS.  The methods are those of `subprocess.Popen`.
     """
 
-    def __init__(self, name: str, arguments: list[str], log: Path) -> None:
-        given = (name, arguments, str(log), dict(os.environ))
-        self._process = FORKSERVER.Process(target=_run, args=given, daemon=True)
+    def __init__(self, target: Any, *arguments: object) -> None:
+        self._process = FORKSERVER.Process(target=target, args=arguments, daemon=True)
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid
@@ -54,6 +61,39 @@ class ForkedProcess:
     def kill(self) -> None:
         """Send SIGKILL."""
         self._process.kill()
+
+
+class ForkedNode(ForkedProcess):
+    """A node with its output in a file."""
+
+    def __init__(self, name: str, arguments: list[str], log: Path) -> None:
+        super().__init__(_run, name, arguments, str(log), dict(os.environ))
+
+
+class ForkedChild(processes.ChildProcess):
+    """A child process that answers calls."""
+
+    def __init__(self) -> None:
+        requests, self_requests = FORKSERVER.Pipe(duplex=False)
+        self_answers, answers = FORKSERVER.Pipe(duplex=False)
+        self._process: Any = ForkedProcess(_answer, os.getcwd(), requests, answers)
+        for connection in (requests, answers):
+            connection.close()
+        self._requests = os.fdopen(os.dup(self_requests.fileno()), 'wb')
+        self._answers = os.fdopen(os.dup(self_answers.fileno()), 'rb')
+        for connection in (self_requests, self_answers):
+            connection.close()
+        pickle.dump(sys.path, self._requests)
+
+
+def _answer(folder: str, requests: Connection, answers: Connection) -> None:
+    """In the new process: what `processes` does as a module."""
+    os.chdir(folder)
+    for number, connection in enumerate((requests, answers)):
+        os.dup2(connection.fileno(), number)
+        connection.close()
+    sys.stdin = os.fdopen(0, closefd=False)
+    processes.main()
 
 
 def _run(name: str, arguments: list[str], log: str, environment: Mapping[str, str]) -> None:

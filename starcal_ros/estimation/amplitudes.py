@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 import math
 
 import numpy as np
-from scipy.linalg import eigh
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.special import erf
 
@@ -187,7 +186,7 @@ def averaged_field(
     """
     mean, precision = octave_prior(len(amplitudes.log_px), first)
     s = np.exp(amplitudes.log_px)[octave]
-    values, vectors = eigh(information * np.outer(s, s), check_finite=False)
+    values, vectors = np.linalg.eigh(information * np.outer(s, s))
     values = np.maximum(values, 0.0)
     along = vectors.T @ (s * gradient)
     room = math.log(LARGEST_FIELD_PX) - amplitudes.log_px.max()
@@ -450,7 +449,7 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
         K = kernel(steps)
         ratio[j] = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
         for k in range(len(sigma_px)):  # the shapes in units of their noise
-            values, vectors = eigh(K * np.outer(root[:, k], root[:, k]), check_finite=False)
+            values, vectors = np.linalg.eigh(K * np.outer(root[:, k], root[:, k]))
             ones, along = root[:, k] @ vectors, (left[:, k] / root[:, k]) @ vectors
             inverse = 1.0 / (1.0 + variance[:, None] * np.maximum(values, 0.0))
             of_ones, mean = inverse @ ones**2, inverse @ (ones * along)

@@ -74,13 +74,14 @@ def tool(*arguments: object) -> subprocess.Popen[str]:
     )
 
 
-def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path: Path) -> None:
+def test_json_is_the_same_bytes_from_any_number_of_workers(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     written = []
     for count in (0, 1, 2):
         folder = tmp_path / str(count)
-        done = tool(*ARGUMENTS, '-o', folder, '--workers', count)
-        out, err = done.communicate(timeout=100)
-        assert done.returncode == 0, err
+        assert studies.main([*ARGUMENTS, '-o', str(folder), '--workers', str(count)]) == 0
+        out, err = capfd.readouterr()
         assert err == ''  # no progress
         assert 'hierarchical' in out
         written.append((folder / 'coverage.json').read_bytes())
@@ -144,15 +145,12 @@ def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
 
 def test_a_trial_hangs_on_nothing_but_seed_study_and_number() -> None:
     design = small('coverage')
+    rows = {trial: monte_carlo.run_trial(design, trial) for trial in (3, 0, 2, 1)}
     more = dataclasses.replace(design, trials=1000)
-    assert monte_carlo.run_trial(design, 3) == monte_carlo.run_trial(more, 3)
-    for other in (
-        monte_carlo.run_trial(design, 2),
-        monte_carlo.run_trial(dataclasses.replace(design, seed=6), 3),
-    ):
-        assert monte_carlo.run_trial(design, 3)[0]['map_px'] != other[0]['map_px']
-    rows = [row for trial in (3, 0, 2, 1) for row in monte_carlo.run_trial(design, trial)]
-    assert monte_carlo.conclude(design, rows) == here(design)
+    assert rows[3] == monte_carlo.run_trial(more, 3)
+    for other in (rows[2], monte_carlo.run_trial(dataclasses.replace(design, seed=6), 3)):
+        assert rows[3][0]['map_px'] != other[0]['map_px']
+    assert monte_carlo.conclude(design, itertools.chain(*rows.values())) == here(design)
 
 
 @each_study

@@ -132,7 +132,7 @@ class Case:
 
     def readings(self) -> list[Reading]:
         """Every reading with its alignments; the configured one is first."""
-        return [self._reading(way, 0.0) for way in _ways(self.setup)]
+        return [self._at_shifts(way, np.zeros(1))[0] for way in _ways(self.setup)]
 
     def _fitting(self, readings: Sequence[Reading]) -> list[Reading]:
         """Readings supported by most images, and by about as many as the best reading."""
@@ -165,26 +165,34 @@ class Case:
         ]
         return likely[0] if len(likely) == 1 else None
 
-    def _reading(self, way: tuple[str, str], shift_s: float) -> Reading:
+    def _at_shifts(self, way: tuple[str, str], shift_s: Floats) -> list[Reading]:
+        """The reading of each shift (s,) of the stamps, with the most alignments that agree."""
+        images = len(self.solved)
         stamps_ns = np.array([image.time_ns for image in self.solved])
-        at_ns = stamps_ns + round(shift_s * NANOSECONDS_PER_SECOND)
-        read, usable = _read_at(self.attitudes, at_ns, way, self.setup)
-        if read is None:
-            return Reading(*way, 0, math.pi, Rotation.identity(), shift_s)
-        icrf_from_camera = Rotation.concatenate(
-            [self.solved[k].sky.camera_from_icrf for k in np.flatnonzero(usable)]
-        ).inv()
-        return _agreed(read.inv() * icrf_from_camera, way, shift_s)
+        at_ns = stamps_ns + np.rint(shift_s[:, None] * NANOSECONDS_PER_SECOND).astype(np.int64)
+        read, usable = _read_at(self.attitudes, at_ns.ravel(), way, self.setup)
+        quaternion = np.zeros((len(usable), 4))  # of no rotation: it agrees with none
+        if read is not None:
+            icrf_from_camera = Rotation.concatenate(
+                [image.sky.camera_from_icrf for image in self.solved]
+            ).inv()
+            image = np.flatnonzero(usable) % images
+            quaternion[usable] = (read.inv() * icrf_from_camera[image]).as_quat()
+        agreeing, scatter_rad, mean = _agreed(quaternion.reshape(-1, images, 4))
+        return [
+            Reading(*way, int(agreeing[k]), float(scatter_rad[k]), mean[k], float(shift_s[k]))
+            for k in range(len(shift_s))
+        ]
 
     def _shifted(self) -> Reading | None:
         """The reading and stamp shift that most images support; None if there is none."""
-        coarse = np.arange(-CLOCK_SEARCH_S, CLOCK_SEARCH_S + 1e-9, _COARSE_STEP_S)
-        fine = np.arange(-0.3, 0.3 + 1e-9, _FINE_STEP_S)
+        steps = round(CLOCK_SEARCH_S / _COARSE_STEP_S)
+        coarse: Floats = _COARSE_STEP_S * np.arange(-steps, steps + 1, dtype=np.float64)
+        fine: Floats = _FINE_STEP_S * np.arange(-12, 13, dtype=np.float64)
         readings = []
         for way in _ways(self.setup):
-            tried = [self._reading(way, float(shift_s)) for shift_s in coarse]
-            near_s = min(tried, key=_rank).shift_s
-            tried += [self._reading(way, float(near_s + shift_s)) for shift_s in fine]
+            tried = self._at_shifts(way, coarse)
+            tried += self._at_shifts(way, min(tried, key=_rank).shift_s + fine)
             readings.append(_middle_of_best(tried))
         return next(iter(self._fitting(readings)), None)
 
@@ -203,17 +211,26 @@ def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> 
     return [_ROLLS[turns] * rotation for turns in (0, 2, 1, 3) for rotation in read]
 
 
-def _agreed(alignments: Rotation, way: tuple[str, str], shift_s: float) -> Reading:
-    """The largest group of alignments that agree."""
-    q = alignments.as_quat()
-    apart = 2 * np.arccos(np.minimum(np.abs(q @ q.T), 1.0))
-    near = apart < _AGREE_RAD
-    middle = int(near.sum(axis=1).argmax())
-    group = near[middle]
-    mean = alignments[group].mean()
-    off = (mean.inv() * alignments[group]).magnitude()
-    scatter_rad = float(np.sqrt((off**2).mean()))
-    return Reading(*way, int(group.sum()), scatter_rad, mean, shift_s)
+def _agreed(quaternion: Floats) -> tuple[NDArray[np.int64], Floats, Rotation]:
+    """
+    Counts (s,), scatters (s,) and means of the largest groups of alignments that agree.
+
+    ``quaternion`` (s, m, 4) of m alignments, zero where there is none; the scatter of none is pi.
+    """
+    cosine = np.abs(quaternion @ quaternion.transpose(0, 2, 1))
+    near = 2 * np.arccos(np.minimum(cosine, 1.0)) < _AGREE_RAD
+    middle = near.sum(axis=2).argmax(axis=1)
+    group = near[np.arange(len(near)), middle]
+    count = group.sum(axis=1)
+    members = quaternion * group[:, :, None]
+    _, vectors = np.linalg.eigh(members.transpose(0, 2, 1) @ members)
+    mean = vectors[:, :, -1]
+    # Half of the angle from the mean: its cosine would lose half of the digits.
+    along = np.einsum('smi,si->sm', members, mean)
+    across = np.linalg.norm(members - along[:, :, None] * mean[:, None], axis=2)
+    off = 2.0 * np.arctan2(across, np.abs(along))
+    squared = (off**2).sum(axis=1) / np.maximum(count, 1)
+    return count, np.where(count > 0, np.sqrt(squared), math.pi), Rotation.from_quat(mean)
 
 
 def _read_at(

@@ -268,7 +268,7 @@ class Child:
 
     def wait_for_processor(self, processor_s: float) -> bool:
         """Wait until it has used a processor for a time; True where it has ended before."""
-        while self.wait(0.001) is None:
+        while self.wait(0.005) is None:
             if graph.processor_s(self._number) >= processor_s:
                 return False
         return True

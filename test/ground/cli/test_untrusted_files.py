@@ -15,7 +15,7 @@ import pytest
 
 from starcal_ground.cli import main
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures('forked_readers')]
 _MOST_BYTES = 1 << 30  # that a file adds to the memory
 
 

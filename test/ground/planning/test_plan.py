@@ -72,6 +72,7 @@ def test_the_images_then_give_the_sigma_that_was_expected(
     assert planned.in_a_sentence().startswith('map_arcsec 0.')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['map', 'line_of_sight', 'fx'])
 def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
     setup: Setup, ensemble: Ensemble, name: str

@@ -114,6 +114,7 @@ def test_an_image_without_a_rate_turns_as_the_others_do(stated: dict[str, object
 NOISY = World(rate_deg_s=0.05, row_s=20e-3 / 1024, tracker_arcsec=20.0, tracker_hz=4.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('filter_s', [0.0, 0.5])
 @pytest.mark.parametrize('stated', [{}, {'shutter': 'rolling', 'readout_s': 0.02}])
 def test_rates_by_samples_with_errors_of_their_own_show_no_absent_readout(

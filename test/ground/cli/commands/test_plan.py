@@ -23,6 +23,7 @@ def allowed(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_table_and_the_file_say_the_same(
     allowed: Path, tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

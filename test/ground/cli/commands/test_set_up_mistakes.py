@@ -27,8 +27,6 @@ from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TY
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
-pytestmark = pytest.mark.slow
-
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 IMAGES = 4
 
@@ -137,6 +135,7 @@ def said(
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('write', 'shift_s', 'words'),
     [
@@ -162,6 +161,7 @@ def test_a_mistake_of_the_bag(
             assert word.lower() in text.lower(), text
 
 
+@pytest.mark.slow
 def test_clocks_that_cannot_be_matched_are_two_clocks(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +172,7 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(
         assert 'stamp_offset_s' in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('scale', 'commands'), [(2.0, ('diagnose', 'inspect')), (0.5, ('calibrate',))]
 )

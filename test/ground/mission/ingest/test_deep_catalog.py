@@ -29,7 +29,8 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, StarcalError
 from starcal_ros.sky.catalog import load_catalog, MotionSource, StarCatalog, UNMOVED
 
-pytestmark = pytest.mark.slow  # a child process reads each table
+# A child process reads each table.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('forked_readers')]
 
 BUNDLED = load_catalog()
 FAINT = 300

@@ -30,7 +30,7 @@ from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.records import Image
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.usefixtures('forked_readers')
 
 ALIGNMENT = yaml.safe_load((TINY / 'params.yaml').read_text())['/**']['ros__parameters'][
     'prior_alignment'
@@ -50,6 +50,7 @@ def words(text: str, **values: object) -> list[str]:
     return [word.format(**values) for word in text.split()]
 
 
+@pytest.mark.slow
 def test_the_imported_bag_gives_the_calibration_of_the_original(
     night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -88,6 +89,7 @@ def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, capsys)
     assert (tmp_path / 'bag_import.json').exists()
 
 
+@pytest.mark.slow
 def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     start = aem.read_text().index('META_START')

@@ -86,6 +86,7 @@ def test_an_image_that_was_not_solved_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('forked_readers')
 def test_solved_fits_images_are_imported_and_calibrated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
