@@ -21,7 +21,6 @@ import numpy as np
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images.from_stars import (
     count_of_stars,
-    FEWEST_SOURCES,
     from_stars,
     FromStars,
     options_of,
@@ -44,6 +43,7 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.identification.blind.images import FEWEST_SOURCES
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, Setup
 from starcal_ros.pipeline.solve import inputs_of

@@ -77,6 +77,11 @@ class SkyMatch:
     log10_p_value: float
     residual_px: float
 
+    @property
+    def camera_px(self) -> Floats:
+        """Pixels (n, 2) in the image that ``camera`` is of: mirrored where that is."""
+        return mirror(self.xy_px, self.camera.width) if self.mirrored else self.xy_px
+
 
 @dataclass(frozen=True)
 class NotFound:
@@ -102,30 +107,33 @@ def find_sky(
     ``try_mirrored`` the mirror image is searched too.  ``rounds`` is a part of `ROUNDS`; the
     search ends when the processor time of the thread reaches ``deadline_s``.
     """
-    found, _ = find_in_any([xy_px], camera, catalog, try_mirrored, rounds, deadline_s)
-    return found
+    ways = (False, True) if try_mirrored else (False,)
+    return find_in_any([xy_px], camera, catalog, ways, rounds, deadline_s)[0]
 
 
 def find_in_any(
     rankings: Sequence[Floats],
     camera: CameraModel,
     catalog: StarCatalog,
-    try_mirrored: bool = False,
+    mirrored: Sequence[bool] = (False,),
     rounds: Sequence[tuple[int, int]] = ROUNDS,
     deadline_s: float = math.inf,
 ) -> tuple[SkyMatch | NotFound, int]:
-    """As `find_sky` for several selections of the sources of an image; the row of the matched."""
+    """
+    As `find_sky` for several selections of the sources of an image; the row of the matched.
+
+    ``mirrored`` are the ways that each is tried.
+    """
     seen = [
-        _Seen(SourceImage(xy_px, camera), False, k)
+        _Seen(_image(xy_px, camera, turned), turned, k)
         for k, xy_px in enumerate(rankings)
         if len(xy_px) >= _FEWEST_SOURCES
+        for turned in mirrored
     ]
     if not seen:
         count = max(len(xy_px) for xy_px in rankings)
         return NotFound(f'{count} star-like sources, at least {_FEWEST_SOURCES} are needed'), 0
-    if try_mirrored:
-        seen = [one for k in seen for one in (k, k.turned())]
-    tried = math.log10(1 + try_mirrored)
+    tried = math.log10(len(mirrored))
     least = math.inf
     for before, sources in rounds:
         chosen = [one for one in seen if len(one.image.xy_px) > before]
@@ -150,11 +158,12 @@ class _Seen:
     mirrored: bool
     ranking: int
 
-    def turned(self) -> _Seen:
-        """The mirror image."""
-        camera = self.image.camera
-        xy_px = mirror(self.image.xy_px, camera.width)
-        return _Seen(SourceImage(xy_px, mirrored_camera(camera)), True, self.ranking)
+
+def _image(xy_px: Floats, camera: CameraModel, mirrored: bool) -> SourceImage:
+    """Sources (n, 2) with a prior camera, or those of the mirror image."""
+    if not mirrored:
+        return SourceImage(xy_px, camera)
+    return SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera))
 
 
 def _candidates(
@@ -185,9 +194,7 @@ def confirm_sky(
     mirrored: bool = False,
 ) -> SkyMatch | NotFound:
     """Identified stars, as from `find_sky`, given a rotation known to 10 % of the field."""
-    image = SourceImage(xy_px, camera)
-    if mirrored:
-        image = SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera))
+    image = _image(xy_px, camera, mirrored)
     stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
     start = SkyFit(camera_from_icrf, image.camera, stars)
     pairs = _shifted_alike(image, catalog, start)

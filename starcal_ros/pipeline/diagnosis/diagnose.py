@@ -19,6 +19,12 @@ import numpy as np
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
+from starcal_ros.identification.blind.images import (
+    FEWEST_SOURCES,
+    Identified,
+    identify_images,
+    Solved,
+)
 from starcal_ros.pipeline.diagnosis.attitude_reading import (
     Case,
     CLOCK_SEARCH_S,
@@ -26,12 +32,6 @@ from starcal_ros.pipeline.diagnosis.attitude_reading import (
     prior_alignment,
     Reading,
     WireAttitudes,
-)
-from starcal_ros.pipeline.diagnosis.identified import (
-    FEWEST_SOURCES,
-    Identified,
-    identify_images,
-    Solved,
 )
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
