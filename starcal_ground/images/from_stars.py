@@ -24,8 +24,11 @@ from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.lens import ideal_points
 from starcal_ros.errors import NotFromStars
-from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.problem import State
+from starcal_ros.estimation.search import minimise, moved_to_stars, problem_of, start_of
+from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.identification.blind import search
 from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
 from starcal_ros.identification.blind.images import FEWEST_SOURCES, ImageSearch
@@ -55,6 +58,9 @@ _NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
+_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 1e-3  # as of the first search of the estimate
+_FREE_ARCSEC = 7200.0  # of the rotation of an image, which trades with its principal point
+_FEWEST_STARS, _MORE_STARS = 30, 1.02  # of all images, and over those of the camera before
 _SIGMA_ARCSEC = 60.0  # of the rotations, above what refraction and aberration change in them
 
 
@@ -151,7 +157,8 @@ def from_stars(
             f'{len(matches)} of {len(seen)} images match the sky, {min_images} are needed:'
             f' {ADVICE}; no clouds, no lights, no frames of anything else'
         )
-    camera, rotations = _common_camera(matches, catalog)
+    sources = {one.time_ns: one.rankings[-1] for one in rich}
+    camera, rotations = _common_camera(matches, sources, catalog)
     (mirrored,) = finder.mirrored
     return FromStars(camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies))
 
@@ -172,11 +179,12 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], 
                 f'images of {size[0]} x {size[1]} and of {width} x {height}: give those of one'
                 ' camera and mode'
             )
-        digest, noise = hash(image.pixels.tobytes()), _noise(image.pixels)
+        noise = _noise(image.pixels)
+        digest = 0 if noise.any() else hash(image.pixels.tobytes())
         if digest in sums or any(float(noise @ other) > _SAME_NOISE for other in noises):
             copies.append(image.time_ns)
             continue
-        sums.add(digest)
+        sums |= {digest} - {0}
         noises.append(noise)
         sources = bright_sources(image.pixels)
         # The structure of a corona is wide along both axes, as few stars are.
@@ -327,22 +335,42 @@ def _focal_px(camera: CameraModel, model: str) -> float:
 
 
 def _common_camera(
-    matches: Mapping[int, SkyMatch], catalog: StarCatalog
+    matches: dict[int, SkyMatch], sources: Mapping[int, Floats], catalog: StarCatalog
 ) -> tuple[CameraModel, dict[int, Rotation]]:
-    """The camera that fits all matches, and the rotations ``icrf_from_camera`` with it."""
-    stars = sum(len(sky.xy_px) for sky in matches.values())
+    """
+    The camera that fits all matches, and the rotations ``icrf_from_camera`` with it.
+
+    The camera of one image is wrong where that shows no stars: ``sources`` (n, 2) by stamp are
+    matched again with that of all, until it matches no more of them.
+    """
     parameters = np.median([sky.camera.parameters for sky in matches.values()], axis=0)
     camera = dataclasses.replace(next(iter(matches.values())).camera, parameters=parameters)
-    if len(matches) < 2 or stars < 30:
-        return camera, {t: sky.camera_from_icrf.inv() for t, sky in matches.items()}
-    options = CalibrationOptions(
-        method='per_image', min_images=1, min_stars=10, velocity_sigma_m_s=0.0
-    )
-    images = tuple(_observations(*one, catalog, camera) for one in matches.items())
+    stars = 0
+    while len(matches) > 1:
+        before, stars = stars, sum(len(sky.xy_px) for sky in matches.values())
+        if stars < max(_FEWEST_STARS, _MORE_STARS * before):
+            break
+        images = tuple(_observations(*one, catalog, camera) for one in matches.items())
+        state = _robust_search(images, camera)
+        camera = dataclasses.replace(camera, parameters=state.parameters)
+        matches = {
+            t: search.matched_again(sky, sources[t], catalog, camera, rotation)
+            for (t, sky), rotation in zip(matches.items(), state.camera_from_icrf, strict=True)
+        }
+    return camera, {t: sky.camera_from_icrf.inv() for t, sky in matches.items()}
+
+
+def _robust_search(images: tuple[StarObservations, ...], camera: CameraModel) -> State:
+    """Camera and rotations that fit images, without the variances and sigmas of an estimate."""
+    options = CalibrationOptions(method='per_image', star_tracker_sigma_arcsec=(_FREE_ARCSEC,) * 3)
     geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    fit = estimate_calibration(Ensemble(images), geometry, options)
-    rotations = dict(zip(matches, fit.linear.state.camera_from_icrf.inv(), strict=True))
-    return dataclasses.replace(fit.geometry.camera, field=None), rotations
+    table, problem = star_table(images), problem_of(Ensemble(images), geometry, options)
+    start = moved_to_stars(problem, start_of(problem, geometry, 0, False), table, camera)
+    measurements = arrange(table, np.ones(len(table), bool), table.covariance_px2)
+    try:
+        return minimise(problem, start, measurements, _ROBUST_SCALE, _ROBUST_GAIN).state
+    except NotObservable:
+        return start
 
 
 def _observations(

@@ -24,6 +24,7 @@ from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind import search
 from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources, smear
 from starcal_ros.identification.blind.search import SkyMatch
+from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -44,8 +45,9 @@ class ImageSearch:
     Search for images of one camera; the first match gives its camera and handedness to the others.
 
     ``camera`` is the prior of the images as they are given, then that of the first match;
-    ``mirrored`` the ways that they are tried.  Images are given by rankings of their sources, each
-    (n, 2), brightest first; that of the last match is tried first.
+    ``mirrored`` the ways that they are tried; ``ranges`` those of the camera, searched in turn, so
+    that an image of another focal length is found too.  Images are given by rankings of their
+    sources, each (n, 2), brightest first; that of the last match is tried first.
     """
 
     camera: CameraModel
@@ -53,6 +55,7 @@ class ImageSearch:
     deadline_s: float = math.inf
     mirrored: tuple[bool, ...] = (False, True)
     ranking: int = 0
+    ranges: tuple[Ranges, ...] = (STATED,)
 
     def is_over(self) -> bool:
         """True if the processor time of the thread has reached the deadline."""
@@ -62,7 +65,9 @@ class ImageSearch:
         """Match of an image with one of some rotations ``camera_from_icrf``."""
         rows = self._order(rankings)
         for mirrored, rotation, row in itertools.product(self.mirrored, rotations, rows):
-            sky = search.confirm_sky(rankings[row], self.camera, self.catalog, rotation, mirrored)
+            sky = search.confirm_sky(
+                rankings[row], self.camera, self.catalog, rotation, mirrored, self.ranges[0]
+            )
             if isinstance(sky, SkyMatch):
                 return self.take(sky, row)
         return None
@@ -78,21 +83,25 @@ class ImageSearch:
         if len(self.mirrored) > 1:
             fx, fy = (scale * float(camera.parameters[k]) for k in (0, 2))
             camera = camera.replace(fx=fx, fy=fy)
-        sky, row = search.find_in_any(
-            [rankings[row] for row in rows],
-            camera,
-            self.catalog,
-            self.mirrored,
-            rounds,
-            self.deadline_s,
-        )
-        return self.take(sky, rows[row]) if isinstance(sky, SkyMatch) else None
+        for ranges in self.ranges:
+            sky, row = search.find_in_any(
+                [rankings[row] for row in rows],
+                camera,
+                self.catalog,
+                self.mirrored,
+                rounds,
+                self.deadline_s,
+                ranges,
+            )
+            if isinstance(sky, SkyMatch):
+                return self.take(sky, rows[row])
+        return None
 
     def take(self, sky: SkyMatch, ranking: int) -> SkyMatch:
         """The match, whose camera the others have if it is the first."""
         self.ranking = ranking
         if len(self.mirrored) > 1:
-            self.mirrored = (sky.mirrored,)
+            self.mirrored, self.ranges = (sky.mirrored,), (FOUND, STATED)
             self.camera = search.mirrored_camera(sky.camera) if sky.mirrored else sky.camera
         return sky
 
