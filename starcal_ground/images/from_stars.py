@@ -57,6 +57,7 @@ _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
 _NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
+_OTHERS = 20, 80  # percentiles between which the focal lengths of one camera lie
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
 _ROBUST_SCALE, _ROBUST_GAIN = 3.0, 1e-3  # as of the first search of the estimate
 _FREE_ARCSEC = 7200.0  # of the rotation of an image, which trades with its principal point
@@ -310,7 +311,7 @@ def _of_one_lens(
     if not matches:
         return {}, ()
     focal_px = np.array([_focal_px(sky.camera, sky.camera.model) for sky in matches.values()])
-    low, high = np.percentile(focal_px, [10, 90])
+    low, high = np.percentile(focal_px, _OTHERS)
     if high > (1 + _SAME_CAMERA) * low:
         raise NotFromStars(
             f'focal lengths of {low:.0f} to {high:.0f} px: several lenses, a zoom or a change of'
