@@ -95,23 +95,16 @@ class NotFound:
 
 
 def find_sky(
-    xy_px: Floats,
-    camera: CameraModel,
-    catalog: StarCatalog,
-    try_mirrored: bool = False,
-    rounds: Sequence[tuple[int, int]] = ROUNDS,
-    deadline_s: float = math.inf,
+    xy_px: Floats, camera: CameraModel, catalog: StarCatalog, try_mirrored: bool = False
 ) -> SkyMatch | NotFound:
     """
     Identified stars among sources (n, 2), brightest first, or the reason why there are none.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the mirror image is searched too.  ``rounds`` is a part of `ROUNDS`; the
-    search ends when the processor time of the thread reaches ``deadline_s``.
+    ``try_mirrored`` the mirror image is searched too.
     """
-    ways = (False, True) if try_mirrored else (False,)
-    return find_in_any([xy_px], camera, catalog, ways, rounds, deadline_s)[0]
+    return find_in_any([xy_px], camera, catalog, (False, True) if try_mirrored else (False,))[0]
 
 
 def find_in_any(
@@ -126,7 +119,8 @@ def find_in_any(
     """
     As `find_sky` for several selections of the sources of an image; the row of the matched.
 
-    ``mirrored`` are the ways that each is tried, ``ranges`` those of the camera.
+    ``mirrored`` are the ways that each is tried, ``rounds`` a part of `ROUNDS`, ``ranges`` those
+    of the camera.  The search ends when the processor time of the thread reaches ``deadline_s``.
     """
     seen = [
         _Seen(_image(xy_px, camera, turned, ranges), turned, k)
