@@ -10,7 +10,7 @@ from the rotations (method ``per_image``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -24,10 +24,15 @@ from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.lens import ideal_points
 from starcal_ros.errors import NotFromStars
-from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.problem import State
+from starcal_ros.estimation.search import minimise, moved_to_stars, problem_of, start_of
+from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.identification.blind import search
 from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
+from starcal_ros.identification.blind.images import FEWEST_SOURCES, ImageSearch
+from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.catalog import StarCatalog
@@ -46,14 +51,17 @@ _HALF_FIELDS_DEG = (
 _SEARCHED = 4  # images that are searched over all focal lengths
 _SEARCH_S = 150.0  # of processor time
 _CENTROID_PX = 0.3  # of a bright source
-FEWEST_SOURCES = 6
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
 # Of noise: exposures have 0, or 0.3 by what their sensor adds to each.
 _NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
+_OTHERS = 20, 80  # percentiles between which the focal lengths of one camera lie
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
+_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 1e-3  # as of the first search of the estimate
+_FREE_ARCSEC = 7200.0  # of the rotation of an image, which trades with its principal point
+_FEWEST_STARS, _MORE_STARS = 30, 1.02  # of all images, and over those of the camera before
 _SIGMA_ARCSEC = 60.0  # of the rotations, above what refraction and aberration change in them
 
 
@@ -97,14 +105,13 @@ class FromStars:
 @dataclass(frozen=True)
 class _Sources:
     """
-    Sources of an image: all by their light, and the compact ones, without glare.
+    Sources of an image: the compact ones, without glare, and all by their light.
 
     ``stars`` counts those that may be stars; 0 in a picture of anything but the night sky.
     """
 
     time_ns: int
-    all: Floats
-    compact: Floats
+    rankings: tuple[Floats, Floats]
     stars: int
 
 
@@ -135,9 +142,9 @@ def from_stars(
         )
     half_px = 0.5 * math.hypot(*size)
     usual = (_usual(size, half_px, model, math.radians(deg)) for model, deg in _HALF_FIELDS_DEG)
-    matched = None if prior is None else _first_match(rich, [prior], catalog)
-    matched = matched or _first_match(rich, list(usual), catalog)
-    if matched is None:
+    finder = None if prior is None else _first_match(rich, [prior], catalog)
+    finder = finder or _first_match(rich, list(usual), catalog)
+    if finder is None:
         given = f'{float(prior.parameters[0]):.0f} px or ' if prior is not None else ''
         raise NotFromStars(
             f'the stars of {len(seen)} images match no part of the sky of the catalog, with'
@@ -145,17 +152,16 @@ def from_stars(
             ' clouds, no lights; fields under 3 degrees need their focal length and a catalog of'
             ' their region (starcal catalog)'
         )
-    first, compact_first = matched
-    matches, other_focal_px = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
+    matches, other_focal_px = _of_one_lens(_all_matches(rich, finder))
     if len(matches) < min_images:
         raise NotFromStars(
             f'{len(matches)} of {len(seen)} images match the sky, {min_images} are needed:'
             f' {ADVICE}; no clouds, no lights, no frames of anything else'
         )
-    camera, rotations = _common_camera(matches, catalog, first.camera)
-    return FromStars(
-        camera, first.mirrored, rotations, len(seen), other_focal_px, frozenset(copies)
-    )
+    sources = {one.time_ns: one.rankings[-1] for one in rich}
+    camera, rotations = _common_camera(matches, sources, catalog)
+    (mirrored,) = finder.mirrored
+    return FromStars(camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies))
 
 
 def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], list[int]]:
@@ -174,18 +180,19 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], 
                 f'images of {size[0]} x {size[1]} and of {width} x {height}: give those of one'
                 ' camera and mode'
             )
-        digest, noise = hash(image.pixels.tobytes()), _noise(image.pixels)
+        noise = _noise(image.pixels)
+        digest = 0 if noise.any() else hash(image.pixels.tobytes())
         if digest in sums or any(float(noise @ other) > _SAME_NOISE for other in noises):
             copies.append(image.time_ns)
             continue
-        sums.add(digest)
+        sums |= {digest} - {0}
         noises.append(noise)
         sources = bright_sources(image.pixels)
         # The structure of a corona is wide along both axes, as few stars are.
         middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
         compact = sources.xy_px[sources.wide_px <= middle_px]
         stars = _count_of_stars(image.pixels, sources)
-        seen.append(_Sources(image.time_ns, sources.xy_px, compact, stars))
+        seen.append(_Sources(image.time_ns, (compact, sources.xy_px), stars))
     return seen, size, copies
 
 
@@ -246,78 +253,56 @@ def _without_distortion(size: tuple[int, int], focal_px: float, model: str) -> C
 
 def _first_match(
     seen: Sequence[_Sources], cameras: Sequence[CameraModel], catalog: StarCatalog
-) -> tuple[search.SkyMatch, bool] | None:
-    """An image identified with one of the cameras, and whether by its compact sources."""
+) -> ImageSearch | None:
+    """The search that one of the cameras has identified an image for."""
     deadline_s = time.thread_time() + _SEARCH_S
     ordered = sorted(seen, key=lambda one: -one.stars)
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
         for camera in cameras:
-            rankings = (one.compact, one.all)
-            sky, matched = search.find_in_any(
-                rankings, camera, catalog, True, search.ROUNDS[:1], deadline_s
-            )
-            if isinstance(sky, search.SkyMatch):
-                return _of_better_lens(sky, rankings[matched], catalog), matched == 0
-            if time.thread_time() > deadline_s:
+            finder = ImageSearch(camera, catalog, deadline_s)
+            if sky := finder.look_up(one.rankings, search.ROUNDS[:1]):
+                better = _of_better_lens(sky, one.rankings[finder.ranking], catalog)
+                found = ImageSearch(camera, catalog)
+                found.take(better, finder.ranking)
+                return found
+            if finder.is_over():
                 return None
     return None
 
 
-def _of_better_lens(sky: search.SkyMatch, xy_px: Floats, catalog: StarCatalog) -> search.SkyMatch:
+def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMatch:
     """A match of sources (n, 2), or the same with an equidistant lens where that shows more."""
     if sky.camera.model == _EQUIDISTANT:
         return sky
-    turned_px = search.mirror(xy_px, sky.camera.width) if sky.mirrored else xy_px
     # Without distortion: coefficients fitted to a perspective lens bend corners without stars.
     size, focal_px = (sky.camera.width, sky.camera.height), _focal_px(sky.camera, _EQUIDISTANT)
     camera = _without_distortion(size, focal_px, _EQUIDISTANT)
     cx, cy = sky.camera.parameters[3:5].tolist()
-    other = search.confirm_sky(
-        turned_px, camera.replace(cx=cx, cy=cy), catalog, sky.camera_from_icrf
-    )
-    if isinstance(other, search.SkyMatch) and (
+    camera = camera.replace(cx=cx, cy=cy)
+    if sky.mirrored:
+        camera = search.mirrored_camera(camera)
+    other = search.confirm_sky(xy_px, camera, catalog, sky.camera_from_icrf, sky.mirrored)
+    if isinstance(other, SkyMatch) and (
         len(other.xy_px) > _MORE * len(sky.xy_px) or other.residual_px < _CLOSER * sky.residual_px
     ):
-        return dataclasses.replace(other, mirrored=sky.mirrored)
+        return other
     return sky
 
 
-def _all_matches(
-    seen: Sequence[_Sources], first: search.SkyMatch, compact_first: bool, catalog: StarCatalog
-) -> dict[int, search.SkyMatch]:
-    """The images that the camera of the first match identifies, by stamp, mirrored back."""
-    matches: dict[int, search.SkyMatch] = {}
-    camera = first.camera
-    before: search.SkyMatch | search.NotFound = search.NotFound('')
+def _all_matches(seen: Sequence[_Sources], finder: ImageSearch) -> dict[int, SkyMatch]:
+    """The images that the camera of the first match identifies, by stamp."""
+    matches: dict[int, SkyMatch] = {}
+    before: list[Rotation] = []
     for one in seen:
-        rankings = [one.compact, one.all] if compact_first else [one.all, one.compact]
-        if first.mirrored:
-            rankings = [search.mirror(xy_px, camera.width) for xy_px in rankings]
-        for sky in _attempts(rankings, camera, catalog, before):
-            if isinstance(sky, search.SkyMatch):
-                matches[one.time_ns] = before = sky
-                break
+        if sky := finder.guess(one.rankings, before) or finder.look_up(one.rankings):
+            matches[one.time_ns], before = sky, [sky.camera_from_icrf]
     return matches
 
 
-def _attempts(
-    rankings: Sequence[Floats],
-    camera: CameraModel,
-    catalog: StarCatalog,
-    before: search.SkyMatch | search.NotFound,
-) -> Iterator[search.SkyMatch | search.NotFound]:
-    """Matches of an image, the cheapest first: at the rotation before, then of few patterns."""
-    if isinstance(before, search.SkyMatch):
-        for xy_px in rankings:
-            yield search.confirm_sky(xy_px, camera, catalog, before.camera_from_icrf)
-    for rounds in (search.ROUNDS[:1], search.ROUNDS[1:]):
-        yield search.find_in_any(rankings, camera, catalog, rounds=rounds)[0]
-
-
 def _of_one_lens(
-    matches: Mapping[int, search.SkyMatch],
-) -> tuple[dict[int, search.SkyMatch], tuple[float, ...]]:
+    matches: Mapping[int, SkyMatch],
+) -> tuple[dict[int, SkyMatch], tuple[float, ...]]:
     """
     The matches with the focal length of most, and the focal lengths of the others.
 
@@ -326,7 +311,7 @@ def _of_one_lens(
     if not matches:
         return {}, ()
     focal_px = np.array([_focal_px(sky.camera, sky.camera.model) for sky in matches.values()])
-    low, high = np.percentile(focal_px, [10, 90])
+    low, high = np.percentile(focal_px, _OTHERS)
     if high > (1 + _SAME_CAMERA) * low:
         raise NotFromStars(
             f'focal lengths of {low:.0f} to {high:.0f} px: several lenses, a zoom or a change of'
@@ -351,26 +336,46 @@ def _focal_px(camera: CameraModel, model: str) -> float:
 
 
 def _common_camera(
-    matches: Mapping[int, search.SkyMatch], catalog: StarCatalog, camera: CameraModel
+    matches: dict[int, SkyMatch], sources: Mapping[int, Floats], catalog: StarCatalog
 ) -> tuple[CameraModel, dict[int, Rotation]]:
-    """The camera that fits all matches, and the rotations ``icrf_from_camera`` with it."""
-    stars = sum(len(sky.xy_px) for sky in matches.values())
+    """
+    The camera that fits all matches, and the rotations ``icrf_from_camera`` with it.
+
+    The camera of one image is wrong where that shows no stars: ``sources`` (n, 2) by stamp are
+    matched again with that of all, until it matches no more of them.
+    """
     parameters = np.median([sky.camera.parameters for sky in matches.values()], axis=0)
-    camera = dataclasses.replace(camera, parameters=parameters)
-    if len(matches) < 2 or stars < 30:
-        return camera, {t: sky.camera_from_icrf.inv() for t, sky in matches.items()}
-    options = CalibrationOptions(
-        method='per_image', min_images=1, min_stars=10, velocity_sigma_m_s=0.0
-    )
-    images = tuple(_observations(*one, catalog, camera) for one in matches.items())
+    camera = dataclasses.replace(next(iter(matches.values())).camera, parameters=parameters)
+    stars = 0
+    while len(matches) > 1:
+        before, stars = stars, sum(len(sky.xy_px) for sky in matches.values())
+        if stars < max(_FEWEST_STARS, _MORE_STARS * before):
+            break
+        images = tuple(_observations(*one, catalog, camera) for one in matches.items())
+        state = _robust_search(images, camera)
+        camera = dataclasses.replace(camera, parameters=state.parameters)
+        matches = {
+            t: search.matched_again(sky, sources[t], catalog, camera, rotation)
+            for (t, sky), rotation in zip(matches.items(), state.camera_from_icrf, strict=True)
+        }
+    return camera, {t: sky.camera_from_icrf.inv() for t, sky in matches.items()}
+
+
+def _robust_search(images: tuple[StarObservations, ...], camera: CameraModel) -> State:
+    """Camera and rotations that fit images, without the variances and sigmas of an estimate."""
+    options = CalibrationOptions(method='per_image', star_tracker_sigma_arcsec=(_FREE_ARCSEC,) * 3)
     geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    fit = estimate_calibration(Ensemble(images), geometry, options)
-    rotations = dict(zip(matches, fit.linear.state.camera_from_icrf.inv(), strict=True))
-    return dataclasses.replace(fit.geometry.camera, field=None), rotations
+    table, problem = star_table(images), problem_of(Ensemble(images), geometry, options)
+    start = moved_to_stars(problem, start_of(problem, geometry, 0, False), table, camera)
+    measurements = arrange(table, np.ones(len(table), bool), table.covariance_px2)
+    try:
+        return minimise(problem, start, measurements, _ROBUST_SCALE, _ROBUST_GAIN).state
+    except NotObservable:
+        return start
 
 
 def _observations(
-    time_ns: int, sky: search.SkyMatch, catalog: StarCatalog, camera: CameraModel
+    time_ns: int, sky: SkyMatch, catalog: StarCatalog, camera: CameraModel
 ) -> StarObservations:
     """Identified sources as observations of stars; their attitude is that of the camera."""
     rows, n = sky.catalog_index, len(sky.catalog_index)
@@ -381,7 +386,7 @@ def _observations(
         catalog_id=catalog.id[rows],
         direction_icrf=catalog.direction_icrs[rows],
         magnitude=catalog.magnitude[rows].astype(np.float32),
-        measured_px=sky.xy_px,
+        measured_px=sky.camera_px,
         covariance_px2=np.tile([_CENTROID_PX**2, 0.0, _CENTROID_PX**2], (n, 1)),
         flux_dn=np.full(n, np.nan, np.float32),
         snr=np.full(n, np.nan, np.float32),

@@ -21,7 +21,6 @@ import numpy as np
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images.from_stars import (
     count_of_stars,
-    FEWEST_SOURCES,
     from_stars,
     FromStars,
     options_of,
@@ -44,7 +43,9 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.identification.blind.images import FEWEST_SOURCES
 from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.diagnosis.bags import refusals
 from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, Setup
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
@@ -70,15 +71,23 @@ class NightSky:
     is_located: bool
     topics: Topics
     copies_ns: frozenset[int] = frozenset()
+    identified_ns: frozenset[int] = frozenset()
 
     def through_air(
         self, observations: Sequence[StarObservations]
     ) -> tuple[list[StarObservations], str]:
-        """Observations, refracted if the stars show it and no site is given, and a note on it."""
-        images = [self._in_words_of_stars(one) for one in observations]
-        if self.is_located:
-            return images, ''
-        return with_air(images, self.setup.prior.camera)
+        """Observations, refracted if the stars show it and no site is given, and notes on them."""
+        images, note = [self._in_words_of_stars(one) for one in observations], ''
+        if not self.is_located:
+            images, note = with_air(images, self.setup.prior.camera)
+        lost = refusals(one for one in images if one.time_ns in self.identified_ns)
+        notes = [note] if note else []
+        notes += [
+            f'{row.count} images are refused as {row.reason} though identified by their stars:'
+            f' {row.detail or row.meaning}'
+            for row in lost
+        ]
+        return images, '; '.join(notes)
 
     def _in_words_of_stars(self, one: StarObservations) -> StarObservations:
         """Observations of a copy refused, and of an image without stars as such."""
@@ -271,7 +280,15 @@ def _set_up(
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
     topics = dataclasses.replace(given, attitude=_ATTITUDE_TOPIC)
-    return NightSky((*bags, attitudes), setup, tuple(notes), is_located, topics, stars.copies_ns)
+    return NightSky(
+        (*bags, attitudes),
+        setup,
+        tuple(notes),
+        is_located,
+        topics,
+        stars.copies_ns,
+        frozenset(stars.icrf_from_camera),
+    )
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:

@@ -58,15 +58,11 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     # The second round is centred on the first centroid: neighbours at the rim then count less.
     offset = np.zeros((len(centre), 2))
     for radius_px in (4.0, 5.0):
-        u, v = (
-            reach[None, None] - offset[:, 0, None, None],
-            reach[None, :, None] - offset[:, 1, None, None],
-        )
-        weight = light * (u * u + v * v <= radius_px**2)
+        u2, v2 = ((reach - offset[:, k, None]) ** 2 for k in (0, 1))
+        weight = light * (u2[:, None] + v2[:, :, None] <= radius_px**2)
         flux = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
-        offset = offset + np.stack(
-            [(weight * u).sum(axis=(1, 2)) / flux, (weight * v).sum(axis=(1, 2)) / flux], axis=-1
-        )
+        middle = [weight.sum(axis=axis) @ reach / flux for axis in (1, 2)]
+        offset = np.stack(middle, axis=-1)
     long_px, wide_px, along_rad = _extents(light, reach)
     total = light.sum(axis=(1, 2))
     order = np.argsort(-total, kind='stable')

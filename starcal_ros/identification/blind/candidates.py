@@ -27,7 +27,7 @@ from starcal_ros.identification.blind.pattern_index import (
     shapes,
     sphere_points,
 )
-from starcal_ros.identification.blind.sky_fit import FOCAL_RANGE, SourceImage
+from starcal_ros.identification.blind.sky_fit import SourceImage
 from starcal_ros.sky.catalog import StarCatalog
 
 _KEPT = 32  # number of best candidates of a look-up
@@ -39,6 +39,7 @@ _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
 _SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
+_KNOWN = 0.05  # half range of the focal length from which a field is searched with one
 _LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
 _CERTAIN_GAIN = 1.5  # such a gain that few false candidates reach and most true ones do
 
@@ -113,19 +114,19 @@ class View:
         return np.take_along_axis(chosen, order, axis=1), shape
 
 
-def focal_scales(half_diagonal_rad: float) -> tuple[float, ...]:
+def focal_scales(image: SourceImage) -> tuple[float, ...]:
     """Focal lengths to try, over the prior; in a narrow field shapes do not depend on it."""
-    if half_diagonal_rad < math.radians(12.0):
+    if image.half_diagonal_rad < math.radians(12.0) or image.ranges.focal < _KNOWN:
         return (1.0,)
-    if half_diagonal_rad < math.radians(24.0):
+    if image.half_diagonal_rad < math.radians(24.0):
         return (1.0, 0.86, 1.16)
     return (1.0, 0.91, 1.1, 0.83, 1.2)
 
 
-def _tolerances(half_diagonal_rad: float) -> tuple[float, float]:
+def _tolerances(image: SourceImage) -> tuple[float, float]:
     """Largest error of the shape of a pattern, and of the logarithm of its size."""
-    size = {1: FOCAL_RANGE + 0.05, 3: 0.16, 5: 0.13}[len(focal_scales(half_diagonal_rad))]
-    return 0.012 + 0.04 * half_diagonal_rad, size
+    size = {1: image.ranges.focal + 0.05, 3: 0.16, 5: 0.13}[len(focal_scales(image))]
+    return 0.012 + 0.04 * image.half_diagonal_rad, size
 
 
 def look_up(
@@ -133,7 +134,7 @@ def look_up(
 ) -> Candidates:
     """The most likely candidates from `View.patterns` and the index of one scale."""
     index = pattern_index(catalog, scale)
-    place_tolerance, size_tolerance = _tolerances(view.image.half_diagonal_rad)
+    place_tolerance, size_tolerance = _tolerances(view.image)
     sources, shape = patterns
     fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
     sources, shape = equivalent(sources[fits], shape[fits], place_tolerance)

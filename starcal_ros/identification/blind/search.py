@@ -24,13 +24,15 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.identification.blind.candidates import Candidates, focal_scales, look_up, View
 from starcal_ros.identification.blind.pattern_index import scales_for
 from starcal_ros.identification.blind.sky_fit import (
-    FOCAL_RANGE,
+    FOUND,
     log10_p_value,
     match,
     predicted,
+    Ranges,
     refined,
     SkyFit,
     SourceImage,
+    STATED,
 )
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -44,6 +46,7 @@ _GUESSED = 0.2  # largest shift of a guess, half diagonals
 _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
 _OF_A_GUESS = 40  # brightest stars and sources compared with a guess
 _FEWEST_SOURCES = 5
+_AGAIN_PX = 3.0  # radius of matching with a better camera
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,11 @@ class SkyMatch:
     log10_p_value: float
     residual_px: float
 
+    @property
+    def camera_px(self) -> Floats:
+        """Pixels (n, 2) in the image that ``camera`` is of: mirrored where that is."""
+        return mirror(self.xy_px, self.camera.width) if self.mirrored else self.xy_px
+
 
 @dataclass(frozen=True)
 class NotFound:
@@ -87,45 +95,43 @@ class NotFound:
 
 
 def find_sky(
-    xy_px: Floats,
-    camera: CameraModel,
-    catalog: StarCatalog,
-    try_mirrored: bool = False,
-    rounds: Sequence[tuple[int, int]] = ROUNDS,
-    deadline_s: float = math.inf,
+    xy_px: Floats, camera: CameraModel, catalog: StarCatalog, try_mirrored: bool = False
 ) -> SkyMatch | NotFound:
     """
     Identified stars among sources (n, 2), brightest first, or the reason why there are none.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the mirror image is searched too.  ``rounds`` is a part of `ROUNDS`; the
-    search ends when the processor time of the thread reaches ``deadline_s``.
+    ``try_mirrored`` the mirror image is searched too.
     """
-    found, _ = find_in_any([xy_px], camera, catalog, try_mirrored, rounds, deadline_s)
-    return found
+    return find_in_any([xy_px], camera, catalog, (False, True) if try_mirrored else (False,))[0]
 
 
 def find_in_any(
     rankings: Sequence[Floats],
     camera: CameraModel,
     catalog: StarCatalog,
-    try_mirrored: bool = False,
+    mirrored: Sequence[bool] = (False,),
     rounds: Sequence[tuple[int, int]] = ROUNDS,
     deadline_s: float = math.inf,
+    ranges: Ranges = STATED,
 ) -> tuple[SkyMatch | NotFound, int]:
-    """As `find_sky` for several selections of the sources of an image; the row of the matched."""
+    """
+    As `find_sky` for several selections of the sources of an image; the row of the matched.
+
+    ``mirrored`` are the ways that each is tried, ``rounds`` a part of `ROUNDS`, ``ranges`` those
+    of the camera.  The search ends when the processor time of the thread reaches ``deadline_s``.
+    """
     seen = [
-        _Seen(SourceImage(xy_px, camera), False, k)
+        _Seen(_image(xy_px, camera, turned, ranges), turned, k)
         for k, xy_px in enumerate(rankings)
         if len(xy_px) >= _FEWEST_SOURCES
+        for turned in mirrored
     ]
     if not seen:
         count = max(len(xy_px) for xy_px in rankings)
         return NotFound(f'{count} star-like sources, at least {_FEWEST_SOURCES} are needed'), 0
-    if try_mirrored:
-        seen = [one for k in seen for one in (k, k.turned())]
-    tried = math.log10(1 + try_mirrored)
+    tried = math.log10(len(mirrored))
     least = math.inf
     for before, sources in rounds:
         chosen = [one for one in seen if len(one.image.xy_px) > before]
@@ -150,11 +156,12 @@ class _Seen:
     mirrored: bool
     ranking: int
 
-    def turned(self) -> _Seen:
-        """The mirror image."""
-        camera = self.image.camera
-        xy_px = mirror(self.image.xy_px, camera.width)
-        return _Seen(SourceImage(xy_px, mirrored_camera(camera)), True, self.ranking)
+
+def _image(xy_px: Floats, camera: CameraModel, mirrored: bool, ranges: Ranges) -> SourceImage:
+    """Sources (n, 2) with a prior camera, or those of the mirror image."""
+    if not mirrored:
+        return SourceImage(xy_px, camera, ranges)
+    return SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera), ranges)
 
 
 def _candidates(
@@ -166,7 +173,7 @@ def _candidates(
     To refine a false candidate costs half as much as a look-up, and there may be 32 of them.
     """
     others = []
-    scales = focal_scales(seen[0].image.half_diagonal_rad) if seen else ()
+    scales = focal_scales(seen[0].image) if seen else ()
     for focal_scale, one in itertools.product(scales, seen):
         view = View(one.image, focal_scale)
         patterns = view.patterns(before, sources)
@@ -183,11 +190,10 @@ def confirm_sky(
     catalog: StarCatalog,
     camera_from_icrf: Rotation,
     mirrored: bool = False,
+    ranges: Ranges = STATED,
 ) -> SkyMatch | NotFound:
     """Identified stars, as from `find_sky`, given a rotation known to 10 % of the field."""
-    image = SourceImage(xy_px, camera)
-    if mirrored:
-        image = SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera))
+    image = _image(xy_px, camera, mirrored, ranges)
     stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
     start = SkyFit(camera_from_icrf, image.camera, stars)
     pairs = _shifted_alike(image, catalog, start)
@@ -198,6 +204,16 @@ def confirm_sky(
     if log10_p >= MAX_LOG10_P_VALUE:
         return NotFound('the stars are not where they were expected', log10_p)
     return _result(image, catalog, fit, radius_px, log10_p, mirrored)
+
+
+def matched_again(
+    sky: SkyMatch, xy_px: Floats, catalog: StarCatalog, camera: CameraModel, rotation: Rotation
+) -> SkyMatch:
+    """A match with all its stars among sources (n, 2) by a better camera and rotation."""
+    turned_px = mirror(xy_px, camera.width) if sky.mirrored else xy_px
+    image = SourceImage(turned_px, camera, FOUND)
+    fit = SkyFit(rotation, camera, _stars_about(image, catalog, rotation.as_matrix()[2]))
+    return _result(image, catalog, fit, _AGAIN_PX, sky.log10_p_value, sky.mirrored)
 
 
 def _shifted_alike(image: SourceImage, catalog: StarCatalog, start: SkyFit) -> Indices:
@@ -245,7 +261,7 @@ def _fits(image: SourceImage, catalog: StarCatalog, candidates: Candidates) -> I
 
 def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Indices:
     """Rows of the stars that may be in the image with this axis, at least three per source."""
-    radius_rad = 1.25 * image.half_diagonal_rad * (1 + FOCAL_RANGE)
+    radius_rad = 1.25 * image.half_diagonal_rad * (1 + image.ranges.focal)
     near = np.flatnonzero(catalog.direction_icrs @ axis > math.cos(min(radius_rad, 1.4)))
     area = 1.0 / (1.0 - math.cos(min(radius_rad, 1.4))) * (1.0 - math.cos(image.half_diagonal_rad))
     return near[: int(max(60, 3 * len(image.xy_px)) / area)]

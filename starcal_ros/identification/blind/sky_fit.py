@@ -26,11 +26,6 @@ from starcal_ros.camera import CameraModel, line_of_sight, project, rotation_jac
 from starcal_ros.camera.lens import coefficient_jacobian, distort, ideal_points
 from starcal_ros.sky.catalog import StarCatalog
 
-FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
-CENTRE_RANGE = 0.05  # half range of the principal point, in widths
-DISTORTION_RANGE = 0.03  # half range of the distortion in the corners, over the radius
-# Radii of matching, in half diagonals.
-_CLOSING_IN = (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005)
 _CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
 _TELLING = 0.08  # largest such probability at which matches decide about a candidate
 _MOST_STARS = 200
@@ -43,11 +38,32 @@ _ALONE = 10.0  # radius about a star for the local density of sources, in radii 
 
 
 @dataclass(frozen=True)
+class Ranges:
+    """
+    Half ranges of a prior camera.
+
+    ``focal`` of the logarithm of the focal length, ``centre`` of the principal point in widths,
+    ``distortion`` of that in the corners over the radius.  ``closing_in`` are the radii of
+    matching of a fit, in half diagonals.
+    """
+
+    focal: float
+    centre: float
+    distortion: float
+    closing_in: tuple[float, ...]
+
+
+STATED = Ranges(0.25, 0.05, 0.03, (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005))
+FOUND = Ranges(0.02, 0.01, 0.005, (0.01, 0.005))  # of a camera that identified another image
+
+
+@dataclass(frozen=True)
 class SourceImage:
-    """Sources (n, 2), brightest first, of an image with a prior camera."""
+    """Sources (n, 2), brightest first, of an image with a prior camera and its ranges."""
 
     xy_px: Floats
     camera: CameraModel
+    ranges: Ranges = STATED
 
     @functools.cached_property
     def half_diagonal_px(self) -> float:
@@ -95,17 +111,17 @@ def refined(
     fit, prior = start, image.camera
     half_px = image.half_diagonal_px
     fit = _step(image, catalog, fit, pairs, 0.02 * half_px)
-    for part in _CLOSING_IN:
+    for part in image.ranges.closing_in:
         radius_px = max(part * half_px, 2.0)
         sources = int(_CROWDED * image.area_px2 / (math.pi * radius_px**2)) + 6
-        stars, xy_px = predicted(catalog, fit, 2 * sources)
+        stars, xy_px = predicted(catalog, fit, 2 * min(sources, len(image.xy_px)))
         rank, source, _ = _mutual(image, xy_px, radius_px, sources)
         if _like_chance(image, rank, radius_px, sources):
             return None
         pairs = np.stack([stars[rank], source], axis=-1)
         fit = _step(image, catalog, fit, pairs, radius_px / 3)
         fx = float(fit.camera.parameters[0])
-        if abs(math.log(fx / float(prior.parameters[0]))) > 1.3 * FOCAL_RANGE:
+        if abs(math.log(fx / float(prior.parameters[0]))) > 1.3 * image.ranges.focal:
             return None
     for _ in range(2):
         pairs = match(image, catalog, fit, 4.5, _MOST_STARS, _MOST_STARS)
@@ -212,8 +228,8 @@ def _step(
     weight = 1.0 / (scale_px**2 + (residual**2).sum(axis=0) / 4)
     part = (float(camera.parameters[5]) - float(before[5])) / k1_per_part
     off = [math.log(before[0] / fx), float(before[3]) - cx, float(before[4]) - cy, -part]
-    centre_px = CENTRE_RANGE * camera.width
-    held = (1.7 / np.array([FOCAL_RANGE, centre_px, centre_px, DISTORTION_RANGE])) ** 2
+    ranges, centre_px = image.ranges, image.ranges.centre * camera.width
+    held = (1.7 / np.array([ranges.focal, centre_px, centre_px, ranges.distortion])) ** 2
     weighted = (J * weight[:, None]).reshape(-1, 7).T
     N = weighted @ J.reshape(-1, 7)
     b = weighted @ residual.reshape(-1)
@@ -243,29 +259,29 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
     Infinite with fewer than five stars near their predictions.
     """
     _, xy_px = predicted(catalog, fit, _MOST_STARS)
-    crowding = [_crowded(image, xy_px, radius_px) for radius_px in _JUDGED_PX]
+    radii_px = np.array(_JUDGED_PX)
+    crowded = np.array([_crowded(image, xy_px, radius_px) for radius_px in _JUDGED_PX])
+    positions = np.array([_log10_positions(image, radius_px) for radius_px in _JUDGED_PX])
     best, best_radius_px = math.inf, _JUDGED_PX[-1]
-    depths = [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]
-    for n in depths:
-        if n < 5:
-            continue
+    for n in [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]:
         sources = min(len(image.xy_px), 4 * n)
         _, source, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
-        order, ordered = 1.0, 0
-        for radius_px, crowded in zip(_JUDGED_PX, crowding, strict=True):
-            near = apart_px < radius_px
-            hits = int(np.count_nonzero(near))
-            if hits < 5:
-                continue
-            if hits > ordered:
-                order, ordered = _chance_of_order(source[near]), hits
-            # The mean over the stars; those among many sources have their local density.
-            q = float(np.maximum(crowded[:n], _evenly(image, radius_px, sources)).mean())
-            tail = float(betainc(hits, n - hits + 1, q))  # P(Binomial(n, q) >= hits)
-            chance = max(_LOOKS * tail * order, 1e-300)
-            log10_p = math.log10(chance) + _log10_positions(image, radius_px)
-            if log10_p < best:
-                best, best_radius_px = log10_p, radius_px
+        hits = np.count_nonzero(apart_px < radii_px[:, None], axis=1)
+        enough = np.flatnonzero(hits >= 5)
+        if not len(enough):
+            continue
+        hits = hits[enough]
+        _, first, same = np.unique(hits, return_index=True, return_inverse=True)
+        order = [_chance_of_order(source[apart_px < radii_px[enough[k]]]) for k in first]
+        # The mean over the stars; those among many sources have their local density.
+        evenly = np.array([_evenly(image, radius_px, sources) for radius_px in radii_px[enough]])
+        q = np.maximum(crowded[enough, :n], evenly[:, None]).mean(axis=1)
+        tail = betainc(hits, n - hits + 1, q)  # P(Binomial(n, q) >= hits)
+        chance = np.maximum(_LOOKS * tail * np.array(order)[same], 1e-300)
+        log10_p = np.log10(chance) + positions[enough]
+        k = int(np.argmin(log10_p))
+        if log10_p[k] < best:
+            best, best_radius_px = float(log10_p[k]), _JUDGED_PX[enough[k]]
     return best, best_radius_px
 
 
@@ -302,12 +318,13 @@ def _log10_positions(image: SourceImage, radius_px: float) -> float:
     """Decadic logarithm of the number of fits that differ by the radius of matching."""
     half_px, f_px = image.half_diagonal_px, float(image.camera.parameters[0])
     tilts_and_roll = 8 * math.pi**2 * f_px**2 * half_px / radius_px**3
-    focal = 2 * FOCAL_RANGE * half_px / radius_px
-    distortion = 2 * DISTORTION_RANGE * half_px / radius_px
+    # Those of a stated camera for a found one too: it may be of a false match.
+    focal = 2 * STATED.focal * half_px / radius_px
+    distortion = 2 * STATED.distortion * half_px / radius_px
     # A shift of the principal point equals a rotation to first order; the rest is the second
     # order of the projection and of the distortion.
-    shape = (half_px / f_px) ** 2 + 3 * DISTORTION_RANGE
-    centre = 2 * CENTRE_RANGE * image.camera.width * shape / radius_px
+    shape = (half_px / f_px) ** 2 + 3 * STATED.distortion
+    centre = 2 * STATED.centre * image.camera.width * shape / radius_px
     return math.log10(
         max(tilts_and_roll, 1.0) * max(focal, 1.0) * max(distortion, 1.0) * max(centre, 1.0) ** 2
     )

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.pipeline.diagnosis.identified import Solved
+from starcal_ros.identification.blind.images import Solved
 from starcal_ros.pipeline.setup import Setup
 
 _AGREE_RAD = math.radians(0.5)  # alignments of one reading that agree

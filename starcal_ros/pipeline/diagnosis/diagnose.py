@@ -19,6 +19,7 @@ import numpy as np
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
+from starcal_ros.identification.blind.images import Identified, identify_images, Solved
 from starcal_ros.pipeline.diagnosis.attitude_reading import (
     Case,
     CLOCK_SEARCH_S,

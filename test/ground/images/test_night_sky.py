@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
-from starcal_ground.images.from_stars import _of_one_lens, from_stars
-from starcal_ground.images.night_sky import calibrate_images, photographs_of
+from starcal_ground.images.from_stars import _of_one_lens, from_stars, pinhole
+from starcal_ground.images.night_sky import calibrate_images, NightSky, photographs_of
 from starcal_ground.simulation.rendering import images
 import starcal_ros
 from starcal_ros.arrays import Pixels
@@ -28,8 +28,11 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import read_calibration
+from starcal_ros.identification.blind.search import SkyMatch
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Image
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import CameraGeometry, Image, refused_image
 from starcal_ros.sky.catalog import load_catalog
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
@@ -324,5 +327,39 @@ def test_exposures_of_one_field_are_no_copies(tmp_path: Path) -> None:
         calibrate_images(write_pngs(frames, tmp_path / 'night'))
 
 
-def test_no_match_at_all_is_no_lens() -> None:
-    assert _of_one_lens({}) == ({}, ())
+@pytest.mark.parametrize(('focal_px', 'others_px'), [
+    ([], ()),
+    ([2659.0] * 10 + [2100.0], (2100.0,)),
+    ([2659.0] * 9 + [2100.0, 2598.0], (2100.0, 2598.0)),  # two screens with a planetarium
+    ([1800.0] * 3 + [1980.0] * 3, None),
+    ([1800.0, 1800.0, 1980.0], None),
+    (np.linspace(1764.0, 1836.0, 11), None),  # a focus that drifts
+])  # fmt: skip
+def test_a_few_images_of_another_focal_length_are_left_out_and_named(
+    focal_px: Sequence[float], others_px: tuple[float, ...] | None
+) -> None:
+    none = np.empty(0, np.int64)
+    matches = {
+        time_ns: SkyMatch(
+            Rotation.identity(), pinhole((640, 512), px), none, np.empty((0, 2)), False, -9.0, 0.3
+        )
+        for time_ns, px in enumerate(focal_px)
+    }
+    if others_px is None:
+        with pytest.raises(NotFromStars, match='several lenses, a zoom or a change of focus'):
+            _of_one_lens(matches)
+        return
+    kept, left_out_px = _of_one_lens(matches)
+    assert len(kept) == len(matches) - len(others_px)
+    assert left_out_px == pytest.approx(others_px)
+
+
+def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
+    prior = CameraGeometry(pinhole((640, 512), 1800.0), np.array([0.0, 0.0, 0.0, 1.0]))
+    setup = load_setup({}, prior=prior)
+    sky = NightSky((), setup, (), True, Topics(), identified_ns=frozenset({1, 2}))
+    detail = 'stars match in one part of the image only'
+    images = [refused_image(time_ns, 640, 512, 'no_match', detail) for time_ns in (1, 2, 3)]
+    _, note = sky.through_air(images)
+    assert note == (f'2 images are refused as no_match though identified by their stars: {detail}')
+    assert sky.through_air(images[2:])[1] == ''

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
@@ -24,12 +25,19 @@ from starcal_ros.identification.blind.search import (
     confirm_sky,
     find_in_any,
     find_sky,
+    matched_again,
     mirror,
     mirrored_camera,
     NotFound,
     SkyMatch,
 )
-from starcal_ros.identification.blind.sky_fit import _chance_of_order, SourceImage
+from starcal_ros.identification.blind.sky_fit import (
+    _chance_of_order,
+    FOUND,
+    Ranges,
+    SourceImage,
+    STATED,
+)
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
@@ -191,6 +199,42 @@ def test_a_rotation_known_roughly_is_confirmed(catalog: StarCatalog, width_deg: 
     assert len(set(found.catalog_index) & set(searched.catalog_index)) >= 18
     elsewhere = Rotation.from_euler('y', 90.0, degrees=True) * frame.camera_from_icrf
     assert isinstance(confirm_sky(frame.xy_px, frame.prior, catalog, elsewhere), NotFound)
+
+
+@pytest.mark.parametrize('width_deg', [8, 25, 55])
+@pytest.mark.parametrize(('ranges', 'growth', 'is_found'), [
+    (FOUND, 1.0, True),
+    (FOUND, 1.008, True),
+    (FOUND, 1.1, False),
+    (STATED, 1.1, True),
+])  # fmt: skip
+def test_a_camera_that_identified_another_image_is_searched_near_its_focal_length(
+    catalog: StarCatalog, width_deg: float, ranges: Ranges, growth: float, is_found: bool
+) -> None:
+    frame = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
+    fx = growth * float(frame.prior.parameters[0])
+    prior = frame.prior.replace(fx=fx, fy=fx)
+    sky, _ = find_in_any([frame.xy_px], prior, catalog, ranges=ranges)
+    assert isinstance(sky, SkyMatch) == is_found
+    if isinstance(sky, SkyMatch):
+        apart = (sky.camera_from_icrf * frame.camera_from_icrf.inv()).magnitude()
+        assert apart * fx < 20.0  # px; the principal point is fitted too
+
+
+@pytest.mark.parametrize('mirrored', [False, True])
+def test_a_better_camera_matches_the_stars_that_one_image_left_out(
+    catalog: StarCatalog, mirrored: bool
+) -> None:
+    frame = next(frames(catalog, 25, 40, 10, 0.0, 1))
+    xy_px = mirror(frame.xy_px, frame.prior.width) if mirrored else frame.xy_px
+    sky = find_sky(xy_px, frame.prior, catalog, try_mirrored=True)
+    assert isinstance(sky, SkyMatch) and sky.mirrored == mirrored
+    few = dataclasses.replace(sky, catalog_index=sky.catalog_index[:9], xy_px=sky.xy_px[:9])
+    again = matched_again(few, xy_px, catalog, frame.prior, frame.camera_from_icrf)
+    drawn = {tuple(xy): star for xy, star in zip(xy_px.tolist(), frame.star, strict=True)}
+    rows = zip(again.xy_px.tolist(), again.catalog_index, strict=True)
+    assert sum(drawn[tuple(xy)] == star for xy, star in rows) >= 38
+    assert again.camera is frame.prior and again.mirrored == mirrored
 
 
 def test_bright_false_sources_do_not_hide_the_stars(catalog: StarCatalog) -> None:

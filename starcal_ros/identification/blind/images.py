@@ -1,9 +1,10 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Images identified without attitude or alignment, within a limited time.
+Images of one camera identified without attitude or alignment.
 
-All images are searched with their brightest sources before any is searched further: one image
-that is found gives the focal length and the handedness to the others, which are then quick.
+The first image that is found gives its camera and handedness to the others, which are then quick:
+for a diagnosis, within a limited time, all images are searched with their brightest sources before
+any is searched further.
 """
 
 from __future__ import annotations
@@ -12,14 +13,18 @@ from collections.abc import Callable, Iterable, Sequence
 import dataclasses
 from dataclasses import dataclass
 import itertools
+import math
 import time
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind import search
 from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources, smear
+from starcal_ros.identification.blind.search import SkyMatch
+from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -32,6 +37,76 @@ _FEW = 3  # identified, with which no image is searched further
 _FEWEST_SOURCES = 6
 _SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
 _MISFIT_PX = 3.0  # of a star whose identification is left out of a rotation
+
+
+@dataclass
+class ImageSearch:
+    """
+    Search for images of one camera; the first match gives its camera and handedness to the others.
+
+    ``camera`` is the prior of the images as they are given, then that of the first match;
+    ``mirrored`` the ways that they are tried; ``ranges`` those of the camera, searched in turn, so
+    that an image of another focal length is found too.  Images are given by rankings of their
+    sources, each (n, 2), brightest first; that of the last match is tried first.
+    """
+
+    camera: CameraModel
+    catalog: StarCatalog
+    deadline_s: float = math.inf
+    mirrored: tuple[bool, ...] = (False, True)
+    ranking: int = 0
+    ranges: tuple[Ranges, ...] = (STATED,)
+
+    def is_over(self) -> bool:
+        """True if the processor time of the thread has reached the deadline."""
+        return time.thread_time() > self.deadline_s
+
+    def guess(self, rankings: Sequence[Floats], rotations: Iterable[Rotation]) -> SkyMatch | None:
+        """Match of an image with one of some rotations ``camera_from_icrf``."""
+        rows = self._order(rankings)
+        for mirrored, rotation, row in itertools.product(self.mirrored, rotations, rows):
+            sky = search.confirm_sky(
+                rankings[row], self.camera, self.catalog, rotation, mirrored, self.ranges[0]
+            )
+            if isinstance(sky, SkyMatch):
+                return self.take(sky, row)
+        return None
+
+    def look_up(
+        self,
+        rankings: Sequence[Floats],
+        rounds: Sequence[tuple[int, int]] = search.ROUNDS,
+        scale: float = 1.0,
+    ) -> SkyMatch | None:
+        """Match of an image anywhere; ``scale`` of the focal length until there is a match."""
+        camera, rows = self.camera, self._order(rankings)
+        if len(self.mirrored) > 1:
+            fx, fy = (scale * float(camera.parameters[k]) for k in (0, 2))
+            camera = camera.replace(fx=fx, fy=fy)
+        for ranges in self.ranges:
+            sky, row = search.find_in_any(
+                [rankings[row] for row in rows],
+                camera,
+                self.catalog,
+                self.mirrored,
+                rounds,
+                self.deadline_s,
+                ranges,
+            )
+            if isinstance(sky, SkyMatch):
+                return self.take(sky, rows[row])
+        return None
+
+    def take(self, sky: SkyMatch, ranking: int) -> SkyMatch:
+        """The match, whose camera the others have if it is the first."""
+        self.ranking = ranking
+        if len(self.mirrored) > 1:
+            self.mirrored, self.ranges = (sky.mirrored,), (FOUND, STATED)
+            self.camera = search.mirrored_camera(sky.camera) if sky.mirrored else sky.camera
+        return sky
+
+    def _order(self, rankings: Sequence[Floats]) -> list[int]:
+        return sorted(range(len(rankings)), key=lambda row: row != self.ranking)
 
 
 @dataclass(frozen=True)
@@ -57,7 +132,7 @@ class Solved(_Sources):
     image.
     """
 
-    sky: search.SkyMatch
+    sky: SkyMatch
 
 
 @dataclass(frozen=True)
@@ -82,9 +157,10 @@ def identify_images(
     ``guesses`` are tried before the sky is searched.  The search ends after 10 s of processor time
     of this thread.
     """
-    finder = _Search(camera, catalog, guesses, time.thread_time() + _SEARCH_S)
+    finder = ImageSearch(camera, catalog, time.thread_time() + _SEARCH_S)
     looked_at: list[BrightSources] = []
     other_sizes: list[tuple[int, int]] = []
+    solved: list[Solved] = []
     pending: list[_Sources] = []
     searched = 0
     for image in itertools.islice(images, LOOKED_AT):
@@ -99,21 +175,42 @@ def identify_images(
         # The pattern of streaks is none of points.
         if len(bright.sources.xy_px) >= _FEWEST_SOURCES and smear(bright.sources) is None:
             searched += 1
-            if not (finder.guess(bright) or finder.look_up(bright, search.ROUNDS[0])):
+            rankings = [bright.sources.xy_px]
+            sky = finder.guess(rankings, guesses(bright.time_ns))
+            if sky := sky or finder.look_up(rankings, search.ROUNDS[:1]):
+                solved.append(Solved(**vars(bright), sky=sky))
+            else:
                 pending.append(bright)
-                if len(pending) == _FEW and not finder.solved:
-                    pending = finder.look_up_rescaled(pending)
-        if len(finder.solved) == _IMAGES or searched == _SEARCHED or finder.is_over():
+            if len(pending) == _FEW:
+                for scale in _OTHER_SCALES:
+                    if not solved:
+                        pending = _look_up(finder, pending, solved, search.ROUNDS[0], scale)
+        if len(solved) == _IMAGES or searched == _SEARCHED or finder.is_over():
             break
     for later in search.ROUNDS[1:]:
-        last, pending = pending, []
-        for bright in last:
-            if len(finder.solved) >= _FEW or finder.is_over():
-                break
-            if not finder.look_up(bright, later):
-                pending.append(bright)
-    alike = sorted(_with_one_camera(finder.solved, catalog), key=lambda image: image.time_ns)
+        pending = _look_up(finder, pending, solved, later)
+    alike = sorted(_with_one_camera(solved, catalog), key=lambda image: image.time_ns)
     return Identified(tuple(alike), tuple(looked_at), tuple(other_sizes))
+
+
+def _look_up(
+    finder: ImageSearch,
+    pending: Sequence[_Sources],
+    solved: list[Solved],
+    searched: tuple[int, int],
+    scale: float = 1.0,
+) -> list[_Sources]:
+    """The images that a round of the search does not identify; ``solved`` gets the others."""
+    unsolved = []
+    for bright in pending:
+        sky = None
+        if len(solved) < _FEW and not finder.is_over():
+            sky = finder.look_up([bright.sources.xy_px], [searched], scale)
+        if sky:
+            solved.append(Solved(**vars(bright), sky=sky))
+        else:
+            unsolved.append(bright)
+    return unsolved
 
 
 def _sources(image: Image, camera: CameraModel) -> _Sources | None:
@@ -124,72 +221,6 @@ def _sources(image: Image, camera: CameraModel) -> _Sources | None:
     if pixels.shape != sides:
         return None
     return _Sources(image.time_ns, bright_sources(pixels), is_turned)
-
-
-@dataclass
-class _Search:
-    """Identifies images one by one; the first one ``solved`` gives its camera to the others."""
-
-    camera: CameraModel
-    catalog: StarCatalog
-    guesses: Guesses
-    deadline_s: float
-    solved: list[Solved] = dataclasses.field(default_factory=list)
-
-    def is_over(self) -> bool:
-        """True if the time given for the search has passed."""
-        return time.thread_time() > self.deadline_s
-
-    def guess(self, image: _Sources) -> bool:
-        """True if one of its guessed rotations identifies an image."""
-        rotations = self.guesses(image.time_ns)
-        ways = [self.solved[0].sky.mirrored] if self.solved else [False, True]
-        for mirrored, rotation in itertools.product(ways, rotations):
-            sky = search.confirm_sky(
-                image.sources.xy_px, self.camera, self.catalog, rotation, mirrored
-            )
-            if self._take(image, sky):
-                return True
-        return False
-
-    def look_up(self, image: _Sources, searched: tuple[int, int], scale: float = 1.0) -> bool:
-        """True if a round of the search identifies an image; ``scale`` of the focal length."""
-        xy_px, width = image.sources.xy_px, self.camera.width
-        fx, fy = (float(self.camera.parameters[k]) for k in (0, 2))
-        camera, is_mirrored = self.camera.replace(fx=scale * fx, fy=scale * fy), False
-        if self.solved:
-            known = self.solved[0].sky
-            focal_px, is_mirrored = float(known.camera.parameters[0]), known.mirrored
-            prior = search.mirrored_camera(self.camera) if is_mirrored else self.camera
-            camera = prior.replace(fx=focal_px, fy=focal_px * fy / fx)
-        sky = search.find_sky(
-            search.mirror(xy_px, width) if is_mirrored else xy_px,
-            camera,
-            self.catalog,
-            try_mirrored=not self.solved,
-            rounds=(searched,),
-            deadline_s=self.deadline_s,
-        )
-        if isinstance(sky, search.SkyMatch) and is_mirrored:
-            sky = dataclasses.replace(sky, mirrored=True, xy_px=search.mirror(sky.xy_px, width))
-        return self._take(image, sky)
-
-    def look_up_rescaled(self, pending: list[_Sources]) -> list[_Sources]:
-        """The images that no focal length far from that of the camera identifies."""
-        for scale in _OTHER_SCALES:
-            unsolved = [
-                image for image in pending if not self.look_up(image, search.ROUNDS[0], scale)
-            ]
-            if self.solved:
-                return unsolved
-        return pending
-
-    def _take(self, image: _Sources, sky: search.SkyMatch | search.NotFound) -> bool:
-        """Add an image to those solved if it was identified."""
-        if isinstance(sky, search.NotFound):
-            return False
-        self.solved.append(Solved(**vars(image), sky=sky))
-        return True
 
 
 def _with_one_camera(solved: Sequence[Solved], catalog: StarCatalog) -> list[Solved]:
@@ -213,10 +244,9 @@ def _with_one_camera(solved: Sequence[Solved], catalog: StarCatalog) -> list[Sol
     ]
 
 
-def _rotation(sky: search.SkyMatch, camera: CameraModel, catalog: StarCatalog) -> Rotation:
+def _rotation(sky: SkyMatch, camera: CameraModel, catalog: StarCatalog) -> Rotation:
     """The rotation ``camera_from_icrf`` of an identified image with another camera."""
-    xy_px = search.mirror(sky.xy_px, camera.width) if sky.mirrored else sky.xy_px
-    lines = line_of_sight(camera, xy_px)
+    lines = line_of_sight(camera, sky.camera_px)
     stars = catalog.direction_icrs[sky.catalog_index]
     good = np.isfinite(lines[:, 0])
     limit_rad = _MISFIT_PX / float(camera.parameters[0])
