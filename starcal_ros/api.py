@@ -19,11 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
-from starcal_ros.assessment.lookup import Derivatives
+from starcal_ros.assessment.lookup import Derivatives, sigma_arcsec
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera import project as project_in_camera
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
@@ -474,8 +473,7 @@ def line_of_sight_sigma_arcsec(
     >>> bool(alone < 1.0 < pointing)
     True
     """
-    covariance = line_of_sight_covariance(calibration, pixels_px, frame)
-    return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) / ARCSECOND_RAD)
+    return sigma_arcsec(line_of_sight_covariance(calibration, pixels_px, frame))
 
 
 def _in_frame(

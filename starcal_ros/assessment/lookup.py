@@ -68,10 +68,16 @@ def _table(
 ) -> tuple[Floats, Floats, Floats]:
     derivatives = Derivatives.at(camera, pixels)
     shape, full = (
-        np.sqrt(derivatives.variance_rad2(covariance, J)) / ARCSECOND_RAD
+        sigma_arcsec(derivatives.covariance_rad2(covariance, J))
         for J in (derivatives.of_shape(camera), derivatives.J)
     )
     return derivatives.directions, shape, full
+
+
+def sigma_arcsec(covariance_rad2: Floats) -> Floats:
+    """Return the roots (...) of the traces of covariances (..., 3, 3): both angles summed."""
+    variance_rad2 = np.trace(covariance_rad2, axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(np.maximum(variance_rad2, 0.0)) / ARCSECOND_RAD)
 
 
 def pixels_every(camera: CameraModel, step_px: float) -> Floats:
@@ -137,11 +143,6 @@ class Derivatives:
         common = common_rotation(camera) if common is None else common
         return np.asarray(J - _rotations(self.directions) @ common)
 
-    def variance_rad2(self, covariance: MapCovariance, J: Floats) -> Floats:
-        """Return the variances (n,) of the directions, both angles summed; J as here."""
-        unresolved = covariance.unresolved_px**2 * (self.by_pixel**2).sum(axis=(1, 2))
-        return np.asarray(_trace(J, covariance.matrix) + unresolved)
-
     def covariance_rad2(self, covariance: MapCovariance, J: Floats) -> Floats:
         """Return the covariances (n, 3, 3) of the directions in the camera frame; J as here."""
         by_pixel = covariance.unresolved_px * self.by_pixel
@@ -166,8 +167,3 @@ def common_rotation(camera: CameraModel) -> Floats:
 def _rotations(directions: Floats) -> Floats:
     """Movement (n, 3, 3) of directions (n, 3) by small rotations about the three axes."""
     return np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
-
-
-def _trace(J: Floats, covariance: Floats) -> Floats:
-    """Traces (n,) of ``J covariance J'``."""
-    return np.asarray(np.maximum(np.einsum('nij,nij->n', J @ covariance, J), 0.0))

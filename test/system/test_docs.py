@@ -144,6 +144,32 @@ def test_links_lead_somewhere(document: Path) -> None:
         assert not anchor or anchor in heading_anchors(target), link
 
 
+def test_the_front_page_begins_with_a_command_that_the_tool_takes() -> None:
+    text = (ROOT / 'docs/index.rst').read_text()
+    (line,) = re.findall(r'^   \.venv/bin/starcal (.*)$', text, re.MULTILINE)
+    words = shlex.split(line)
+    assert parser(words).parse_args(words).command == 'calibrate'
+    assert text.index('.venv/bin/pip install .') < text.index(line)
+
+
+def test_equations_are_set_without_a_network() -> None:
+    """As MathML, which holds no command of TeX and no mark of a column."""
+    pytest.importorskip('latex2mathml')  # `make docs` brings it
+    from docs.conf import mathml
+
+    equations = [
+        equation
+        for document in DOCUMENTS
+        for equation in re.findall(
+            r'^ *\$\$\n(.*?)^ *\$\$', document.read_text(), re.DOTALL | re.MULTILINE
+        )
+    ]
+    assert len(equations) > 10
+    for equation in equations:
+        words = ''.join(ElementTree.fromstring(mathml(equation, is_block=True)).itertext())
+        assert words and not set(words) & set('\\\\&'), equation
+
+
 def test_pictures_show_something() -> None:
     shown = {
         str((document.parent / link).resolve().relative_to(ROOT))

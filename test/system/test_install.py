@@ -147,7 +147,7 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
     done = run(starcal, 'calibrate', tiny, '--params', params, '-o', 'out', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert json.loads((tmp_path / 'out/calibration.json').read_text())['accepted']
-    refused = run(starcal, 'trend', '.', '-o', 'trend', cwd=tmp_path)
+    refused = run(starcal, 'trend', '.', '-o', 'trend', '--parquet', cwd=tmp_path)
     assert refused.returncode == 2
     assert f"{python} -m pip install '.[mission]'" in refused.stderr
     assert refused.stderr.count('\n') == 1

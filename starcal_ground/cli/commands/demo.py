@@ -38,7 +38,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli import node_processes
 
-    node_processes.check_ros()
+    node_processes.check_ros()  # before modules whose packages a vehicle lacks
 
     from starcal_ground import comparison
     from starcal_ground.cli.commands.compare import with_truth

@@ -159,10 +159,8 @@ def _vectors(calibration: Calibration, common: Floats) -> Iterator[Floats]:
         there = Derivatives.at(camera, pixel[None])
         if not np.isfinite(there.directions).all():
             continue
-        covariance = calibration.map_covariance
-        of_pixel = covariance.unresolved_px**2 * there.by_pixel[0] @ there.by_pixel[0].T
         covariances = [
-            (J[0] @ covariance.matrix @ J[0].T + of_pixel).ravel()
+            there.covariance_rad2(calibration.map_covariance, J).ravel()
             for J in (there.J, there.of_shape(camera, common))
         ]
         yield np.concatenate([[degc], pixel, there.directions[0], *covariances])

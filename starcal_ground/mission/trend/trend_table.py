@@ -208,11 +208,7 @@ def _boresight_sigma(calibration: Calibration) -> Floats:
     camera = calibration.geometry.camera
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
     derivatives = Derivatives.at(camera, middle)
-    J, of_pixel = (
-        derivatives.J[0],
-        derivatives.by_pixel[0] * calibration.map_covariance.unresolved_px,
-    )
-    covariance = J @ calibration.map_covariance.matrix @ J.T + of_pixel @ of_pixel.T
+    (covariance,) = derivatives.covariance_rad2(calibration.map_covariance, derivatives.J)
     # A small rotation about x moves the direction along y, one about y along x.
     return np.asarray(np.sqrt(np.diag(covariance)[[1, 0]]) / ARCSECOND_RAD)
 
