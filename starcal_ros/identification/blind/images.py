@@ -34,7 +34,7 @@ LOOKED_AT = 40  # at most, those without sources included
 # Focal lengths over that of the camera, each searched to 25 %: of other pixels or of binned ones.
 _OTHER_SCALES = (0.55, 1.8, 0.3, 3.3)
 _FEW = 3  # identified, with which no image is searched further
-_FEWEST_SOURCES = 6
+FEWEST_SOURCES = 6
 _SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
 _MISFIT_PX = 3.0  # of a star whose identification is left out of a rotation
 
@@ -173,7 +173,7 @@ def identify_images(
             continue
         looked_at.append(bright.sources)
         # The pattern of streaks is none of points.
-        if len(bright.sources.xy_px) >= _FEWEST_SOURCES and smear(bright.sources) is None:
+        if len(bright.sources.xy_px) >= FEWEST_SOURCES and smear(bright.sources) is None:
             searched += 1
             rankings = [bright.sources.xy_px]
             sky = finder.guess(rankings, guesses(bright.time_ns))

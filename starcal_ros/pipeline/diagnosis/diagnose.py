@@ -28,7 +28,6 @@ from starcal_ros.pipeline.diagnosis.attitude_reading import (
     Reading,
     WireAttitudes,
 )
-from starcal_ros.pipeline.diagnosis.identified import Identified, identify_images, Solved
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Image
