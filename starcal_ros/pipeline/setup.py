@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.assessment.gate import GateOptions
+from starcal_ros.assessment.requirements import requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.camera.projection import convert
@@ -392,6 +393,7 @@ def load_setup(
     prior = prior or _prior(frames)
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
     check_site(groups['site'])
+    requirements_of(groups['gate'].requirements)
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)

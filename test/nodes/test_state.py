@@ -368,9 +368,9 @@ def test_what_was_forced_stays_for_its_own_reasons_only(
     state = started(dataclasses.replace(setup, gate=gate), tmp_path)
     assert state.active is not None and state.active.forced
     state.close()
-    tighter = dataclasses.replace(gate, max_map_sigma_px=1e-6)
+    tighter = dataclasses.replace(gate, requirements=('map=1e-6px',))
     state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
-    assert state.active is None and 'max_map_sigma_px' in state.withheld[0]
+    assert state.active is None and 'requirements' in state.withheld[0]
     assert 'max_change_px' not in state.withheld[0]
     state.close()
 
