@@ -14,7 +14,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.assessment.requirements import OPTION
+from starcal_ros.assessment.requirements import answers, OPTION
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
@@ -99,6 +99,22 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], o
         f'{text} {significant(total[0], 2)}″ rms over the detector, {bound} '
         f'of it, {worst}″ at worst.{f" Largest causes: {parts}." if parts else ""}'
     )
+
+
+def met_requirements(calibration: records.Calibration) -> list[str]:
+    """A sentence on each requirement that is met; one that is missed is among the reasons."""
+    met = [text for text in answers(calibration) if text.endswith(': met')]
+    return [f'{text[0].upper()}{text[1:]}.' for text in met]
+
+
+def in_sentences(calibration: records.Calibration) -> list[str]:
+    """Sentences of the first box: reasons, requirements, precision, next step."""
+    reasons = [f'{text[0].upper()}{text[1:]}.' for text in calibration.reasons]
+    checks = checks_sentence(calibration.gate) or 'The gate checks are not recorded.'
+    sentences = [*reasons, *met_requirements(calibration), checks]
+    sentences += precision_sentences(calibration)
+    step = next_step(calibration)
+    return [*sentences, f'Next: {step}'] if step else sentences
 
 
 def next_step(calibration: records.Calibration) -> str:
