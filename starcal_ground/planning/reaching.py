@@ -17,7 +17,6 @@ from starcal_ros.text import significant
 
 _MOST_IMAGES = 20
 _LISTED = 2  # pointings in a sentence
-_NUMBERS = ['one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight', 'nine', 'ten']
 
 
 def with_images_to_reach(campaign: Campaign) -> Campaign:
@@ -54,8 +53,7 @@ def _planned(campaign: Campaign, quantity: str, check: GateCheck) -> GateCheck:
         words = f'{len(plan.steps)} more images reach {last}{unit}'
     else:
         count = enough[0]
-        number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
-        words = f'{number} more image{"s reach" if count > 1 else " reaches"} it'
+        words = f'{count} more image{"s reach" if count > 1 else " reaches"} it'
         places = '; '.join(
             f'RA {place.ra_deg:.1f}, Dec {place.dec_deg:+.1f}, roll {place.roll_deg:.0f}'
             for place in (step.pointing for step in plan.steps[:count])

@@ -127,6 +127,8 @@ def next_step(calibration: records.Calibration) -> str:
         f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
     )
     text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
+    if {*failed} == {OPTION}:
+        text = 'The sigmas hold, but miss a requirement.'
     steps = _against_sigma(calibration) if OPTION in failed else []
     return ' '.join([text, *steps])
 

@@ -157,7 +157,7 @@ def test_the_time_of_an_activation_is_read_when_it_is_made(
     ('requirement', 'words'),
     [
         ('line_of_sight=1000arcsec@98%', 'arcsec, at most 1000 arcsec required: met'),
-        ('f=1e-6px', 'over the limit of 1e-06 px (requirements); missed by'),
+        ('f=1e-6px', 'over the limit of 0.000001 px (requirements); missed by'),
     ],
 )
 def test_the_answer_has_the_requirements(

@@ -42,9 +42,13 @@ from starcal_ros.text import significant
 if TYPE_CHECKING:
     from starcal_ground.images.first_setup import FirstSetup
     from starcal_ros.pipeline.campaign import Campaign, Source
-    from starcal_ros.records import Calibration, CameraGeometry, GateCheck, Statement
+    from starcal_ros.records import Calibration, CameraGeometry
 
 _DIR = 'folder for the products, created if absent'
+_ANSWERED = (
+    *('accepted', 'reasons', 'images_used', 'images_refused', 'stars_used', 'residual_rms_px'),
+    'statements',
+)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -195,52 +199,24 @@ class Selection:
         return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
 
 
-@dataclass(frozen=True)
-class Answer:
-    """
-    Object that `starcal calibrate --json` prints.
-
-    ``requirements`` are checks of the gate; ``assumed`` has options that nobody stated,
-    ``statements`` what stating one would gain; ``precision`` and ``next_step`` are those of the
-    report.
-    """
-
-    accepted: bool
-    reasons: tuple[str, ...]
-    requirements: tuple[GateCheck, ...]
-    lens_model: str
-    images_used: int
-    images_refused: Mapping[str, int]
-    residual_rms_px: float
-    found: tuple[str, ...]
-    assumed: Mapping[str, str]
-    statements: tuple[Statement, ...]
-    precision: tuple[str, ...]
-    next_step: str
-    folder: str
-
-
-def answer_of(made: Campaign, first: FirstSetup, source: Source, folder: Path) -> Answer:
-    """Answer of a campaign whose products are in a folder."""
+def answer_of(
+    made: Campaign, first: FirstSetup, source: Source, folder: Path
+) -> Mapping[str, object]:
+    """Object that `--json` prints of a campaign whose products are in a folder."""
     from starcal_ground.report import verdict
     from starcal_ros.assessment.requirements import OPTION
 
     calibration = made.calibration
-    return Answer(
-        accepted=calibration.accepted,
-        reasons=calibration.reasons,
-        requirements=tuple(check for check in calibration.gate if check.option == OPTION),
-        lens_model=calibration.geometry.camera.model,
-        images_used=calibration.images_used,
-        images_refused=calibration.images_refused,
-        residual_rms_px=calibration.residual_rms_px,
-        found=made.notes,
-        assumed=dict(first.assumed(source.topics)),
-        statements=calibration.statements,
-        precision=tuple(verdict.precision_sentences(calibration)),
-        next_step=verdict.next_step(calibration),
-        folder=str(folder),
-    )
+    return {
+        **{name: getattr(calibration, name) for name in _ANSWERED},
+        'requirements': [check for check in calibration.gate if check.option == OPTION],
+        'lens_model': calibration.geometry.camera.model,
+        'found': made.notes,
+        'assumed': dict(first.assumed(source.topics)),
+        'precision': verdict.precision_sentences(calibration),
+        'next_step': verdict.next_step(calibration),
+        'folder': str(folder),
+    }
 
 
 def print_calibration(
@@ -256,12 +232,12 @@ def print_calibration(
     print_table(
         ('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas'),
         [
-            (f'{kind}{row.name}', row.value, row.unit.replace('arcsec', '″'), row.sigma,
-             row.change, row.change_sigmas)
+            (f'{kind}{row.name}', row.value, unit, row.sigma, row.change, row.change_sigmas)
             for kind, of_kind in (('', rows), ('alignment ', angles))
             for row in of_kind
+            for unit in [row.unit.replace('arcsec', '″')]
         ],
-    )  # fmt: skip
+    )
     refused = ', '.join(f'{n} {reason}' for reason, n in calibration.images_refused.items())
     lines = [
         ('images', f'{calibration.images_used} used, refused: {refused or "none"}'),
@@ -310,17 +286,17 @@ def _print_budget(calibration: Calibration, verbose: bool) -> None:
 
 def _print_assumed(assumed: Sequence[tuple[str, str]], calibration: Calibration) -> None:
     """Print what nobody stated, with what stating it would gain."""
-    gains = {str(row).partition(': ')[0].removeprefix('state '): row
-             for row in calibration.statements}  # fmt: skip
-    rows = [(name, [f'assumed {text}']) for name, text in assumed]
-    rows += [(name, []) for name in gains if name.split()[0].strip(',') not in dict(assumed)]
-    if not rows:
-        return
-    print_text('\nyours to state (--set NAME=VALUE, or in --params):')
-    for name, words in rows:
-        gained = [str(row).partition(': ')[2] for option, row in gains.items()
-                  if option.split()[0].strip(',') == name.split()[0].strip(',')]  # fmt: skip
-        print_wrapped(f'  {name}: {"; ".join([*words, *gained])}', 4)
+    gains = {
+        row.option.split()[0].strip(','): str(row).partition(': ')[2]
+        for row in calibration.statements
+    }
+    assumptions = {name: f'assumed {text}' for name, text in assumed}
+    names = dict.fromkeys([*assumptions, *gains])
+    if names:
+        print_text('\nyours to state (--set NAME=VALUE, or in --params):')
+    for name in names:
+        text = '; '.join(filter(None, [assumptions.get(name), gains.get(name)]))
+        print_wrapped(f'  {name}: {text}', 4)
 
 
 def _print_verdict(calibration: Calibration) -> None:
@@ -328,7 +304,7 @@ def _print_verdict(calibration: Calibration) -> None:
     from starcal_ground.report import verdict
 
     print_text()
-    print_verdict(calibration.accepted, 'accepted by the gate' if calibration.accepted
-                  else 'refused by the gate')  # fmt: skip
+    word = 'accepted' if calibration.accepted else 'refused'
+    print_verdict(calibration.accepted, f'{word} by the gate')
     for sentence in verdict.in_sentences(calibration):
         print_wrapped(f'  {sentence}'.replace(' arcsec', '″'), 4)
