@@ -204,7 +204,7 @@ def first_setup(
     stars to ``bag_folder``; ``on_notes`` is told of files that are left out, before the search.
 
     Raises NotFromStars when the stars give no camera. Raises BagError when a bag cannot be read,
-    or several topics have a type. Raises OptionError when attitudes and images do not agree.
+    or several topics have a type. Raises OptionError for options that do not go together.
     """
     files = list(filter(None, [given.params]))
     if given.is_by_stars:
@@ -235,19 +235,18 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     options = {'lens_model': 'auto', **given.options}
     options['camera_info_url'] = str(folder / CAMERA_FILE)
     words = f'images of {topic}: {stars.in_a_sentence()}'
-    refusal = ''
-    directions = _DIRECTIONS if 'attitude_direction' not in options else ('',)
-    for direction in directions:
-        tried = {**options, 'attitude_direction': direction} if direction else options
-        setup = load_setup(tried, others=NODE_OPTION_CLASSES)
+    ways = [options['attitude_direction']] if 'attitude_direction' in options else _DIRECTIONS
+    setups = [
+        load_setup({**options, 'attitude_direction': way}, NODE_OPTION_CLASSES) for way in ways
+    ]
+    for setup in setups:
         if setup.is_aligned:  # stated; a wrong direction is named where no image matches
             return setup, (words,)
         topics = choose_topics(given.paths, given.topics, setup)
         diagnosis = diagnose_bags(given.paths, given.topics, setup)
-        alignment, sentence = found_alignment(diagnosis)
+        alignment, _ = found_alignment(diagnosis)
         if alignment is not None:
             read = setup.attitude.attitude_direction
             line = f'attitudes of {topics.attitude}: {read}, {diagnosis.images} images agree'
             return aligned(setup, np.array(alignment)), (words, line)
-        refusal = refusal or sentence
-    raise OptionError(f'{given.paths[0]}: the attitudes do not fit the images: {refusal}')
+    return setups[0], (words,)  # why none is found is named where it is needed

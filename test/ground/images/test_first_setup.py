@@ -36,12 +36,13 @@ def tiny_images() -> list[Image]:
     return [image for image in reader.read_images([TINY], IMAGES) if isinstance(image, Image)]
 
 
-def with_inverse_attitudes(path: Path, images: list[Image]) -> Path:
-    """The bag with attitudes that take ICRF coordinates to the star tracker."""
+def with_attitudes(path: Path, images: list[Image], sign: int = 1, shift_s: int = 0) -> Path:
+    """The bag with attitudes that are late, or inverted (-1): from ICRF to the star tracker."""
     with BagWriter(path) as writer:
         for raw in reader.read_raw([TINY], [ATTITUDES]):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
-            writer.write_attitude(ATTITUDES, time_ns, xyzw * [-1, -1, -1, 1], 'star_tracker')
+            time_ns += shift_s * 10**9
+            writer.write_attitude(ATTITUDES, time_ns, xyzw * [sign, sign, sign, 1], 'star_tracker')
         for image in images:
             writer.write_image(IMAGES, image, 'camera')
     return path
@@ -65,7 +66,7 @@ def test_a_bag_of_which_nothing_is_stated(
 ) -> None:
     monkeypatch.setenv('COLUMNS', str(COLUMNS))
     is_plain = direction == 'st_to_inertial'
-    bag = TINY if is_plain else with_inverse_attitudes(tmp_path / 'b.mcap', tiny_images)
+    bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', tiny_images, -1)
     monkeypatch.chdir(tmp_path)
     out = Path('out')
     assert main(['calibrate', str(bag), '-o', str(out)]) == 0
@@ -101,6 +102,20 @@ def test_a_bag_of_which_nothing_is_stated(
         second.geometry.camera.parameters, first.geometry.camera.parameters, rtol=1e-6, atol=1e-6
     )
     assert not (again / 'params.yaml').exists()
+
+
+@pytest.mark.slow
+def test_attitudes_that_do_not_fit_are_diagnosed(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = with_attitudes(tmp_path / 'b.mcap', tiny_images, shift_s=5)
+    assert main(['calibrate', str(bag), '-o', str(tmp_path / 'out'), '--quiet']) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1
+    assert 'prior_alignment: not given, and not found: The stamps of the images' in error
+    assert 'Set stamp_offset_s: ' in error and error.endswith('(details: starcal diagnose)\n')
+    assert main(['diagnose', str(bag)]) == 3
+    assert 'in the parameter file:\n  stamp_offset_s: ' in capsys.readouterr().out
 
 
 @pytest.mark.slow
