@@ -19,10 +19,10 @@ from starcal_ros.formats.image_headers import is_fits
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
 
-_START_BYTES = 512
+_START_BYTES, _YAML_BYTES = 512, 2**18
 _OF_IMAGES = (
-    ': starcal calibrate or init takes images alone; starcal import makes a bag of image files and'
-    ' attitudes'
+    ': starcal calibrate, inspect and diagnose take images alone; starcal import makes a bag of'
+    ' image files and attitudes'
 )
 # Topics of other types may be unknown to the converter, which then stops.
 _CONVERTED = frozenset(
@@ -144,6 +144,11 @@ def _instead(file: Path, kind: FileKind) -> str:
         return f' but {kind.name}{_OF_IMAGES}'
     if kind.instead:
         return f' but {kind.name}: {kind.instead.replace("FILE", shlex.quote(str(file)))}'
+    if kind is UNKNOWN and file.suffix in ('.yaml', '.yml'):
+        is_parameters = b'ros__parameters' in file.read_bytes()[:_YAML_BYTES]
+        option = '--params FILE' if is_parameters else '--set camera_info_url=FILE'
+        name = 'parameters' if is_parameters else 'a YAML file'
+        return f' but {name}: {option.replace("FILE", shlex.quote(str(file)))} takes it'
     if kind not in (SQLITE_BAG, ROS_1_BAG):
         return ''
     # rosbags converts the folder with its metadata.yaml, not the file in it.

@@ -27,6 +27,7 @@ _MOST_CHARACTERS = 4096  # Linux has no longer path
 _MOST_ITEMS = 100  # the longest list in use has 22 numbers
 _LONGEST_NAME = 100
 _LONGEST_SECTION = 255  # ROS allows no longer name of a topic or node
+_OF_CAMERAS = {'image_width', 'camera_matrix', 'cam0'}  # ROS, OpenCV, kalibr
 _ALMOST = 0.85  # similarity of names from which one is taken for the other, misspelt
 
 
@@ -151,6 +152,11 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
         meant = meant_node(name, nodes)
         if meant and meant not in named:
             raise OptionError(f'{path}: section {shown(name)} is not read: write /**/{meant}')
+    if cameras := _OF_CAMERAS & {*sections}:
+        raise OptionError(
+            f'{path}: a camera file ({min(cameras)}), not a parameter file: give it as'
+            f' camera_info_url in one, or --set camera_info_url={path}'
+        )
     values_only = [name for name, body in sections.items() if not isinstance(body, dict)]
     if not applied and (values_only or 'ros__parameters' in sections):
         above = '/**:' if 'ros__parameters' in sections else '/**: and ros__parameters:'

@@ -14,12 +14,13 @@ import sys
 from types import FrameType
 from typing import Any, NoReturn, TYPE_CHECKING, TypeVar
 
-from starcal_ground.cli.terminal import print_text
+from starcal_ground.cli.terminal import print_text, print_wrapped
 from starcal_ros.text import printable
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from starcal_ground.images.first_setup import Given
     from starcal_ros.pipeline.topics import Topics
 
 Record = TypeVar('Record', bound='DataclassInstance')
@@ -98,14 +99,29 @@ def add_params(command: argparse.ArgumentParser, what: str = '') -> None:
     command.add_argument('--params', type=path, metavar='FILE', help=text, required=not what)
 
 
-def add_camera_alone(command: argparse.ArgumentParser) -> None:
-    """Add the option that leaves attitudes out."""
+def _setting(text: str) -> tuple[str, object]:
+    from starcal_ros.untrusted import yaml_value
+
+    name, equals, value = text.partition('=')
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form NAME=VALUE')
+    try:
+        return name.strip(), yaml_value(value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
+
+
+def add_inputs(command: argparse.ArgumentParser) -> None:
+    """Add bags or images, and the options that state what is known of them, for `given`."""
+    add_bags(command, BAGS_OR_IMAGES)
+    what = 'ROS parameter file: prior camera, mounting and options (default: found or assumed)'
+    add_params(command, what)
+    what = 'state an option of a parameter file, such as observer=ground; may be repeated'
+    command.add_argument(
+        '--set', type=_setting, action='append', default=[], metavar='NAME=VALUE', help=what
+    )
     what = 'estimate the camera by its stars, without attitudes and alignment, in the bag or not'
     command.add_argument('--camera-alone', action='store_true', help=what)
-
-
-def add_lens(command: argparse.ArgumentParser) -> None:
-    """Add the options that state the focal length of images without attitudes."""
     what = (
         'focal length of the lens, mm, with --pixel-size-um (default: from EXIF or FITS, else '
         'estimated)'
@@ -113,6 +129,26 @@ def add_lens(command: argparse.ArgumentParser) -> None:
     command.add_argument('--focal-length-mm', type=float, default=0.0, metavar='MM', help=what)
     what = 'size of a pixel of the images, micrometres'
     command.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
+    add_topics(command)
+
+
+def given(args: argparse.Namespace, **options: object) -> Given:
+    """Inputs that `add_inputs` asked for and further options; raises OptionError for bad ones."""
+    from starcal_ground.images.first_setup import Given
+    from starcal_ros.pipeline.setup import read_values
+
+    settings = dict(args.set) | options
+    values = read_values(args.params) if args.params else {}
+    lens = args.focal_length_mm, args.pixel_size_um
+    return Given(
+        args.bags,
+        topics(args),
+        values | settings,
+        args.params,
+        tuple(settings),
+        args.camera_alone,
+        lens,
+    )
 
 
 def add_topics(command: argparse.ArgumentParser) -> None:
@@ -141,7 +177,7 @@ def record_of(kind: type[Record], args: argparse.Namespace) -> Record:
     return kind(**{field.name: vars(args)[field.name] for field in dataclasses.fields(kind)})
 
 
-def add_json(command: argparse.ArgumentParser) -> None:
+def add_json(command: argparse._ActionsContainer) -> None:
     """Add the option for `print_json`."""
     what = 'print one JSON object instead of tables'
     command.add_argument('--json', action='store_true', help=what)
@@ -156,8 +192,9 @@ def print_json(record: object) -> None:
 
 def print_notes(notes: Sequence[str]) -> None:
     """Print what a user should know of a result on stderr."""
+    show = print_wrapped if sys.stderr.isatty() else print_text
     for note in notes:
-        print_text(note, file=sys.stderr)
+        show(note, file=sys.stderr)
 
 
 def check_file(output: Path, inputs: Sequence[Path]) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from starcal_ground import outputs, products
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
+from starcal_ground.planning.reaching import with_images_to_reach
 from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
@@ -45,12 +46,12 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
 
 @contextlib.contextmanager
 def failure_recorded(
-    folder: Path, bags: Sequence[Path], kind: type[StarcalError]
+    folder: Path, bags: Sequence[Path], kinds: tuple[type[StarcalError], ...]
 ) -> Iterator[None]:
-    """Write an error of a kind that ends the block to the folder as well."""
+    """Write an error of some kinds that ends the block to the folder as well."""
     try:
         yield
-    except kind as error:
+    except kinds as error:
         outputs.make_folder(folder)
         look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
         raise type(error)(f'{error}{look}') from error
@@ -126,7 +127,7 @@ def _calibrated(
         failure = _failure(str(error), observed)
         look = _write_failure(folder, failure, album.unmatched)
         raise TooFewObservations(f'{failure.reason}{look}') from error
-    arguments.print_notes(made.notes[len(observed.source.notes) :])
+    made = with_images_to_reach(made)
     if made.observations is not observed.observations:
         products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
     return made

@@ -26,7 +26,7 @@ from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import missing_package, StarcalError
 
 COMMANDS = (
-    *('demo', 'init', 'inspect', 'diagnose', 'calibrate', 'compare', 'plan', 'report', 'lookup'),
+    *('demo', 'calibrate', 'inspect', 'diagnose', 'compare', 'plan', 'report', 'lookup'),
     *('play', 'monitor', 'simulate', 'export', 'import', 'catalog', 'trend'),
 )
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
@@ -34,14 +34,14 @@ _FIRST_STEPS = """\
 first steps:
   # render a bag with known truth
   starcal simulate --scenario tiny -o tiny
-  # calibrate
-  starcal calibrate tiny --params tiny/params.yaml -o out
+  # calibrate: what is not stated is found or assumed, and listed
+  starcal calibrate tiny -o out
   # compare with the truth
   starcal compare out tiny/truth.json
   # the same by the ROS nodes, where ROS 2 is installed
   starcal demo
 
-starcal COMMAND --help shows examples of each command. A file that starcal did not write, or that
+starcal help COMMAND shows examples of each command. A file that starcal did not write, or that
 was changed since, is never replaced.
 exit status: 0 the command succeeded, and a calibration passed the gate; 3 the gate refused the
 calibration; 2 bad input, named in one line; 130 interrupted."""
@@ -54,8 +54,12 @@ class _Parser(argparse.ArgumentParser):
         """Exit with status 2."""
         bad = re.search(r"(?:invalid choice: '?|unrecognized arguments: )([^' ]+)", message)
         if bad:
-            near = difflib.get_close_matches(bad[1].partition('=')[0], _words(self), 1)
-            message += f' (did you mean {near[0]}?)' if near else ''
+            word, words = bad[1].partition('=')[0], _words(self)
+            near = difflib.get_close_matches(word, words, 1)
+            if word in words:
+                message += ' (write it after the command)'
+            elif near:
+                message += f' (did you mean {near[0]}?)'
         self.exit(arguments.complain(f'{message} (see {self.prog} --help)'))
 
 
@@ -122,13 +126,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         terminal.open_missing_streams()
         if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
             sys.stdout.reconfigure(errors='backslashreplace')
-        tool = parser(sys.argv[1:] if argv is None else argv)
+        words = list(sys.argv[1:] if argv is None else argv)
+        if words[:1] == ['help']:
+            words = [*words[1:], '--help']
+        tool = parser(words)
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
 
             argcomplete.autocomplete(tool)
         try:
-            return _run(tool.parse_args(argv), tool)
+            return _run(tool.parse_args(words), tool)
         finally:
             sys.stdout.flush()  # at the end of Python an error has no handler
     except StarcalError as error:

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from starcal_ground.report import verdict
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.requirements import OPTION
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
 from starcal_ros.text import printable
@@ -172,7 +173,7 @@ def _calibration(received: Received) -> Group | Text:
 
 
 def _gate(calibration: Calibration) -> Table:
-    """Failed checks, then the passed ones closest to their limits."""
+    """Failed checks, requirements, then the other passed ones closest to their limits."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column('gate check')
     table.add_column('value', justify='right')
@@ -181,7 +182,7 @@ def _gate(calibration: Calibration) -> Table:
     failed = [check for check in calibration.gate if check.passed is False]
     passed = sorted(
         (check for check in calibration.gate if check.passed and share_of_limit(check) > 0),
-        key=share_of_limit,
+        key=lambda check: (check.option == OPTION, share_of_limit(check)),
         reverse=True,
     )
     for check in [*failed, *passed[:_TIGHTEST]]:

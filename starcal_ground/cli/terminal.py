@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 import os
+import shutil
 import sys
+import textwrap
 from typing import TextIO
 
 from starcal_ros.text import printable
@@ -36,6 +38,15 @@ def discard(*names: str) -> None:
 def print_text(text: str = '', end: str = '\n', file: TextIO | None = None) -> None:
     """Print lines with characters that act on a terminal escaped (`printable`)."""
     print('\n'.join(map(printable, text.split('\n'))), end=end, file=file)
+
+
+def print_wrapped(text: str, indent: int = 2, file: TextIO | None = None) -> None:
+    """Print a text in lines of the terminal's width, those after the first indented."""
+    width = max(shutil.get_terminal_size().columns, 2 * indent + 20)
+    lines = textwrap.wrap(
+        text, width, subsequent_indent=indent * ' ', break_on_hyphens=False, break_long_words=False
+    )
+    print_text('\n'.join(lines), file=file)
 
 
 @contextlib.contextmanager

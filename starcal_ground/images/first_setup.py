@@ -1,12 +1,20 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""First camera and parameters of a bag or of photographs, from their stars."""
+"""
+Set-up of a calibration from whatever is given: what is stated, found by the stars, and assumed.
+
+A camera that is not stated is that of the stars; with it the attitudes of a bag give their
+direction and the alignment.  What is stated of a star tracker has to be there, unless the camera
+alone is asked for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 from dataclasses import dataclass
-import itertools
+import functools
+import math
 from pathlib import Path
 import textwrap
 
@@ -14,122 +22,231 @@ import numpy as np
 import yaml
 
 from starcal_ground.images import night_sky
-from starcal_ground.images.from_stars import FromStars
-from starcal_ground.images.photographs import Photograph
-from starcal_ros.camera import CameraModel
-from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ground.images.photographs import image_paths
+from starcal_ground.outputs import make_folder
+from starcal_ground.products import write_camera_info
+from starcal_ros.errors import OptionError
+from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPES, VELOCITY_TYPE
-from starcal_ros.pipeline import campaign, solve
+from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.pipeline.campaign import Source, source_of, ThroughAir
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
-from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, read, Topics
-from starcal_ros.records import CameraGeometry
+from starcal_ros.pipeline.setup import (
+    aligned,
+    files_of,
+    load_setup,
+    NODE_OPTION_CLASSES,
+    option_groups,
+    paths_from,
+    Setup,
+)
+from starcal_ros.pipeline.topics import (
+    choose_image_topic,
+    choose_topics,
+    stated_tracker,
+    Topics,
+    without_attitudes,
+)
 
-CAMERA_FILE = 'camera.yaml'  # beside the parameter file
+PARAMETER_FILE, CAMERA_FILE = 'params.yaml', 'camera.yaml'
 _LOOKED_AT = 20  # images, the first ones
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
-_OF_TRACKER = (
-    'star_tracker_sigma_arcsec: 1-sigma noise about x, y, z; until then by the scatter of images',
-    'stamp_offset_s: from the image stamp to the middle of the exposure; until then 0',
-    'shutter: global, or rolling with readout_s; until then unknown',
-)
-_OF_PLACE = (
-    'observer: ground, with latitude_deg, longitude_deg and height_m, or space; until then by the'
-    ' stars'
-)
-_OF_VELOCITY = (
-    'observer: ground with its site, or observer_velocity_m_s; until then an orbit about the Earth'
-)
+
+
+@dataclass(frozen=True)
+class Given:
+    """
+    Bags or images, and what is stated of them.
+
+    ``options`` are those of a parameter file ``params`` and of ``--set``, ``settings`` the names
+    of the latter; ``lens`` is the focal length (mm) and the pixel size (um), 0 where not stated.
+    """
+
+    paths: Sequence[Path]
+    topics: Topics
+    options: Mapping[str, object]
+    params: Path | None = None
+    settings: Sequence[str] = ()
+    camera_alone: bool = False
+    lens: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def states_camera(self) -> bool:
+        """True if the camera need not be found."""
+        return bool(self.options.get('camera_info_url'))
+
+    @functools.cached_property
+    def photographs(self) -> list[Path]:
+        """Files of images; empty if bags are given."""
+        return image_paths(self.paths)
+
+    @functools.cached_property
+    def is_by_stars(self) -> bool:
+        """True if the attitudes are to be found from the stars; OptionError if they are stated."""
+        if not self.photographs:
+            return without_attitudes(self.paths, self.topics, self.options, self.camera_alone)
+        if (stated := stated_tracker(self.options)) and not self.camera_alone:
+            raise OptionError(
+                f'{", ".join(stated)}: stated, but image files have no attitudes: give a bag that'
+                ' has them (starcal import), or --camera-alone'
+            )
+        return True
+
+    def checked(self) -> tuple[Setup | None, list[Path]]:
+        """
+        The setup of bags with attitudes where the camera is stated, and the files of the options.
+
+        Raises OptionError with the place of a bad option.
+        """
+        if any(self.lens) and (self.states_camera or not (self.photographs or all(self.lens))):
+            raise OptionError(
+                '--focal-length-mm, --pixel-size-um: a camera_info_url has them already'
+                if self.states_camera
+                else '--focal-length-mm, --pixel-size-um: bags need both'
+            )
+        with self._with_place():
+            if self.is_by_stars or not self.states_camera:
+                frames = option_groups(self.options, NODE_OPTION_CLASSES)['frames']
+                setup = None
+            else:
+                setup = load_setup(self.options, others=NODE_OPTION_CLASSES)
+                frames = setup.frames
+        return setup, [*filter(None, [self.params]), *files_of(frames).values()]
+
+    @contextlib.contextmanager
+    def _with_place(self) -> Iterator[None]:
+        try:
+            yield
+        except OptionError as error:
+            if str(error).partition(':')[0] in self.settings:
+                raise OptionError(f'--set {error}') from error
+            raise OptionError(f'{self.params}: {error}' if self.params else str(error)) from error
 
 
 @dataclass(frozen=True)
 class FirstSetup:
     """
-    Camera and options that were found, what was found in words, and the options left to state.
+    Bags, topics and setup to calibrate from, and the files that are read.
 
-    ``options`` are those of the parameter file but for the camera.
+    ``found`` are sentences on what the stars show.
     """
 
-    camera: CameraModel
-    options: Mapping[str, object]
-    found: tuple[str, ...]
-    to_state: tuple[str, ...]
+    given: Given
+    bags: tuple[Path, ...]
+    topics: Topics
+    setup: Setup
+    files: tuple[Path, ...]
+    found: tuple[str, ...] = ()
+    through_air: ThroughAir | None = None
 
-    def parameter_file(self) -> str:
-        """Text of the parameter file, with what is left to state as comments."""
-        values = {'camera_info_url': CAMERA_FILE, **self.options}
-        options = yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
-        findings = ''.join(f'# {line}\n' for line in self.found)
-        to_state = ''.join(f'# {line}\n' for line in self.to_state)
-        parameters = textwrap.indent(options + to_state, 4 * ' ')
-        return f'{findings}/**:\n  ros__parameters:\n{parameters}'
+    def source(self) -> Source:
+        """Source of a calibration; raises BagError and OptionError as `campaign.source_of`."""
+        source = source_of(self.bags, self.setup, self.topics, self.through_air)
+        return dataclasses.replace(source, notes=(*self.found, *source.notes))
+
+    def write(self, folder: Path, topics: Topics) -> None:
+        """Write ``params.yaml`` and ``camera.yaml``, which repeat the calibration."""
+        make_folder(folder)
+        write_camera_info(self.setup.prior.camera, folder / CAMERA_FILE)
+        write_atomically(folder / PARAMETER_FILE, self._parameter_file(topics))
+
+    def _parameter_file(self, topics: Topics) -> str:
+        setup = self.setup
+        values: dict[str, object] = {'lens_model': setup.frames.lens_model}
+        if self.through_air is None:
+            values['attitude_direction'] = setup.attitude.attitude_direction
+            values['prior_alignment'] = setup.prior.star_tracker_from_camera_xyzw.tolist()
+        elif setup.site.observer == 'ground':  # stated by the images
+            values |= dataclasses.asdict(setup.site)
+        values |= paths_from(self.given.options, Path.cwd())
+        values['camera_info_url'] = CAMERA_FILE
+        text = ''.join(f'{name}: {_in_a_line(value)}\n' for name, value in values.items())
+        found = ''.join(f'# {line}\n' for line in self.found)
+        to_state = ''.join(f'# {name}: {what}\n' for name, what in self.assumed(topics))
+        return f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
+
+    def assumed(self, topics: Topics) -> list[tuple[str, str]]:
+        """Options that nobody has stated, each with what is assumed; ``topics`` are those read."""
+        options, stated = self.setup.calibration, self.given.options
+        has_tracker = self.through_air is None
+        has_velocity = bool(topics.velocity or topics.observations)
+        rows = [
+            ('star_tracker_sigma_arcsec', 'from the scatter of the images',
+             has_tracker and not tracker_sigma_is_given(options)),
+            ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
+            ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
+            ('shutter', 'unknown, read out within 20 ms', has_tracker),
+            ('observer', 'space, in an orbit about the Earth' if has_tracker else 'by the stars',
+             not (has_velocity or self.setup.site.observer == 'ground'
+                  or 'observer_velocity_m_s' in stated)),
+        ]  # fmt: skip
+        return [(name, text) for name, text, matters in rows if matters and name not in stated]
 
 
-def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
+def _in_a_line(value: object) -> str:
+    """A value in YAML; alone it would end in a mark of the document."""
+    return yaml.safe_dump([value], default_flow_style=True, width=math.inf).strip()[1:-1]
+
+
+def first_setup(
+    given: Given,
+    stated: Setup | None,
+    folder: Path,
+    bag_folder: Path,
+    on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
+) -> FirstSetup:
     """
-    The camera of photographs, and their site where they state it.
+    Set-up of what is given; ``stated`` is that of `Given.checked`.
 
-    Raises NotFromStars when the stars give no camera.
-    """
-    stars, notes = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
-    options = night_sky.site_of(photographs)
-    to_state = () if options else (_OF_PLACE,)
-    return FirstSetup(stars.camera, options, (stars.in_a_sentence(), *notes), to_state)
-
-
-def of_bags(bags: Sequence[Path], topics: Topics) -> FirstSetup:
-    """
-    The camera of a bag, and the alignment and direction of its attitudes where it has any.
+    A camera that is found is written to a folder, bags of images and of the attitudes of their
+    stars to ``bag_folder``; ``on_notes`` is told of files that are left out, before the search.
 
     Raises NotFromStars when the stars give no camera. Raises BagError when a bag cannot be read,
-    or several topics have a type. Raises OptionError when attitudes and images do not agree.
+    or several topics have a type. Raises OptionError for options that do not go together.
     """
-    topic = choose_image_topic(bags, topics)
-    camera = night_sky.camera_of_bags(bags, topic, {}, _LOOKED_AT)
-    there = {one.type_name for one in reader.topics(bags)}
-    words = f'images of {topic}: {camera.in_a_sentence()}'
-    has_velocity = VELOCITY_TYPE in there
-    if not there & {*ATTITUDE_TYPES}:
-        return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
-    options, attitudes = _aligned(bags, topics, camera)
-    to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
-    worth = _worth_stating(bags, topics, camera.camera, options)
-    return FirstSetup(camera.camera, options, (words, attitudes), (*worth, *to_state))
+    files = list(filter(None, [given.params]))
+    if given.is_by_stars:
+        sky, images = night_sky.from_images(
+            given.paths, given.topics, given.options, bag_folder, given.lens, on_notes
+        )
+        read = (*images, *files)
+        return FirstSetup(given, sky.bags, sky.topics, sky.setup, read, sky.notes, sky.through_air)
+    read = (*reader.mcap_files(given.paths), *files)
+    paths = tuple(given.paths)
+    if stated is not None:
+        return FirstSetup(given, paths, given.topics, stated, read)
+    setup, found = _of_attitudes(given, folder)
+    return FirstSetup(given, paths, given.topics, setup, read, found)
 
 
-def _worth_stating(
-    bags: Sequence[Path], asked: Topics, camera: CameraModel, options: Mapping[str, object]
-) -> tuple[str, ...]:
-    """Sentences on what to state, by a calibration of the first images; none without one."""
-    prior = CameraGeometry(camera, np.array(options['prior_alignment']))
-    others = {name: value for name, value in options.items() if name != 'prior_alignment'}
-    setup = dataclasses.replace(load_setup(others, prior=prior), is_aligned=True)
-    source = campaign.source_of(bags, setup, asked)
-    images = itertools.islice(read(bags, source.topics, setup), _LOOKED_AT)
-    try:
-        calibration = solve.solve(solve.ensemble_of(images, setup), setup)
-    except TooFewObservations:
-        return ()
-    by = f'by a calibration of {calibration.images_used} images'
-    return tuple(f'{str(row).removeprefix("state ")}, {by}' for row in calibration.statements)
-
-
-def _aligned(
-    bags: Sequence[Path], given: Topics, camera: FromStars
-) -> tuple[dict[str, object], str]:
-    """Options of the attitudes in a bag, and a line on them."""
-    prior = CameraGeometry(camera.camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    said = ''
-    for direction in _DIRECTIONS:
-        options: dict[str, object] = {'attitude_direction': direction}
-        setup = dataclasses.replace(load_setup(options, prior=prior), is_aligned=False)
-        topics = choose_topics(bags, given, setup)
-        diagnosis = diagnose_bags(bags, given, setup)
-        alignment, sentence = found_alignment(diagnosis)
+def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
+    """Setup of bags with attitudes whose camera is not stated, and sentences on it."""
+    if choose_topics(given.paths, given.topics).observations:
+        raise OptionError(
+            f'camera_info_url: not stated, and {OBSERVATIONS_TYPE} shows no camera: give the'
+            ' parameter file of these observations (--params)'
+        )
+    topic = choose_image_topic(given.paths, given.topics)
+    stars = night_sky.camera_of_bags(given.paths, topic, given.options, _LOOKED_AT, given.lens)
+    make_folder(folder)
+    write_camera_info(stars.camera, folder / CAMERA_FILE)
+    options = {'lens_model': 'auto', **given.options}
+    options['camera_info_url'] = str(folder / CAMERA_FILE)
+    words = f'images of {topic}: {stars.in_a_sentence()}'
+    ways = [options['attitude_direction']] if 'attitude_direction' in options else _DIRECTIONS
+    setups = [
+        load_setup({**options, 'attitude_direction': way}, NODE_OPTION_CLASSES) for way in ways
+    ]
+    for setup in setups:
+        if setup.is_aligned:  # stated; a wrong direction is named where no image matches
+            return setup, (words,)
+        topics = choose_topics(given.paths, given.topics, setup)
+        diagnosis = diagnose_bags(given.paths, given.topics, setup)
+        alignment, _ = found_alignment(diagnosis)
         if alignment is not None:
-            line = f'attitudes of {topics.attitude}: {direction}, {diagnosis.images} images agree'
-            return {**options, 'prior_alignment': alignment}, line
-        said = said or sentence
-    raise OptionError(f'{bags[0]}: the attitudes do not fit the images: {said}')
+            read = setup.attitude.attitude_direction
+            line = f'attitudes of {topics.attitude}: {read}, {diagnosis.images} images agree'
+            return aligned(setup, np.array(alignment)), (words, line)
+    return setups[0], (words,)  # why none is found is named where it is needed

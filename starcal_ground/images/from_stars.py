@@ -58,6 +58,7 @@ _NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _OTHERS = 20, 80  # percentiles between which the focal lengths of one camera lie
+_SAME_FOCAL = 0.1  # error of a data sheet that needs no word
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
 _ROBUST_SCALE, _ROBUST_GAIN = 3.0, 1e-3  # as of the first search of the estimate
 _FREE_ARCSEC = 7200.0  # of the rotation of an image, which trades with its principal point
@@ -72,7 +73,8 @@ class FromStars:
 
     ``camera`` is of the images mirrored left to right where they are ``mirrored``;
     ``icrf_from_camera`` by stamp; ``images`` is the number of different images, ``copies_ns`` has
-    the stamps of copies of them; ``other_focal_px`` has the focal lengths of images that match the
+    the stamps of copies of them; ``stated_px`` is the focal length of the prior camera, NaN
+    without one; ``other_focal_px`` has the focal lengths of images that match the
     sky with another camera and are left out.
     """
 
@@ -82,6 +84,7 @@ class FromStars:
     images: int
     other_focal_px: tuple[float, ...] = ()
     copies_ns: frozenset[int] = frozenset()
+    stated_px: float = math.nan
 
     def in_a_sentence(self) -> str:
         """Findings as a sentence for a person."""
@@ -96,9 +99,12 @@ class FromStars:
         others = ', '.join(f'{focal_px:.0f}' for focal_px in self.other_focal_px)
         left_out = f'; left out, with another focal length: {others} px' if others else ''
         copies = f'; left out: {len(self.copies_ns)} copies' if self.copies_ns else ''
+        wrong = ''
+        if abs(self.stated_px / fx - 1.0) > _SAME_FOCAL:
+            wrong = f' (stated: {self.stated_px:.0f} px, which the stars contradict)'
         return (
             f'{len(self.icrf_from_camera)} of {self.images} images identified by their stars:'
-            f' focal length {fx:.1f} px, field {field} degrees{left_out}{copies}{flipped}'
+            f' focal length {fx:.1f} px{wrong}, field {field} degrees{left_out}{copies}{flipped}'
         )
 
 
@@ -160,8 +166,11 @@ def from_stars(
         )
     sources = {one.time_ns: one.rankings[-1] for one in rich}
     camera, rotations = _common_camera(matches, sources, catalog)
+    stated_px = math.nan if prior is None else float(prior.parameters[0])
     (mirrored,) = finder.mirrored
-    return FromStars(camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies))
+    return FromStars(
+        camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies), stated_px
+    )
 
 
 def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], list[int]]:

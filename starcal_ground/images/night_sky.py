@@ -8,7 +8,7 @@ calibration of these bags is the same as that of any bag.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import itertools
@@ -111,13 +111,13 @@ def from_images(
     """
     Set-up of a calibration of photographs or of bags without attitudes, and the files it reads.
 
-    ``lens`` is the focal length (mm) and the pixel size (um) of photographs, 0 where not given.
+    ``lens`` is the focal length (mm) and the pixel size (um), 0 where not given.
     ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
     the stars give no camera.
     """
     photographs = image_paths(paths)
     if not photographs:
-        return from_bags(paths, topics, values, folder), reader.mcap_files(paths)
+        return from_bags(paths, topics, values, folder, lens), reader.mcap_files(paths)
     chosen, notes = photographs_of(photographs, *lens)
     on_notes(notes)
     return from_photographs(chosen, values, folder), [one.path for one in chosen]
@@ -212,14 +212,18 @@ def _images(photographs: Sequence[Photograph], refusals: Refusals) -> Iterator[I
 
 
 def from_bags(
-    bags: Sequence[Path], topics: Topics, values: Mapping[str, object], folder: Path
+    bags: Sequence[Path],
+    topics: Topics,
+    values: Mapping[str, object],
+    folder: Path,
+    lens: tuple[float, float] = (0.0, 0.0),
 ) -> NightSky:
     """
     Set-up of a calibration of bags without attitudes; attitudes by the stars go into a folder.
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
-    stars = camera_of_bags(bags, choose_image_topic(bags, topics), values)
+    stars = camera_of_bags(bags, choose_image_topic(bags, topics), values, lens=lens)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
     if is_located and min(stars.icrf_from_camera) < CLOCKS_SET_NS:
@@ -228,19 +232,47 @@ def from_bags(
 
 
 def camera_of_bags(
-    bags: Sequence[Path], topic: str, values: Mapping[str, object], most: int | None = None
+    bags: Sequence[Path],
+    topic: str,
+    values: Mapping[str, object],
+    most: int | None = None,
+    lens: tuple[float, float] = (0.0, 0.0),
 ) -> FromStars:
     """
-    Camera and rotations of the images of bags, at most the first few.
+    Camera and rotations of the images of bags, at most the first few; ``lens`` as `from_images`.
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
     read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
-    images = (image for image in read if isinstance(image, Image))
-    stars = _found(itertools.islice(images, most), values, None)
+    refused: list[StarObservations] = []
+    images = itertools.islice(_of_one_size(read, refused), most)
+    first, hint = next(images, None), None
+    if first is not None and all(lens):
+        height, width = first.pixels.shape
+        hint = pinhole((width, height), 1000.0 * lens[0] / lens[1])
+    try:
+        stars = _found(itertools.chain([first] if first else [], images), values, hint)
+    except NotFromStars as error:
+        if not refused:
+            raise
+        words = f'{len(refused)} images refused as {refused[0].refusal}: {refused[0].detail}'
+        raise NotFromStars(f'{topic}: {words}; {error}') from error
     if stars.mirrored:
         raise NotFromStars('the images are mirrored: mirror them where they are read out')
     return stars
+
+
+def _of_one_size(
+    records: Iterable[Image | StarObservations], refused: list[StarObservations]
+) -> Iterator[Image]:
+    """Images of the size of the first: a calibration refuses the others as ``wrong_size``."""
+    shape = None
+    for image in records:
+        if isinstance(image, StarObservations):
+            refused.append(image)
+        elif image.pixels.shape == (shape or image.pixels.shape):
+            shape = image.pixels.shape
+            yield image
 
 
 def _found(

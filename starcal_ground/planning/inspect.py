@@ -13,13 +13,15 @@ import numpy as np
 
 from starcal_ground.file_kinds import explained
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import BagError, ImageRefused, OptionError
+from starcal_ros.errors import BagError, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_ahead
 from starcal_ros.formats.bag.reader import Damage
+from starcal_ros.formats.image_headers import jpeg_header, png_header, PNG_HEADER_BYTES
 from starcal_ros.formats.messages import message_codec
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message, decode_png
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.campaign import ThroughAir
 from starcal_ros.pipeline.diagnosis import bags
 from starcal_ros.pipeline.diagnosis.bags import Refused
 from starcal_ros.pipeline.setup import Setup
@@ -94,32 +96,34 @@ def inspect(
     given: bag_topics.Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
-    camera_alone: bool = False,
+    through_air: ThroughAir | None = None,
+    problem: str = '',
 ) -> Inspection:
     """
     Contents of bags and the images that a calibration would refuse.
 
     With a setup, stars are measured as for a calibration, which measures images that match no star
-    once more in the end; without one, images are only checked against the attitudes, at the
-    default limits.  So are images of which the stars give the camera alone, without attitudes.
-    Raises BagError when a bag is missing or not a bag.
+    once more in the end; ``through_air`` is given where the attitudes are those of the stars.
+    Without a setup, for which ``problem`` is the reason, images are only checked against the
+    attitudes, at the default limits.  Raises BagError when a bag is missing or not a bag.
     """
     damage: dict[str, None] = {}  # an ordered set
     topics = _contents(paths, lambda text: damage.setdefault(text))
     options = setup.attitude if setup else AttitudeOptions()
-    problems = []
+    problems = [problem] if problem else []
     notes: tuple[str, ...] = ()
-    chosen, seen, by_stars = None, [], False
+    by_stars, chosen = through_air is not None, None
+    seen: list[StarObservations] = []
     try:
-        if by_stars := bag_topics.without_attitudes(
-            paths, given, setup.options() if setup else {}, camera_alone
-        ):
-            setup = None
-            chosen = bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given))
+        if setup is None and bag_topics.without_attitudes(paths, given, {}):
+            by_stars, chosen = (
+                True,
+                bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given)),
+            )
         if setup:
             from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
 
-            source = source_of(paths, setup, given)
+            source = source_of(paths, setup, given, through_air)
             chosen, setup, notes = source.topics, source.setup, source.notes
             records = bag_topics.read(paths, chosen, setup)
         elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:
@@ -129,8 +133,12 @@ def inspect(
         for observations in records:
             seen.append(observations)
             on_image()
+        if through_air is not None:
+            seen, note = through_air(seen)
+            notes = (*notes, note) if note else notes
     except (BagError, OptionError) as error:
         problems.append(explained(error))
+        problems = list(dict.fromkeys(problems))
     used = [observations for observations in seen if not observations.refusal]
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
@@ -138,7 +146,7 @@ def inspect(
         from starcal_ros.pipeline import solve
 
         status = solve.ensemble_status(solve.ensemble_of(seen, setup), setup)
-    if chosen and not problems:
+    if chosen and problems in ([], [problem]):
         problems += _shortages(used, status)
     if chosen and seen and not used:
         command = '' if by_stars else 'starcal diagnose'
@@ -210,11 +218,12 @@ def _kind(message: message_codec.Message) -> str:
     """Encoding and size of an image message as text."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'
-    try:
-        pixels = decode_png(message.data, 0).pixels
-    except ImageRefused:
-        return f'{message.format or "compressed"}, not a PNG of one channel'
-    return f'PNG {8 * pixels.itemsize} bit {pixels.shape[1]} x {pixels.shape[0]}'
+    content = bytes(message.data)
+    png = png_header(content[:PNG_HEADER_BYTES])
+    header = png or jpeg_header(content)
+    if header is None:
+        return f'{message.format or "compressed"}, not a PNG or JPEG'
+    return f'{"PNG" if png else "JPEG"} {header.width} x {header.height}'
 
 
 def _causes(

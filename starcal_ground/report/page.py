@@ -324,6 +324,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'tiles': tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
+        'requirements': verdict.met_requirements(calibration),
         'precision': verdict.precision_sentences(calibration),
         'next_step': verdict.next_step(calibration),
         'signed': _signed(calibration),

@@ -14,6 +14,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.requirements import answers, OPTION
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
@@ -26,7 +27,6 @@ VISIBLE_PX = 0.001
 
 _MOST_OF_DETECTOR = 0.98
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
-_SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
 
 
 _UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
@@ -101,6 +101,22 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], o
     )
 
 
+def met_requirements(calibration: records.Calibration) -> list[str]:
+    """A sentence on each requirement that is met; one that is missed is among the reasons."""
+    met = [text for text in answers(calibration) if text.endswith(': met')]
+    return [f'{text[0].upper()}{text[1:]}.' for text in met]
+
+
+def in_sentences(calibration: records.Calibration) -> list[str]:
+    """Sentences of the first box: reasons, requirements, precision, next step."""
+    reasons = [f'{text[0].upper()}{text[1:]}.' for text in calibration.reasons]
+    checks = checks_sentence(calibration.gate) or 'The gate checks are not recorded.'
+    sentences = [*reasons, *met_requirements(calibration), checks]
+    sentences += precision_sentences(calibration)
+    step = next_step(calibration)
+    return [*sentences, f'Next: {step}'] if step else sentences
+
+
 def next_step(calibration: records.Calibration) -> str:
     """The measures against a refusal, or against the largest causes of the sigma."""
     if calibration.accepted:
@@ -111,7 +127,9 @@ def next_step(calibration: records.Calibration) -> str:
         f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
     )
     text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
-    steps = _against_sigma(calibration) if _SIGMA_LIMITS & set(failed) else []
+    if {*failed} == {OPTION}:
+        text = 'The sigmas hold, but miss a requirement.'
+    steps = _against_sigma(calibration) if OPTION in failed else []
     return ' '.join([text, *steps])
 
 

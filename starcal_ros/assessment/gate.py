@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from starcal_ros.assessment.agreement import movement
-from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.requirements import requirement_checks
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.temperature import camera_at
 from starcal_ros.options import option
@@ -47,11 +47,11 @@ class GateOptions:
     min_coverage: float = option(
         0.3, 'smallest fraction of detector cells with a star used', low=0.0, high=1.0
     )
-    max_map_sigma_px: float = option(
-        0.5,
-        'largest 1-sigma of the distortion map on the detector, common rotation removed, px',
-        low=0.0,
-        high=100.0,
+    requirements: tuple[str, ...] = option(
+        ('line_of_sight=300arcsec', 'map=0.5px'),
+        'upper limits of 1-sigmas, NAME=LIMIT; NAME: line_of_sight (in the star tracker frame) or'
+        ' map (common rotation removed), over the detector or a share of it, @98%; pointing (rms'
+        ' over the detector), f, or a parameter; LIMIT in arcsec or px',
     )
     max_change_px: float = option(
         10.0,
@@ -67,12 +67,6 @@ class GateOptions:
         ' longer image side',
         low=0.0,
         high=180.0,
-    )
-    max_line_of_sight_sigma_arcsec: float = option(
-        300.0,
-        'largest 1-sigma of a line of sight on the detector in the star tracker frame, arcsec',
-        low=0.0,
-        high=3600.0,
     )
     max_held_term_sigma: float = option(
         5.0,
@@ -247,32 +241,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         'fraction of the detector with stars that fit',
         float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
     )
-    aligned = calibration.has_alignment  # otherwise the common rotation has no meaning
-    sigma_arcsec = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
-    yield _worse(
-        limit_check(
-            options,
-            'max_map_sigma_px',
-            'largest 1-sigma of the distortion map',
-            _map_sigma_px(calibration),
-            'px',
-        ),
-        limit_check(
-            options,
-            'max_line_of_sight_sigma_arcsec',
-            'largest 1-sigma of a line of sight',
-            float(sigma_arcsec.max()),
-            'arcsec',
-        ),
-    )
-
-
-def _map_sigma_px(calibration: Calibration) -> float:
-    """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
-    try:
-        return float(map_sigma_px(calibration.geometry.camera, calibration.map_covariance).max())
-    except np.linalg.LinAlgError:
-        return math.nan
+    yield from requirement_checks(calibration, options.requirements)
 
 
 def _changes(

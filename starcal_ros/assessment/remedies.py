@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 REMEDIES: Mapping[str, str] = {
     # Reasons to refuse images (`IMAGE_REFUSALS`).
-    'bad_encoding': 'record images of one channel, 8 or 16 bit, raw or as PNG',
+    'bad_encoding': 'record images of one channel, 8 or 16 bit, raw, as PNG or JPEG',
     'bad_layout': 'correct width, height, step and data where the message is made',
     'bad_stamp': 'stamp the images in UTC since 1970, and check stamp_offset_s',
     'bad_attitude': 'send unit quaternions, and none while the star tracker has no lock',

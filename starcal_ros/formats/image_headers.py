@@ -19,6 +19,7 @@ PNG_HEADER_BYTES = 33
 _PNG_START = b'\x89PNG\r\n\x1a\n\0\0\0\rIHDR'
 _PNG_CHUNK = struct.Struct('>I4s')  # length, name
 _PNG_MOST_CHUNKS = 100_000
+_JPEG_MOST_SEGMENTS = 1000
 # Colour type -> channels; a palette is decoded to three colours.
 _PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 _WIDTH, _HEIGHT, _CHANNELS = 256, 257, 277  # tags of TIFF 6.0
@@ -40,6 +41,23 @@ def png_header(content: bytes) -> Header | None:
         return None
     width, height, _, colour = struct.unpack_from('>IIBB', content, 16)
     return Header(width, height, _PNG_CHANNELS.get(colour, 0))
+
+
+def jpeg_header(content: bytes) -> Header | None:
+    """Header of a JPEG (ITU T.81, B.2.2), from its frame; None if it is not a JPEG."""
+    if content[:2] != b'\xff\xd8':
+        return None
+    at = 2
+    with contextlib.suppress(struct.error):
+        for _ in range(_JPEG_MOST_SEGMENTS):
+            mark, code, length = struct.unpack_from('>BBH', content, at)
+            if mark != 0xFF:
+                break
+            if 0xC0 <= code <= 0xCF and code not in (0xC4, 0xC8, 0xCC):  # tables, not a frame
+                height, width, channels = struct.unpack_from('>HHB', content, at + 5)
+                return Header(width, height, channels)
+            at += 2 + length
+    return None
 
 
 def has_surplus(content: bytes, header: Header) -> bool:

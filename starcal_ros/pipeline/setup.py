@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.assessment.gate import GateOptions
+from starcal_ros.assessment.requirements import requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.camera.projection import convert
@@ -337,15 +338,25 @@ def read_setup(params: Path) -> Setup:
 
 def read_values(params: Path) -> dict[str, object]:
     """
-    Options of a ROS parameter file by name; a relative camera file is relative to that file.
+    Options of a ROS parameter file by name; relative paths are relative to that file.
 
     Raises OptionError when it is not a parameter file.
     """
-    values = dict(read_parameter_file(params, NODES))
-    url = values.get('camera_info_url')
-    if isinstance(url, str):
-        values['camera_info_url'] = with_home('camera_info_url', url)
-    return camera_yaml.with_camera_url_from(values, params)
+    return paths_from(read_parameter_file(params, NODES), params.parent)
+
+
+def paths_from(values: Mapping[str, object], folder: Path) -> dict[str, object]:
+    """Options whose relative paths of files to read are relative to a folder."""
+    names = [field.name for field in option_fields(SetupOptions) if field.metadata['is_path']]
+    paths = {name: values[name] for name in names if isinstance(values.get(name), str)}
+    return {
+        **values,
+        **{
+            name: str(folder / with_home(name, str(path)))
+            for name, path in paths.items()
+            if path and '://' not in str(path)
+        },
+    }
 
 
 def files_of(frames: SetupOptions) -> dict[str, Path]:
@@ -373,6 +384,25 @@ def _check_relative(files: Mapping[str, Path]) -> None:
             )
 
 
+def option_groups(values: Mapping[str, object], others: Sequence[type] = ()) -> dict[str, Any]:
+    """
+    Options of every stage, by the names of `Setup`, checked as far as that needs no camera.
+
+    ``others`` are further option classes whose names are also allowed. Raises OptionError for an
+    unknown name or a bad value.
+    """
+    known = names_of(*OPTION_CLASSES, *others)
+    for name in values:
+        if name not in known and not is_of_ros(name):
+            raise OptionError(unknown_option(name, known))
+    groups: dict[str, Any] = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS}
+    _check_relative(files_of(groups['frames']))
+    check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
+    check_site(groups['site'])
+    requirements_of(groups['gate'].requirements)
+    return groups
+
+
 def load_setup(
     values: Mapping[str, object], others: Sequence[type] = (), prior: CameraGeometry | None = None
 ) -> Setup:
@@ -384,17 +414,10 @@ def load_setup(
     or a bad value. Raises ProductError or CatalogError when the prior camera or the catalog cannot
     be read.
     """
-    known = names_of(*OPTION_CLASSES, *others)
-    for name in values:
-        if name not in known and not is_of_ros(name):
-            raise OptionError(unknown_option(name, known))
-    groups: dict[str, Any] = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS}
+    groups = option_groups(values, others)
     frames: SetupOptions = groups['frames']
-    _check_relative(files_of(frames))
     is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
-    check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
-    check_site(groups['site'])
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)

@@ -17,7 +17,10 @@ from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
-_OF_A_STAR_TRACKER = ('prior_alignment', 'star_tracker_sigma_arcsec', 'more_star_trackers')
+_OF_A_STAR_TRACKER = (
+    *('prior_alignment', 'star_tracker_sigma_arcsec', 'star_tracker_slow_arcsec'),
+    'more_star_trackers',
+)
 CLOCKS_SET_NS = 631_152_000_000_000_000  # 1990-01-01
 _LIKE_ATTITUDES = re.compile('Odometry|Pose|TFMessage|Transform|Quaternion|Attitude|Orientation')
 _CAMERA_ALONE = 'starcal calibrate --camera-alone estimates the camera without an alignment'

@@ -41,7 +41,7 @@ from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, Setup
 from starcal_ros.processes import return_freed_memory
 from starcal_ros.ros.inputs import Inputs
-from starcal_ros.ros.parameters import OptionParameters, unread_sections
+from starcal_ros.ros.parameters import folders_of_paths, OptionParameters, unread_sections
 from starcal_ros.ros.printable_log import PrintableLog
 from starcal_ros.text import printable
 
@@ -367,6 +367,7 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
         nonlocal node, executor
         node = make_node()
         given = sys.argv if args is None else args
+        node.options.folders = folders_of_paths(given, node.get_fully_qualified_name())
         for text in unread_sections(given, node.get_fully_qualified_name(), name):
             node.get_logger().warning(text)
         executor = Executor(_THREADS)

@@ -22,18 +22,20 @@ from rclpy.parameter import Parameter
 
 from starcal_ros import options
 from starcal_ros.errors import OptionError
+from starcal_ros.pipeline.setup import paths_from
 
 
 class OptionParameters:
     """
     Options of dataclasses as parameters of a node, checked whenever they are set.
 
-    While ``frozen`` is set, changes are rejected. Raises OptionError if a value from the command
-    line or the parameter file is invalid.
+    While ``frozen`` is set, changes are rejected. ``folders`` are those of `folders_of_paths`.
+    Raises OptionError if a value from the command line or the parameter file is invalid.
     """
 
     def __init__(self, node: Node, option_classes: Sequence[type[Any]]) -> None:
         self.frozen = False
+        self.folders: dict[tuple[str, object], Path] = {}
         self.classes = tuple(option_classes)
         self._node = node
         self._fields = {field.name: field for field in options.option_fields(*option_classes)}
@@ -50,10 +52,14 @@ class OptionParameters:
 
     def values(self) -> dict[str, object]:
         """Return all options by name, in the types of the dataclasses."""
-        return {
+        values: dict[str, object] = {
             name: options.check_value(field, self._node.get_parameter(name).value)
             for name, field in self._fields.items()
         }
+        for (name, value), folder in self.folders.items():
+            if values.get(name) == value:
+                values |= paths_from({name: value}, folder)
+        return values
 
     def names(self) -> list[str]:
         """Names of all options."""
@@ -79,6 +85,27 @@ class OptionParameters:
             except OptionError as error:
                 return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+
+def folders_of_paths(arguments: Sequence[str], node: str) -> dict[tuple[str, object], Path]:
+    """
+    Folder of the parameter file that gives each path, by its option and value.
+
+    ``arguments`` and ``node`` as for `unread_sections`.
+    """
+    folders: dict[tuple[str, object], Path] = {}
+    for flag, file in itertools.pairwise(arguments):
+        sections = options.parameter_sections(Path(file)) if flag == '--params-file' else {}
+        for section, body in sections.items():
+            values = body.get('ros__parameters') if isinstance(body, dict) else None
+            if isinstance(values, dict) and options.section_applies(section, node):
+                paths = paths_from(values, Path(file).absolute().parent)
+                folders |= {
+                    (name, value): Path(file).absolute().parent
+                    for name, value in values.items()
+                    if isinstance(value, str) and paths[name] != value
+                }
+    return folders
 
 
 def unread_sections(arguments: Sequence[str], node: str, executable: str) -> list[str]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_ros.assessment import requirements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.errors import (
@@ -345,10 +346,11 @@ def refusals_today(calibration: Calibration, setup: Setup) -> tuple[str, ...]:
 
 def summary(calibration: Calibration) -> str:
     """One line on a calibration."""
-    return (
+    fit = (
         f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
         f' in {calibration.images_used} images'
     )
+    return '; '.join([fit, *requirements.answers(calibration)])
 
 
 def _check_size(

@@ -16,7 +16,7 @@ pytest.importorskip('starcal.msg')
 
 from rcl_interfaces.srv import GetParameters
 
-from starcal_ros.ros.parameters import unread_sections
+from starcal_ros.ros.parameters import folders_of_paths, unread_sections
 
 pytestmark = pytest.mark.nodes
 
@@ -46,6 +46,30 @@ def test_a_node_starts_with_the_minimal_file(
     camera = f'camera_info_url:=file://{tiny_bag / "camera.yaml"}'
     node = start_node('calibrator', ros=('--params-file', str(params), '-p', camera))
     client.until(lambda: 'active, listening to' in node.said())
+
+
+def test_the_parameter_file_of_the_tool_starts_a_node_from_any_folder(
+    client: Client, start_node: StartNode
+) -> None:
+    """Its camera file is relative to it, not to the folder in which the node starts."""
+    params = Path(__file__).parents[2] / 'bags' / 'tiny' / 'params.yaml'
+    assert 'camera_info_url: camera.yaml' in params.read_text()
+    assert not Path('camera.yaml').exists()
+    node = start_node('calibrator', ros=('--params-file', str(params)))
+    client.until(lambda: 'active, listening to' in node.said())
+
+
+def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path: Path) -> None:
+    values = '{camera_info_url: camera.yaml, catalog: /a.npz, dark_frame: "", state_dir: here}'
+    params = tmp_path / 'params.yaml'
+    params.write_text(f'/**:\n  ros__parameters: {values}\n')
+    other = tmp_path / 'other.yaml'
+    other.write_text('/**/star_observer:\n  ros__parameters: {flat_field: flat.png}\n')
+    given = ['--ros-args', '--params-file', str(params), '--params-file', str(other)]
+    camera = {('camera_info_url', 'camera.yaml'): tmp_path}
+    assert folders_of_paths(given, '/calibrator') == camera
+    flat = {('flat_field', 'flat.png'): tmp_path}
+    assert folders_of_paths(given, '/star_observer') == camera | flat
 
 
 def test_sections_of_others_are_no_concern(tmp_path: Path) -> None:

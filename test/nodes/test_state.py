@@ -153,6 +153,22 @@ def test_the_time_of_an_activation_is_read_when_it_is_made(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ('requirement', 'words'),
+    [
+        ('line_of_sight=1000arcsec@98%', 'arcsec, at most 1000 arcsec required: met'),
+        ('f=1e-6px', 'over the limit of 0.000001 px (requirements); missed by'),
+    ],
+)
+def test_the_answer_has_the_requirements(
+    setup: Setup, shown: tuple[StarObservations, ...], requirement: str, words: str
+) -> None:
+    gate = dataclasses.replace(setup.gate, requirements=(requirement,))
+    answer = filled(dataclasses.replace(setup, gate=gate), shown).solve()
+    assert words in answer.message and answer.success == words.endswith('met')
+
+
+@pytest.mark.slow
 def test_what_is_forced_says_so(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
@@ -396,9 +412,9 @@ def test_what_was_forced_stays_for_its_own_reasons_only(
     state = started(dataclasses.replace(setup, gate=gate), tmp_path)
     assert state.active is not None and state.active.forced
     state.close()
-    tighter = dataclasses.replace(gate, max_map_sigma_px=1e-6)
+    tighter = dataclasses.replace(gate, requirements=('map=1e-6px',))
     state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
-    assert state.active is None and 'max_map_sigma_px' in state.withheld[0]
+    assert state.active is None and 'requirements' in state.withheld[0]
     assert 'max_change_px' not in state.withheld[0]
     state.close()
 

@@ -14,9 +14,9 @@ import pytest
 from tool_modules import tool  # type: ignore[import-not-found]
 import yaml
 
-from starcal_ros.formats.products.camera_yaml import read_camera_info, with_camera_url_from
+from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.options import check_value, option_fields, read_parameter_file
-from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, OPTION_CLASSES
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, read_setup
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'
@@ -74,8 +74,7 @@ def test_examples_load(path: Path) -> None:
     if path.stem.endswith('_camera'):
         assert read_camera_info(str(path)).width > 0
         return
-    values = read_parameter_file(path, ('star_observer', 'calibrator'))
-    setup = load_setup(with_camera_url_from(values, path), others=NODE_OPTION_CLASSES)
+    setup = read_setup(path)
     assert setup.prior.camera.width > 0
 
 

@@ -1,15 +1,19 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Calibrate from bags, without a ROS graph.
+Calibrate from bags or images, with what is known of them, without a ROS graph.
 
 Measures the stars of all images, estimates camera and alignment, checks the result against the
 limits of the gate and writes report.html, calibration.json, camera_info.yaml and observations.mcap
-to DIR. Images without attitudes give the camera alone: their attitudes are found from the stars.
+to DIR. What is not stated (--params, --set) is found by the stars or assumed, and listed; a camera
+that was found is in DIR as params.yaml and camera.yaml. Images without attitudes give the camera
+alone.
 
-  # the bag in the repository
-  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
-  # photographs of the night sky alone
-  starcal calibrate 'night/*.jpg' -o out
+  # the bag in the repository, of which nothing is stated
+  starcal calibrate bags/tiny -o found
+  # with its parameter file, and an accuracy to reach
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --require map=1arcsec@98%
+  # photographs of the night sky alone, with a lens model
+  starcal calibrate 'night/*.jpg' -o out --set lens_model=plumb_bob
   # the images of the first 30 s
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30
   # one of several cameras, from two bags together
@@ -21,8 +25,7 @@ to DIR. Images without attitudes give the camera alone: their attitudes are foun
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
-import contextlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
@@ -31,105 +34,102 @@ import tempfile
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_table, print_text, print_verdict
+from starcal_ground.cli.terminal import print_table, print_text, print_verdict, print_wrapped
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import NotFromStars, OptionError
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
-    from starcal_ros.pipeline.campaign import Source
+    from starcal_ground.images.first_setup import FirstSetup
+    from starcal_ros.pipeline.campaign import Campaign, Source
     from starcal_ros.records import Calibration, CameraGeometry
+
+_DIR = 'folder for the products, created if absent'
+_ANSWERED = (
+    *('accepted', 'reasons', 'images_used', 'images_refused', 'stars_used', 'residual_rms_px'),
+    'statements',
+)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    arguments.add_bags(command, arguments.BAGS_OR_IMAGES)
-    what = 'ROS parameter file: prior camera, mounting and options; images need none'
-    arguments.add_params(command, what)
-    arguments.add_output(
-        command, 'DIR', 'folder for the products, created if absent', required=True
+    arguments.add_inputs(command)
+    arguments.add_output(command, 'DIR', f'{_DIR} (needed)')
+    what = (
+        'a sigma to reach, such as line_of_sight=5arcsec@98%%, map=0.1px, pointing=10arcsec or'
+        ' f=0.1px, in place of the option requirements; may be repeated'
     )
+    command.add_argument('--require', action='append', metavar='NAME=LIMIT', help=what)
     what = 'write no report; starcal report DIR writes it later'
     command.add_argument('--no-report', action='store_true', help=what)
-    arguments.add_camera_alone(command)
-    arguments.add_lens(command)
-    arguments.add_topics(command)
     when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
     for name, what in (('from', f'use images from T on: {when}'), ('to', 'use images up to T')):
         command.add_argument(
             f'--{name}', dest=f'{name}_time', type=parse_time, metavar='T', help=what
         )
+    shown = command.add_mutually_exclusive_group()
+    arguments.add_json(shown)
+    what = 'print nothing but errors; the exit status is the verdict'
+    shown.add_argument('--quiet', action='store_true', help=what)
+    what = 'print solver, alignment and what each cause of the sigma was estimated from too'
+    shown.add_argument('--verbose', action='store_true', help=what)
 
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli import into_folder
-    from starcal_ros.estimation.options import tracker_sigma_is_given
 
-    with _source(args) as (source, files), into_folder.digests(files) as inputs:
-        if args.output.exists() and not args.output.is_dir():
-            raise OptionError(f'{args.output}: not a folder')
-        arguments.print_notes(source.notes)
-        selection = None
-        if args.from_time or args.to_time:
-            selection = Selection(args.from_time, args.to_time)
-        made, report = into_folder.calibrate_into(
-            args.output, source, inputs, selection, not args.no_report
-        )
-    calibration, setup = made.calibration, made.setup
-    print_calibration(calibration, setup.prior)
-    if calibration.has_alignment and not tracker_sigma_is_given(setup.calibration):
-        sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
-        print_text(
-            f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
-            ' is not given'
-        )
-    print_text(f'products written to {args.output}' + (f'; {report}' if report else ''))
-    return arguments.EXIT_ACCEPTED if calibration.accepted else arguments.EXIT_REFUSED
+    if args.output is None:
+        raise OptionError(f'-o/--output DIR: not given: the {_DIR}, e.g. -o out')
+    if args.output.exists() and not args.output.is_dir():
+        raise OptionError(f'{args.output}: not a folder')
+    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+        first, source = _source(args, Path(folder))
+        with into_folder.digests(first.files) as inputs:
+            selection = None
+            if args.from_time or args.to_time:
+                selection = Selection(args.from_time, args.to_time)
+            made, report = into_folder.calibrate_into(
+                args.output, source, inputs, selection, not args.no_report
+            )
+    if not args.quiet:
+        arguments.print_notes(made.notes[len(source.notes) :])
+    if args.json:
+        arguments.print_json(answer_of(made, first, source, args.output))
+    elif not args.quiet:
+        print_calibration(made.calibration, made.setup.prior, args.verbose)
+        _print_assumed(first.assumed(source.topics), made.calibration)
+        print_text(f'\nproducts written to {args.output}' + (f'\n{report}' if report else ''))
+        _print_verdict(made.calibration)
+    accepted = made.calibration.accepted
+    return arguments.EXIT_ACCEPTED if accepted else arguments.EXIT_REFUSED
 
 
-@contextlib.contextmanager
-def _source(args: argparse.Namespace) -> Iterator[tuple[Source, Sequence[Path]]]:
-    """The source that the arguments name, and its files; that of images lasts for the block."""
+def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Source]:
+    """The set-up that the arguments give, and its source; a failure is recorded in the folder."""
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
-    from starcal_ground.images.photographs import image_paths
-    from starcal_ros.formats.bag import reader
-    from starcal_ros.pipeline.campaign import source_of
-    from starcal_ros.pipeline.setup import files_of, read_setup, read_values
-    from starcal_ros.pipeline.topics import without_attitudes
+    from starcal_ground.images import first_setup
+    from starcal_ground.outputs import check_outputs, make_folder
 
-    photographs, topics = image_paths(args.bags), arguments.topics(args)
-    values = read_values(args.params) if args.params else {}
-    if photographs or without_attitudes(args.bags, topics, values, args.camera_alone):
-        with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-            yield _source_by_stars(args, values, photographs, Path(folder))
-        return
-    if args.params is None:
-        raise OptionError('--params: needed for a bag with attitudes, unless --camera-alone')
-    setup = read_setup(args.params)
-    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
-    with failure_recorded(args.output, args.bags, OptionError):
-        source = source_of(args.bags, setup, topics)
-    yield source, (*reader.mcap_files(args.bags), args.params)
+    given = arguments.given(args, **({'requirements': args.require} if args.require else {}))
+    setup, files = given.checked()
+    files += given.photographs
+    check_folder(args.output, [] if given.photographs else given.paths, files)
+    if setup is None:  # a long search, whose result must have its place
+        names = (first_setup.PARAMETER_FILE, first_setup.CAMERA_FILE)
+        if not given.states_camera:
+            check_outputs([args.output / name for name in names], files)
+        make_folder(args.output)
 
+    def note(notes: Sequence[str]) -> None:
+        if not args.quiet:
+            arguments.print_notes(notes)
 
-def _source_by_stars(
-    args: argparse.Namespace, values: Mapping[str, object], photographs: list[Path], folder: Path
-) -> tuple[Source, Sequence[Path]]:
-    """Photographs, or bags without attitudes: those of their stars are written to a folder."""
-    from starcal_ground.cli.into_folder import check_folder, failure_recorded
-    from starcal_ground.images import night_sky
-    from starcal_ground.outputs import make_folder
-    from starcal_ros.pipeline.campaign import source_of
-
-    params = list(filter(None, [args.params]))
-    check_folder(args.output, [] if photographs else args.bags, (*photographs, *params))
-    make_folder(args.output)
-    lens = args.focal_length_mm, args.pixel_size_um
-    with failure_recorded(args.output, args.bags, NotFromStars):
-        sky, files = night_sky.from_images(
-            args.bags, arguments.topics(args), values, folder, lens, arguments.print_notes
-        )
-    arguments.print_notes(sky.notes)
-    return source_of(sky.bags, sky.setup, sky.topics, sky.through_air), (*files, *params)
+    with failure_recorded(args.output, given.paths, (NotFromStars, OptionError)):
+        first = first_setup.first_setup(given, setup, args.output, bag_folder, note)
+        source = first.source()
+    note(source.notes)
+    if not given.states_camera:
+        first.write(args.output, source.topics)
+    return first, source
 
 
 @dataclass(frozen=True)
@@ -199,64 +199,112 @@ class Selection:
         return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
 
 
-def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
-    """Print parameters, statistics and verdict; changes are relative to the prior."""
-    import numpy as np
+def answer_of(
+    made: Campaign, first: FirstSetup, source: Source, folder: Path
+) -> Mapping[str, object]:
+    """Object that `--json` prints of a campaign whose products are in a folder."""
+    from starcal_ground.report import verdict
+    from starcal_ros.assessment.requirements import OPTION
 
+    calibration = made.calibration
+    return {
+        **{name: getattr(calibration, name) for name in _ANSWERED},
+        'requirements': [check for check in calibration.gate if check.option == OPTION],
+        'lens_model': calibration.geometry.camera.model,
+        'found': made.notes,
+        'assumed': dict(first.assumed(source.topics)),
+        'precision': verdict.precision_sentences(calibration),
+        'next_step': verdict.next_step(calibration),
+        'folder': str(folder),
+    }
+
+
+def print_calibration(
+    calibration: Calibration, prior: CameraGeometry, verbose: bool = False
+) -> None:
+    """Print parameters, statistics and causes of the sigma; changes are relative to the prior."""
     from starcal_ground.report import verdict
 
+    camera = calibration.geometry.camera
+    print_text(f'lens model {camera.model}, {camera.width} x {camera.height} px\n')
     rows = verdict.parameter_rows(calibration, prior)
     angles = verdict.alignment_rows(calibration, prior)
     print_table(
         ('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas'),
         [
-            (f'{kind}{row.name}', row.value, row.unit, row.sigma, row.change, row.change_sigmas)
+            (f'{kind}{row.name}', row.value, unit, row.sigma, row.change, row.change_sigmas)
             for kind, of_kind in (('', rows), ('alignment ', angles))
             for row in of_kind
+            for unit in [row.unit.replace('arcsec', '″')]
         ],
     )
-    _print_budget(calibration)
-    quaternion = calibration.geometry.star_tracker_from_camera_xyzw
-    aligned = np.array2string(quaternion, precision=9, separator=', ')
-    if not calibration.has_alignment:
-        aligned = 'none: attitudes from the stars, the camera alone'
     refused = ', '.join(f'{n} {reason}' for reason, n in calibration.images_refused.items())
-    print_text(f'alignment xyzw  {aligned}')
-    print_text(f'images          {calibration.images_used} used, refused: {refused or "none"}')
-    print_text(
-        f'stars           {calibration.stars_used} used, {calibration.stars_rejected} rejected'
-    )
-    print_text(f'residual        {calibration.residual_rms_px:.4f} px rms per axis')
-    print_text(f'method          {calibration.method}')
-    print_text(f'solver          {calibration.iterations} iterations, {calibration.termination}')
+    lines = [
+        ('images', f'{calibration.images_used} used, refused: {refused or "none"}'),
+        ('stars', f'{calibration.stars_used} used, {calibration.stars_rejected} rejected'),
+        ('residual', f'{calibration.residual_rms_px:.4f} px rms per axis'),
+    ]
+    if not calibration.has_alignment:
+        lines.append(('alignment', 'none: attitudes from the stars, the camera alone'))
     if calibration.temperature is not None:
-        print_text(f'temperature     {verdict.thermal_summary(calibration.temperature)}')
-    for tracker in calibration.star_trackers:
-        print_text(f'star tracker    {verdict.alignment_summary(tracker)}')
-    if calibration.accepted:
-        print_verdict(True, 'verdict         accepted')
-    else:
-        print_verdict(False, f'verdict         refused: {"; ".join(calibration.reasons)}')
-    for statement in calibration.statements[:1]:
-        print_text(f'lower sigma     {statement}')
+        lines.append(('temperature', verdict.thermal_summary(calibration.temperature)))
+    lines += [
+        ('tracker', verdict.alignment_summary(tracker)) for tracker in calibration.star_trackers
+    ]
+    if verbose and calibration.has_alignment:
+        quaternion = calibration.geometry.star_tracker_from_camera_xyzw
+        lines.append(('alignment', f'xyzw {", ".join(f"{part:.9f}" for part in quaternion)}'))
+    if verbose:
+        lines += [
+            ('method', calibration.method),
+            ('solver', f'{calibration.iterations} iterations, {calibration.termination}'),
+        ]
+    print_text()
+    for name, text in lines:
+        print_wrapped(f'{name:<12}{text}', 12)
+    _print_budget(calibration, verbose)
 
 
-def _print_budget(calibration: Calibration) -> None:
+def _print_budget(calibration: Calibration, verbose: bool) -> None:
     from starcal_ros.records import parts_that_matter
 
+    columns = 3 if calibration.has_alignment else 2
     parts = parts_that_matter(calibration.sigma_budget)
-    columns = 4 if calibration.has_alignment else 3
+    if not parts:
+        return
+    header = ('1-sigma of lines of sight', 'camera alone', 'with alignment')
     rows = [
-        (
-            part.cause,
-            part.assumption,
-            *(
-                f'{significant(one, 3, least=0.001)}"'
-                for one in (part.map_arcsec, part.pointing_arcsec)
-            ),
-        )
+        (part.cause, *(f'{significant(sigma, 3, least=0.001)}″' for sigma in sigmas))
         for part in parts
+        for sigmas in [(part.map_arcsec, part.pointing_arcsec)]
     ]
-    if rows:
-        header = ('1-sigma of lines of sight', '', 'camera alone', 'with alignment')
-        print_table(header[:columns], [row[:columns] for row in rows], left=2)
+    print_text()
+    print_table(header[:columns], [row[:columns] for row in rows])
+    for part in parts[1:] if verbose else ():
+        print_wrapped(f'  {part.cause}: {part.assumption}', 4)
+
+
+def _print_assumed(assumed: Sequence[tuple[str, str]], calibration: Calibration) -> None:
+    """Print what nobody stated, with what stating it would gain."""
+    gains = {
+        row.option.split()[0].strip(','): str(row).partition(': ')[2]
+        for row in calibration.statements
+    }
+    assumptions = {name: f'assumed {text}' for name, text in assumed}
+    names = dict.fromkeys([*assumptions, *gains])
+    if names:
+        print_text('\nyours to state (--set NAME=VALUE, or in --params):')
+    for name in names:
+        text = '; '.join(filter(None, [assumptions.get(name), gains.get(name)]))
+        print_wrapped(f'  {name}: {text}', 4)
+
+
+def _print_verdict(calibration: Calibration) -> None:
+    """Print the first box of the report."""
+    from starcal_ground.report import verdict
+
+    print_text()
+    word = 'accepted' if calibration.accepted else 'refused'
+    print_verdict(calibration.accepted, f'{word} by the gate')
+    for sentence in verdict.in_sentences(calibration):
+        print_wrapped(f'  {sentence}'.replace(' arcsec', '″'), 4)

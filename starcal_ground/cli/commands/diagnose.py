@@ -3,8 +3,8 @@
 Find out why the images of a bag match no star.
 
 Identifies some of the first images without attitude or alignment, compares the attitudes,
-alignment and camera with them, and prints the error, the evidence for it and the lines of the
-parameter file that correct it.
+alignment and camera that are stated with them, and prints the error, the evidence for it and the
+lines of the parameter file that correct it.
 
   # find the cause if no image matches
   starcal diagnose bags/tiny --params bags/tiny/params.yaml
@@ -15,22 +15,27 @@ exit status: 0 the set-up is right; 3 it is wrong, or the cause is unknown; 2 ba
 """
 
 import argparse
+from pathlib import Path
+import tempfile
 
 from starcal_ground.cli import arguments, terminal
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    arguments.add_bags(command)
-    arguments.add_params(command)
-    arguments.add_topics(command)
+    arguments.add_inputs(command)
     arguments.add_json(command)
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.images.first_setup import first_setup
     from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
-    from starcal_ros.pipeline.setup import read_setup
 
-    diagnosis = diagnose_bags(args.bags, arguments.topics(args), read_setup(args.params))
+    given = arguments.given(args)
+    setup, _ = given.checked()
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
+        arguments.print_notes(first.found)
+        diagnosis = diagnose_bags(first.bags, first.topics, first.setup)
     if args.json:
         arguments.print_json(diagnosis)
     else:

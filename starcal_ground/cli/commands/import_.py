@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.photographs import ImageOptions
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ground.mission.ingest.mission_records import Guard
+    from starcal_ros.formats.products.camera_yaml import read_camera_info
 
     options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=None)
     needed = 4 * (1 + len(args.more_star_trackers))
@@ -84,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
             f'--alignment: {given} numbers, {needed} are needed: x y z w for each star tracker;'
             ' only that of a single one is found from the images'
         )
+    if args.camera:  # the images take their time
+        read_camera_info(args.camera)
     paths, solved = _expanded(args.images), _expanded(args.attitude, '--attitude')
     inputs = [args.times, args.camera, *solved, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)

@@ -2,12 +2,12 @@
 """
 List the contents of a bag and the images a calibration would refuse.
 
-Lists topics, rates, stamps, encodings and gaps, and checks each image against the attitudes as a
-calibration does. With --params it also measures the stars.
+Lists topics, rates, stamps, encodings and gaps, and measures each image as a calibration does,
+with what is stated, found and assumed.
 
-  # check stamps and attitudes
+  # of which nothing is stated
   starcal inspect bags/tiny
-  # also measure the stars, as "starcal calibrate" does
+  # with its parameter file
   starcal inspect bags/tiny --params bags/tiny/params.yaml
   # machine-readable output
   starcal inspect bags/tiny --json
@@ -20,11 +20,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 import math
+from pathlib import Path
+import tempfile
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_table, print_text, print_verdict, progress_bar
+from starcal_ground.cli.terminal import (
+    print_table,
+    print_text,
+    print_verdict,
+    print_wrapped,
+    progress_bar,
+)
 from starcal_ros.constants import utc_text
+from starcal_ros.errors import BagError, NotFromStars, OptionError
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -32,33 +41,39 @@ if TYPE_CHECKING:
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    arguments.add_bags(command)
-    arguments.add_params(command, 'ROS parameter file; with it the stars are measured too')
-    arguments.add_camera_alone(command)
-    arguments.add_topics(command)
+    arguments.add_inputs(command)
     arguments.add_json(command)
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.file_kinds import explained
+    from starcal_ground.images.first_setup import first_setup
     from starcal_ground.planning import inspect
     from starcal_ros.formats.bag import reader
     from starcal_ros.formats.messages import message_codec
 
-    setup = None
-    if args.params:
-        from starcal_ros.pipeline.setup import read_setup
-
-        setup = read_setup(args.params)
     kinds = (
         message_codec.IMAGE_TYPE,
         message_codec.COMPRESSED_TYPE,
         message_codec.OBSERVATIONS_TYPE,
     )
-    total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
-    with progress_bar(total, 'images') as advance:
-        inspection = inspect.inspect(
-            args.bags, arguments.topics(args), setup, advance, args.camera_alone
-        )
+    given = arguments.given(args)
+    bags, topics, (setup, _) = tuple(given.paths), given.topics, given.checked()
+    through_air, problem = None, ''
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        try:
+            first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
+        except (NotFromStars, OptionError, BagError) as error:
+            if given.photographs:
+                raise
+            problem = explained(error)  # the bag is listed all the same
+        else:
+            arguments.print_notes(first.found)
+            bags, topics, setup = first.bags, first.topics, first.setup
+            through_air = first.through_air
+        total = max((t.count for t in reader.topics(bags) if t.type_name in kinds), default=0)
+        with progress_bar(total, 'images') as advance:
+            inspection = inspect.inspect(bags, topics, setup, advance, through_air, problem)
     arguments.print_notes(inspection.notes)
     if args.json:
         arguments.print_json(inspection)
@@ -70,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
 def _print(inspection: Inspection) -> None:
     """Print topics, images, attitudes and refused images."""
     from starcal_ground.report import verdict
+    from starcal_ros.records import ALIGNMENT_NAMES
 
     print_table(
         ('topic', 'type', 'messages', 'rate', 'longest gap'),
@@ -86,7 +102,7 @@ def _print(inspection: Inspection) -> None:
         left=2,
     )
     for topic in inspection.topics:
-        print_text(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
+        print_wrapped(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
     for text in inspection.damage:
         print_text(f'damage: {text}')
     if inspection.images:
@@ -101,16 +117,15 @@ def _print(inspection: Inspection) -> None:
                     inspection.status.predicted_sigma,
                     strict=True,
                 )
+                if not (inspection.by_stars and name in ALIGNMENT_NAMES)
             ],
         )
     if inspection.problems:
         print_verdict(False, 'cannot be calibrated: ' + '; '.join(inspection.problems))
     elif inspection.by_stars:
-        print_verdict(True, 'no problems found so far; the camera alone, without attitudes')
-    elif inspection.measured:
-        print_verdict(True, 'can be calibrated')
+        print_verdict(True, 'can be calibrated: the camera alone, without attitudes')
     else:
-        print_verdict(True, 'no problems found so far; use --params to measure the stars too')
+        print_verdict(True, 'can be calibrated')
 
 
 def _print_images(inspection: Inspection) -> None:
@@ -118,7 +133,7 @@ def _print_images(inspection: Inspection) -> None:
     chosen = inspection.chosen
     assert chosen is not None  # images come from a chosen topic
     attitudes = ', '.join(filter(None, (chosen.attitude, *chosen.more_attitudes)))
-    print_text(
+    print_wrapped(
         f'{inspection.images - bad} of {inspection.images} images of '
         f'{chosen.image or chosen.observations} can be used'
         + (f', with the attitudes of {attitudes}' if attitudes else '')
@@ -126,18 +141,12 @@ def _print_images(inspection: Inspection) -> None:
     if math.isfinite(inspection.longest_attitude_gap_s):
         gap_s = significant(inspection.longest_attitude_gap_s, 3)
         print_text(f'longest attitude gap around an image: {gap_s} s')
-    if inspection.refused:
-        print_table(
-            ('refused', 'images', 'meaning', 'first'),
-            [
-                (r.reason, str(r.count), r.meaning, f'{_clock(r.first_ns)}: {r.detail}')
-                for r in inspection.refused
-            ],
-            left=4,
-        )
+    for group in inspection.refused:
+        first = f'first {_clock(group.first_ns)}: {group.detail}'
+        print_wrapped(f'{group.count} refused as {group.reason}: {group.meaning}; {first}')
     if inspection.stars_per_image:
         stars = inspection.stars_per_image
-        print_text(
+        print_wrapped(
             f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
             f'refused: {_counted(inspection.refused_stars)}'
         )

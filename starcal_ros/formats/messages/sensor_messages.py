@@ -15,12 +15,17 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.image_headers import has_surplus, png_header, PNG_HEADER_BYTES
+from starcal_ros.formats.image_headers import (
+    has_surplus,
+    jpeg_header,
+    png_header,
+    PNG_HEADER_BYTES,
+)
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, refused_image, StarObservations
 
 _MOST_PIXELS = 2**27  # 256 MB of 16 bit, for a camera that is not known
-_JPEG = b'\xff\xd8'  # how its files begin
+_SET_CHANNEL = 'is a colour image: set image_channel, e.g. to green'
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 CHANNELS = ('red', 'green', 'blue')
 
@@ -55,9 +60,7 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
     data = message.data
     is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
     if is_colour and not channel:
-        raise ImageRefused(
-            'bad_encoding', f'{encoding} is a colour image: set image_channel, e.g. to green'
-        )
+        raise ImageRefused('bad_encoding', f'{encoding} {_SET_CHANNEL}')
     letters, pixel_bytes = RGB_ENCODINGS.get(encoding, ('', 0))
     if not letters:
         pixel_bytes = _PIXEL_BYTES.get(encoding) or BAYER_ENCODINGS.get(encoding, ('', 0))[1]
@@ -93,43 +96,52 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
     return Image(time_ns, pixels)
 
 
-def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> Image:
+def decode_compressed(
+    data: Any, time_ns: int, size: tuple[int, int] | None = None, channel: str = ''
+) -> Image:
     """
-    Pixels of a PNG of one channel, 8 or 16 bit.
+    Pixels of a PNG, 8 or 16 bit, or of a JPEG.
 
-    A PNG of a few kilobytes can claim gigabytes of pixels, so its header is checked first:
+    A PNG of a few kilobytes can claim gigabytes of pixels, so the header is checked first:
     against ``size`` (width, height) where that is known, else against a limit for any camera.
+    ``channel`` as for `decode_image`.
 
-    Raises ImageRefused ``bad_encoding`` for another format; ``wrong_size``; ``bad_layout`` for a
-    PNG that cannot be decoded.
+    Raises ImageRefused ``bad_encoding`` for another format; ``wrong_size``; ``bad_layout`` for an
+    image that cannot be decoded.
     """
-    # A JPEG would decode too, but its compression changes stars of two pixels.
-    header = png_header(bytes(data[:PNG_HEADER_BYTES]))
+    content = bytes(data)
+    png = png_header(content[:PNG_HEADER_BYTES])
+    header, kind = png or jpeg_header(content), 'PNG' if png else 'JPEG'
     if header is None:
-        kind = 'a JPEG' if bytes(data[:2]) == _JPEG else 'not a PNG'
-        raise ImageRefused('bad_encoding', f'the compressed image is {kind}; PNG is read')
+        raise ImageRefused('bad_encoding', 'the compressed image is not a PNG or JPEG')
     claimed = (header.width, header.height)
-    if header.channels != 1:
-        raise ImageRefused('bad_encoding', f'the PNG has {header.channels} channels, not one')
+    is_colour = header.channels == 3
+    if header.channels not in (1, 3):
+        raise ImageRefused('bad_encoding', f'the {kind} has {header.channels} channels, not one')
+    if is_colour and not channel:
+        raise ImageRefused('bad_encoding', f'the {kind} {_SET_CHANNEL}')
     if size is not None and claimed != size:
         raise ImageRefused(
             'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*claimed, *size)
         )
     if min(claimed) < 1 or max(claimed) > MAX_SIDE_PX or math.prod(claimed) > _MOST_PIXELS:
-        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*claimed))
-    if has_surplus(bytes(data), header):
+        raise ImageRefused('bad_layout', f'the {kind} claims {claimed[0]} x {claimed[1]} px')
+    if png and has_surplus(content, header):
         raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
     import cv2  # slow to import, and few bags have compressed images
 
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:  # as stored: the orientation of EXIF is of a viewer
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
+        raise ImageRefused('bad_layout', f'{len(content)} bytes of {kind} cannot be decoded')
+    if is_colour and pixels.ndim == 3:
+        pixels = plane(pixels, 'bgr', channel)
     if pixels.shape != claimed[::-1] or pixels.dtype not in (np.uint8, np.uint16):
         raise ImageRefused(
-            'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
+            'bad_encoding',
+            f'the {kind} is {pixels.dtype} of shape {pixels.shape}, not one channel',
         )
     pixels.setflags(write=False)
     return Image(time_ns, pixels)  # type: ignore[arg-type]
@@ -153,7 +165,7 @@ def image_from_message(
     if time_ns != codec.nearest_stamp_ns(time_ns):
         raise ImageRefused('bad_stamp', f'{time_ns} ns is not within the range of ROS stamps')
     if not hasattr(message, 'encoding'):
-        return decode_png(message.data, time_ns, size)
+        return decode_compressed(message.data, time_ns, size, channel)
     return decode_image(message, time_ns, channel)
 
 

@@ -185,14 +185,6 @@ def resolve_url(url: str) -> Path:
     raise ProductError(f'{url}: package {package} is not in AMENT_PREFIX_PATH')
 
 
-def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str, object]:
-    """Parameters of a file; a path in `camera_info_url` is relative to that file."""
-    url = values.get('camera_info_url')
-    if isinstance(url, str) and url and '://' not in url:
-        return {**values, 'camera_info_url': str(params.parent / url)}
-    return dict(values)
-
-
 def _as_written_or_decoded(path: Path) -> Path:
     """The path; ROS does not decode %20 in its URLs but others do, so both are taken."""
     return path if path.exists() else Path(unquote(str(path)))

@@ -151,7 +151,8 @@ def of_refusals(refused: Sequence[Refused], images: int) -> Diagnosis | None:
         return None
     most = refused[0]
     count = 'All' if most.count == images else f'{most.count} of'
-    remedy = REMEDIES.get(most.reason)
+    # A detail that has a remedy of its own knows better.
+    remedy = '' if ': set ' in most.detail else REMEDIES.get(most.reason)
     return Diagnosis(
         most.reason,
         most.count,

@@ -116,12 +116,13 @@ def test_a_command_line_imports_its_command_alone() -> None:
     [
         (['fly'], ["'fly'"]),
         (['calibrat'], ['did you mean calibrate?']),
-        (['calibrate', 'a.mcap', '--image-topick=/a'], ['--output']),
+        (['calibrate', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
+        (['--json', 'compare', 'a', 'b'], ['--json (write it after the command)']),
         (['inspect', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
         (['inspect', 'none.mcap'], ['none.mcap', 'no such bag']),
         (['inspect', ''], ['empty path']),
         (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
-        (['calibrate', str(TINY), '--params', str(TINY / 'camera.yaml'), '-o', 'x'], ['section']),
+        (['calibrate', str(TINY), '--params', str(TINY / 'camera.yaml'), '-o', 'x'], ['a camera']),
         (
             ['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'],
             ['larger than'],
@@ -137,9 +138,8 @@ def test_a_command_line_imports_its_command_alone() -> None:
         (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
         (['import', '--channel', 'grene'], ['did you mean green?']),
         (['calibrate'], ['BAG']),
-        (['calibrate', 'a.mcap'], ['--output']),
-        (['calibrate', str(TINY), '-o', 'x'], ['--params']),
-        (['calibrate', 'a.mcap', '--params', 'p.yaml'], ['--output']),
+        (['calibrate', 'a.mcap'], ['--output DIR: not given', 'e.g. -o out']),
+        (['calibrate', 'a.mcap', '-o', 'x', '--json', '--quiet'], ['not allowed with']),
         (['simulate', '-o', 'x'], ['--scenario']),
         (['simulate', '-o', 'x', '--scenario', 'huge'], ["'huge'", 'tiny', 'small', 'paper']),
         (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', '-1'], ['--seed', '-1']),
@@ -230,7 +230,6 @@ def test_topics_that_are_not_there(
         ),
         ({'prior_alignment': [0.0, 0.0, 0.0, 0.5]}, ['prior_alignment', 'unit']),
         ({'attitude_direction': 'up'}, ['attitude_direction', "'up'", 'st_to_inertial']),
-        ({'camera_info_url': None}, ['camera_info_url']),
         ({'camera_info_url': 'none.yaml'}, ['none.yaml', 'No such file']),
         ({'camera_info_url': 'file:///none.yaml'}, ['/none.yaml', 'No such file']),
         ({'camera_info_url': 'package://none/a.yaml'}, ['package none']),
@@ -263,7 +262,7 @@ def test_bad_parameters(
         ('star_observer:\n  ros__parameters: 3\n', ['star_observer', 'ros__parameters']),
         ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
         ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
-        ('/**:\n  ros__parameters: {min_images: 3}\n', ['camera_info_url', 'bad.yaml']),
+        ('/**:\n  ros__parameters: {min_images: few}\n', ['min_images', 'bad.yaml']),
     ],
 )
 def test_bad_parameter_files(run: Run, tmp_path: Path, text: str, words: list[str]) -> None:
@@ -429,7 +428,7 @@ def test_interrupt_is_one_line(run: Run, tmp_path: Path, monkeypatch: pytest.Mon
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr('starcal_ros.pipeline.setup.load_setup', interrupted)
+    monkeypatch.setattr('starcal_ground.images.first_setup.load_setup', interrupted)
     status, _, err = run('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path)
     assert (status, err) == (130, 'starcal: interrupted\n')
 
@@ -556,7 +555,7 @@ def test_no_report_is_written_where_none_is_wanted(
     write_atomically(tmp_path / 'report.html', 'of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
     status, out, _ = run('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
-    assert status == 0 and out.endswith(f'products written to {tmp_path}\n')
+    assert status == 0 and f'\nproducts written to {tmp_path}\n' in out
     assert (tmp_path / 'calibration.json').is_file()
     assert not (tmp_path / 'report.html').exists()
 

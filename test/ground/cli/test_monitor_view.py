@@ -63,7 +63,9 @@ def test_forecast_sigmas_stand_beside_the_active_ones() -> None:
 
 
 def test_a_refused_candidate_shows_the_failed_check_first() -> None:
-    gate = (check(0.5, 1.0), check(2.0, 1.0, passed=False))
+    others = [check(0.9, 1.0) for _ in range(9)]
+    wanted = dataclasses.replace(check(0.1, 1.0, option='requirements'), name='1-sigma of fx')
+    gate = (check(0.5, 1.0), check(2.0, 1.0, passed=False), *others, wanted)
     candidate = dataclasses.replace(
         calibration(), accepted=False, reasons=('residual over the limit',), gate=gate
     )
@@ -71,7 +73,8 @@ def test_a_refused_candidate_shows_the_failed_check_first() -> None:
         Received(active=calibration(), candidate=candidate, health={'calibrator': (2, 'x')})
     )
     assert 'last candidate refused: residual over the limit' in text
-    assert text.index('██████████') < text.index('█████·····')
+    # Then the requirements, then the others by their share of the limit.
+    assert text.index('██████████') < text.index('1-sigma of fx') < text.index('█████████·')
     assert 'calibrator: error x' in text
 
 

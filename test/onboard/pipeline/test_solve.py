@@ -145,12 +145,12 @@ def test_too_few_images_cannot_be_solved(setup: Setup) -> None:
 
 @pytest.mark.slow
 def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
-    strict = load_setup(values(camera_yaml, max_map_sigma_px=1e-6))
+    strict = load_setup(values(camera_yaml, requirements=['map=1e-6px']))
     found = solve.solve(ensemble(), strict)
     assert not found.accepted
-    assert len(found.reasons) == 1 and 'max_map_sigma_px' in found.reasons[0]
+    assert len(found.reasons) == 1 and 'requirements' in found.reasons[0]
     refused = [check for check in found.gate if check.passed is False]
-    assert [check.option for check in refused] == ['max_map_sigma_px']
+    assert [check.option for check in refused] == ['requirements']
     assert refused[0].limit == 1e-6 and found.reasons[0].startswith(refused[0].name)
 
 

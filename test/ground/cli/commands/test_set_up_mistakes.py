@@ -54,12 +54,12 @@ def _as(encoding: str, pixels: Callable[[Any], Any]) -> Write:
     return write
 
 
-def _jpeg(writer: BagWriter, image: Image) -> None:
-    coded = cv2.imencode('.jpg', (image.pixels >> 4).astype(np.uint8))[1]
+def _bmp(writer: BagWriter, image: Image) -> None:
+    coded = cv2.imencode('.bmp', (image.pixels >> 4).astype(np.uint8))[1]
     message = make_message(
         COMPRESSED_TYPE,
         header=make_header(image.time_ns, 'camera', make_message),
-        format='jpeg',
+        format='bmp',
         data=np.asarray(coded).ravel(),
     )
     writer.write(IMAGE_TOPIC, COMPRESSED_TYPE, image.time_ns, message)
@@ -142,7 +142,7 @@ def said(
         (_as('rgb8', lambda p: np.repeat((p >> 4).astype(np.uint8)[..., None], 3, 2)), 0.0,
          ['rgb8 is a colour image: set image_channel']),
         (_as('32FC1', lambda p: p.astype(np.float32)), 0.0, ["'32FC1'", '8 or 16 bit']),
-        (_jpeg, 0.0, ['is a JPEG', 'raw or as PNG']),
+        (_bmp, 0.0, ['is not a PNG or JPEG', 'raw, as PNG or JPEG']),
         (_raw, 18000.0, ['18000.0', 'stamp_offset_s: 18000.0']),
         (_raw, -946727935.0, ['stamp_offset_s: -946727934', 'the date of the attitudes']),
         (_half_lost, 0.0, ['incomplete', 'constant', 'max_lost_fraction']),
@@ -225,9 +225,9 @@ def test_an_uncertainty_of_the_mounting_that_is_too_small(
 def test_inspect_names_the_remedy_without_parameters(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = bag(tmp_path / 'bag.mcap', _jpeg)
+    path = bag(tmp_path / 'bag.mcap', _bmp)
     assert main.main(['inspect', str(path)]) == 3
-    assert 'is a JPEG' in capsys.readouterr().out.splitlines()[-1]
+    assert 'is not a PNG or JPEG' in capsys.readouterr().out.splitlines()[-1]
 
 
 @pytest.mark.parametrize('start', ['2030-01-01T00:00:00', '+5000'])
@@ -243,13 +243,19 @@ def test_no_image_is_chosen(
 def test_a_folder_of_image_files_is_imported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / '001.fits').write_bytes(b'SIMPLE  =                    T')
-    for path in (tmp_path, tmp_path / '001.fits'):
-        assert main.main(['inspect', str(path), '--params', str(TINY / 'params.yaml')]) == 2
-        assert 'starcal import makes a bag of image files' in capsys.readouterr().err
-    # Calibrated without a bag, by the stars alone: a file that is none is named.
-    assert main.main(['calibrate', str(tmp_path), '-o', str(tmp_path / 'out')]) == 2
-    assert 'no image can be read; left out: 1 file (001.fits): not' in capsys.readouterr().err
+    night = tmp_path / 'night'
+    night.mkdir()
+    (night / '001.fits').write_bytes(b'SIMPLE  =                    T')
+    for command in (['calibrate', '-o', str(tmp_path / 'out')], ['inspect']):
+        for path in (night, night / '001.fits'):
+            # What is stated of a star tracker has to be there.
+            stated = [*command, str(path), '--params', str(TINY / 'params.yaml')]
+            assert main.main(stated) == 2
+            assert 'a bag that has them (starcal import)' in capsys.readouterr().err
+            # By the stars alone: a file that is none is named.
+            assert main.main([*command, str(path)]) == 2
+            error = capsys.readouterr().err
+            assert 'no image can be read; left out: 1 file (001.fits): not' in error
 
 
 def test_a_bag_without_attitudes_is_named(

@@ -25,8 +25,8 @@ from starcal_ros.formats.messages.record_messages import (
     observations_to_message,
 )
 from starcal_ros.formats.messages.sensor_messages import (
+    decode_compressed,
     decode_image,
-    decode_png,
     image_from_message,
     refused_from_message,
 )
@@ -131,14 +131,14 @@ def png(width: int, height: int, raw: bytes = b'') -> bytes:
 
 def test_a_png_of_another_size_is_not_decoded() -> None:
     whole = png(4, 3)
-    assert decode_png(whole, 7, (4, 3)).pixels.shape == (3, 4)
+    assert decode_compressed(whole, 7, (4, 3)).pixels.shape == (3, 4)
     for size in ((5, 3), (4, 4)):
         with pytest.raises(ImageRefused, match='wrong_size: image of 4 x 3, prior camera of'):
-            decode_png(whole, 7, size)
+            decode_compressed(whole, 7, size)
     # 65000 x 65000 of 16 bit would take 8 GB; less than a page is allocated for the refusal.
     tracemalloc.start()
     with pytest.raises(ImageRefused, match='wrong_size'):
-        decode_png(png(65000, 65000), 7, (640, 512))
+        decode_compressed(png(65000, 65000), 7, (640, 512))
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()
 
@@ -159,7 +159,10 @@ def test_a_stamp_that_no_message_can_hold_is_refused(sec: int, offset_s: float) 
     ('data', 'reason'),
     [
         (b'', 'bad_encoding'),
-        (cv2.imencode('.jpg', RAMP.astype(np.uint8))[1].tobytes(), 'bad_encoding'),
+        (b'\xff\xd8\xff\xc0\0\x11\x08\0\x04\0\x04\x01', 'bad_layout'),
+        (b'\xff\xd8\xff\xc0\0\x11\x08\xff\xff\xff\xff\x01', 'bad_layout'),  # claims 65535 x 65535
+        (b'\xff\xd8\xff\xe0\0', 'bad_encoding'),
+        (cv2.imencode('.jpg', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
         (cv2.imencode('.png', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
         (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_encoding'),
         (cv2.imencode('.png', RAMP)[1].tobytes()[:40], 'bad_layout'),
@@ -168,10 +171,23 @@ def test_a_stamp_that_no_message_can_hold_is_refused(sec: int, offset_s: float) 
         (png(4, 3, bytes(10**7)), 'bad_layout'),
     ],
 )
-def test_png_refusals(data: bytes, reason: str) -> None:
+def test_compressed_refusals(data: bytes, reason: str) -> None:
     with pytest.raises(ImageRefused) as refused:
-        decode_png(array.array('B', data), TIME_NS)
+        decode_compressed(array.array('B', data), TIME_NS)
     assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize('ending', ['.png', '.jpg'])
+def test_a_channel_of_compressed_colour(ending: str) -> None:
+    flat = np.full((16, 16, 3), (10, 120, 240), np.uint8)  # blue, green, red
+    data = cv2.imencode(ending, flat)[1].tobytes()
+    for channel, value in (('blue', 10), ('green', 120), ('red', 240)):
+        pixels = decode_compressed(data, TIME_NS, (16, 16), channel).pixels
+        assert pixels.shape == (16, 16) and np.abs(pixels.astype(int) - value).max() <= 3
+    with pytest.raises(ImageRefused, match='is a colour image: set image_channel'):
+        decode_compressed(data, TIME_NS)
+    grey = cv2.imencode('.jpg', flat[..., 1])[1].tobytes()
+    assert decode_compressed(grey, TIME_NS).pixels.shape == (16, 16)
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])

@@ -1,0 +1,245 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""`starcal calibrate` of whatever is given: found, assumed, stated; wrong inputs in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ground.bag_writer import BagWriter
+from starcal_ground.cli.main import main
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
+from starcal_ros.formats.messages.sensor_messages import attitude_from_message
+from starcal_ros.formats.products.product_files import read_calibration
+from starcal_ros.pipeline.setup import read_setup
+from starcal_ros.records import Image
+
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
+TRUTH = json.loads((TINY / 'truth.json').read_text())
+IMAGES = '/opnav/image_raw'
+ATTITUDES = '/star_tracker/attitude'
+ALIGNMENT_DEG = 0.1  # noise of the star tracker in the bag: 0.011; a prior must be within 1.5
+COLUMNS = 80
+
+
+@pytest.fixture(scope='module')
+def tiny_images() -> list[Image]:
+    return [image for image in reader.read_images([TINY], IMAGES) if isinstance(image, Image)]
+
+
+def with_attitudes(path: Path, images: list[Image], sign: int = 1, shift_s: int = 0) -> Path:
+    """The bag with attitudes that are late, or inverted (-1): from ICRF to the star tracker."""
+    with BagWriter(path) as writer:
+        for raw in reader.read_raw([TINY], [ATTITUDES]):
+            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+            time_ns += shift_s * 10**9
+            writer.write_attitude(ATTITUDES, time_ns, xyzw * [sign, sign, sign, 1], 'star_tracker')
+        for image in images:
+            writer.write_image(IMAGES, image, 'camera')
+    return path
+
+
+def write_pngs(folder: Path, images: list[Image]) -> Path:
+    folder.mkdir()
+    for k, image in enumerate(images):
+        cv2.imwrite(str(folder / f'{k}.png'), image.pixels)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
+def test_a_bag_of_which_nothing_is_stated(
+    tmp_path: Path,
+    direction: str,
+    tiny_images: list[Image],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('COLUMNS', str(COLUMNS))
+    is_plain = direction == 'st_to_inertial'
+    bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', tiny_images, -1)
+    monkeypatch.chdir(tmp_path)
+    out = Path('out')
+    assert main(['calibrate', str(bag), '-o', str(out)]) == 0
+    text, notes = capsys.readouterr()
+    assert f'attitudes of {ATTITUDES}: {direction}, 8 images agree' in notes
+    assert 'images identified by their stars: focal length 1801.' in notes
+    assert 'star_tracker_sigma_arcsec: assumed from the scatter of the images' in text
+    joined = ' '.join(text.split())
+    # What lowers a sigma most, by how much.
+    ((before, after),) = re.findall('noise; pointing (.*?)″ becomes (.*?)″ if', joined)
+    assert float(after) < float(before)
+    assert 'lens model plumb_bob, 640 x 512 px' in text
+    *_, last = text.split('\n\n')
+    assert last.startswith('accepted by the gate\n') and 'Next: ' in last
+    assert '"' not in text and ' arcsec' not in text  # one sign
+    assert max(map(len, text.splitlines())) <= COLUMNS
+    setup = read_setup(out / 'params.yaml')
+    assert setup.attitude.attitude_direction == direction
+    aligned = Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
+    off = aligned * Rotation.from_matrix(TRUTH['A_true'])
+    assert np.degrees(off.magnitude()) < ALIGNMENT_DEG
+    # Five sigma of a fit to the brightest stars with 0.3 px each: 1801 px to 0.1 %.
+    assert setup.prior.camera.parameters[0] == pytest.approx(TRUTH['k_true'][0], rel=1e-3)
+    assert ('observer' in (out / 'params.yaml').read_text()) is not is_plain  # it has velocities
+
+    # The files repeat the calibration.
+    again, params = tmp_path / 'again', out / 'params.yaml'
+    command = ['calibrate', str(bag), '--params', str(params), '-o', str(again), '--quiet']
+    assert main(command) == 0
+    assert capsys.readouterr() == ('', '')
+    first, second = (read_calibration(place / 'calibration.json') for place in (out, again))
+    np.testing.assert_allclose(
+        second.geometry.camera.parameters, first.geometry.camera.parameters, rtol=1e-6, atol=1e-6
+    )
+    assert not (again / 'params.yaml').exists()
+
+
+@pytest.mark.slow
+def test_attitudes_that_do_not_fit_are_diagnosed(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = with_attitudes(tmp_path / 'b.mcap', tiny_images, shift_s=5)
+    assert main(['calibrate', str(bag), '-o', str(tmp_path / 'out'), '--quiet']) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1
+    assert 'prior_alignment: not given, and not found: The stamps of the images' in error
+    assert 'Set stamp_offset_s: ' in error and error.endswith('(details: starcal diagnose)\n')
+    assert main(['diagnose', str(bag)]) == 3
+    assert 'in the parameter file:\n  stamp_offset_s: ' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_photographs_of_which_nothing_is_stated(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    night, out = write_pngs(tmp_path / 'night', tiny_images[:5]), tmp_path / 'out'
+    command = ['calibrate', str(night), '-o', str(out), '--no-report']
+    assert main([*command, '--focal-length-mm', '50', '--pixel-size-um', '10']) in (0, 3)
+    text, notes = capsys.readouterr()
+    assert 'px (stated: 5000 px, which the stars contradict)' in notes
+    assert 'observer: assumed by the stars' in text and 'star_tracker' not in text
+    assert '# observer: by the stars' in (out / 'params.yaml').read_text()
+    for name in ('inspect', 'diagnose'):
+        assert main([name, str(night)]) == 0
+    text = capsys.readouterr().out
+    assert 'can be calibrated: the camera alone' in text and 'fit the images' in text
+    with (out / 'params.yaml').open('a') as file:
+        file.write('    shutter: global\n')
+    assert main(command) == 2
+    assert 'params.yaml: was not written by starcal, or was changed' in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_requirement_is_answered_for_people_and_programs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '--no-report']
+    command += ['-o', str(tmp_path), '--set', 'star_tracker_slow_arcsec=5']
+    wanted = ['--require', 'line_of_sight=20arcsec@98%']
+    assert main([*command, *wanted, '--json']) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer['accepted'] and [row['note'] for row in answer['requirements']] == ['met']
+    assert answer['lens_model'] == 'plumb_bob' and answer['folder'] == str(tmp_path)
+    assert answer['assumed'].keys() == {'stamp_offset_s'}
+    # Now it is 1.1 of this.
+    assert main([*command, '--require', 'f=0.055px', '--json']) == 3
+    answer = json.loads(capsys.readouterr().out)
+    (check,) = answer['requirements']
+    words = r'missed by 0.00\d+ px; \d+ more images? reach(es)? it'
+    assert re.match(words, check['note']) and check['found'] < 0.07
+    (reason,) = answer['reasons']
+    assert reason.endswith(f'over the limit of 0.055 px (requirements); {check["note"]}')
+
+
+def of_colour(path: Path, images: list[Image]) -> None:
+    """Write a bag of colour images."""
+    with BagWriter(path) as writer:
+        for image in images[:3]:
+            grey = (image.pixels >> 4).astype(np.uint8)
+            message = make_message(
+                IMAGE_TYPE, header=make_header(image.time_ns, 'camera', make_message),
+                height=512, width=640, encoding='rgb8', is_bigendian=0, step=1920,
+                data=np.repeat(grey.reshape(-1), 3),
+            )  # fmt: skip
+            writer.write(IMAGES, IMAGE_TYPE, image.time_ns, message)
+            writer.write_attitude(ATTITUDES, image.time_ns, np.array([0, 0, 0, 1.0]), 'icrf')
+
+
+STATED = f'--params {TINY}/params.yaml -o out'
+WRONG = [
+    ('calibrate {bag}', ['-o/--output DIR: not given', '-o out']),
+    ('calibrate params.yaml -o out', ['parameters: --params params.yaml takes it']),
+    ('calibrate camera.yaml -o out', ['YAML file: --set camera_info_url=camera.yaml']),
+    ('calibrate {bag} --params camera.yaml -o out',
+     ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
+    ('calibrate {bag} -o out --set camera_info_url=none.yaml',
+     ['--set camera_info_url: none.yaml: no such file']),
+    ('calibrate {bag} -o out --set observer=grond', ['--set observer', 'did you mean ground?']),
+    ('calibrate {bag} -o out --set observer=ground', ['observer: ground needs the site']),
+    ('calibrate {bag} -o out --set obsrver=ground', ['--set obsrver', 'did you mean observer?']),
+    ('calibrate {bag} -o out --set observer', ['--set', 'not of the form NAME=VALUE']),
+    ('calibrate {bag} -o out --require line=5arcsec', ['--set requirements: line is not']),
+    ('calibrate {bag} -o out --require map=5', ['the sigma of map is in arcsec or px']),
+    ('calibrate {bag} -o out --focal-length-mm 50', ['--pixel-size-um: bags need both']),
+    ('calibrate {bag} {stated} --focal-length-mm 50', ['a camera_info_url has them already']),
+    ('calibrate {bag} -o out --json --quiet', ['--quiet: not allowed with argument --json']),
+    ('calibrate night -o out --set star_tracker_slow_arcsec=5',
+     ['star_tracker_slow_arcsec: stated, but image files have no attitudes', '--camera-alone']),
+    ('inspect night --set star_tracker_slow_arcsec=5', ['--camera-alone']),
+    ('calibrate night.mcap -o out --set star_tracker_slow_arcsec=5', ['--camera-alone']),
+    ('calibrate observations.mcap -o out', ['shows no camera: give the parameter file']),
+    ('calibrate colour.mcap -o out', ['set image_channel, e.g. to green']),
+    ('calibrate colour.mcap {stated}', ['set image_channel, e.g. to green']),
+    ('calibrate {bag} -o out --jsn', ['--jsn (did you mean --json?)']),
+    ('--json inspect {bag}', ['--json (write it after the command)']),
+    ('import --images night/0.png --attitude none.csv -o bag --camera none.yaml', ['none.yaml']),
+]  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def inputs(tmp_path_factory: pytest.TempPathFactory, tiny_images: list[Image]) -> Path:
+    """A folder with the inputs of the table."""
+    folder = tmp_path_factory.mktemp('inputs')
+    for name in ('params.yaml', 'camera.yaml'):
+        shutil.copy(TINY / name, folder)
+    write_pngs(folder / 'night', tiny_images[:3])
+    with BagWriter(folder / 'night.mcap') as writer:
+        for image in tiny_images[:3]:
+            writer.write_image(IMAGES, image, 'camera')
+    of_colour(folder / 'colour.mcap', tiny_images)
+    with BagWriter(folder / 'observations.mcap') as writer:
+        from starcal_ros.records import refused_image
+
+        writer.write_observations('/observations', refused_image(1, 8, 8, 'blank', ''), 'camera')
+    return folder
+
+
+@pytest.mark.parametrize(('line', 'words'), WRONG, ids=[line for line, _ in WRONG])
+def test_a_wrong_input_ends_in_one_line(
+    line: str,
+    words: list[str],
+    inputs: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(inputs)
+    try:
+        status = main(line.format(bag=TINY, stated=STATED).split())
+    except SystemExit as ended:  # argparse's way out
+        status = int(str(ended.code))
+    text, error = capsys.readouterr()
+    assert status == 2 and not text and error.startswith('starcal: ')
+    assert error.count('\n') == 1
+    for word in words:
+        assert word in error
+    assert error.lower().count('one channel') == 0  # no second remedy for colour

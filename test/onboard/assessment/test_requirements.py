@@ -1,0 +1,91 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Requirements: what is understood, the sigma each limits, and the answer."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from sample_records import calibration  # type: ignore[import-not-found]
+
+from starcal_ros.assessment.requirements import Requirement, requirement_checks, requirements_of
+from starcal_ros.camera import CameraModel
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.records import Calibration, CameraGeometry, DetectorMaps, SigmaPart
+
+CAMERA = CameraModel(640, 512, np.r_[1800.0, 0.0, 1801.0, 319.5, 255.5, np.zeros(5)])
+SIGMA = np.r_[0.1, 0.0, 0.2, 0.3, 0.4, 5 * [0.01], 3 * [4.0 * ARCSECOND_RAD]]
+# 100 cells: ninety of 3", nine of 6" and one of 9".
+CELLS = np.repeat([3.0, 6.0, 9.0], [90, 9, 1]).reshape(10, 10)
+
+
+FOUND: Calibration = dataclasses.replace(
+    calibration(),
+    geometry=CameraGeometry(CAMERA, np.array([0.0, 0.0, 0.0, 1.0])),
+    covariance=np.diag(SIGMA**2),
+    maps=DetectorMaps(np.ones((10, 10), np.int64), CELLS, CELLS / 10),
+    sigma_budget=(SigmaPart('total', 0.3, 3.5, ''),),
+    field=None,
+)
+
+
+@pytest.mark.parametrize(
+    ('text', 'sigma', 'note'),
+    [
+        ('line_of_sight=5arcsec', 9.0, 'missed by 4 arcsec'),
+        ('line_of_sight=5arcsec@98%', 6.0, 'missed by 1 arcsec'),
+        ('line_of_sight = 5 arcsec @ 90 %', 3.0, 'met'),
+        ('map=0.5arcsec', 0.9, 'missed by 0.4 arcsec'),
+        ('map=0.5arcsec@90%', 0.3, 'met'),
+        ('pointing=3arcsec', 3.5, 'missed by 0.5 arcsec'),
+        ('f=0.15px', 0.2, 'missed by 0.05 px'),
+        ('fx=0.1px', pytest.approx(0.1), 'met'),
+        ('k1=0.001', 0.01, 'missed by 0.009'),
+        ('alignment_x=5arcsec', pytest.approx(4.0), 'met'),
+        ('skew=1px', pytest.approx(np.nan, nan_ok=True), 'it is not estimated'),  # held
+        ('k6=1', pytest.approx(np.nan, nan_ok=True), 'it is not estimated'),  # another lens
+    ],
+)
+def test_each_sigma_and_its_answer(text: str, sigma: float, note: str) -> None:
+    (check,) = requirement_checks(FOUND, [text])
+    assert (check.found, check.option) == (sigma, 'requirements')
+    assert (check.note, check.passed) == (note, note == 'met')
+
+
+def test_the_map_in_pixels() -> None:
+    """1 px of each focal length at the corner, 0.227 focal lengths off the axis."""
+    covariance = np.diag(np.r_[1.0, 0.0, 1.0, np.zeros(10)])
+    found = dataclasses.replace(FOUND, covariance=covariance)
+    # The curvature of the field takes 4 % off.
+    assert Requirement.of('map=1px').sigma(found) == pytest.approx(0.227, rel=0.05)
+    half, whole = (Requirement.of(f'map=1px@{share}%').sigma(found) for share in (50, 100))
+    assert half < 0.7 * whole
+
+
+def test_the_camera_alone_has_its_own_lines_of_sight() -> None:
+    alone = dataclasses.replace(FOUND, parent_frame='')
+    assert not alone.has_alignment
+    assert Requirement.of('line_of_sight=5arcsec').sigma(alone) == 0.9
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('5arcsec', 'is not of the form line_of_sight=5arcsec@98%'),
+        ('line_of_sight=5arcsec@98', 'is not of the form'),
+        ('line_of_site=5arcsec', 'did you mean line_of_sight?'),
+        ('line_of_sight=5px', 'the sigma of line_of_sight is in arcsec'),
+        ('map=5', 'in arcsec or px'),
+        ('k1=1px', 'without a unit'),
+        ('f=0.1.2px', 'not a number'),
+        ('f=0.1px@98%', 'only line_of_sight and map are over a share'),
+        ('map=0px', 'above 0, over at most 100 %'),
+        ('map=1px@101%', 'above 0, over at most 100 %'),
+    ],
+)
+def test_what_is_not_understood_is_named(text: str, words: str) -> None:
+    with pytest.raises(OptionError, match='^requirements: ') as refused:
+        requirements_of([text])
+    assert words in str(refused.value)
