@@ -5,7 +5,7 @@ NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate', 'onbo
 """The benches, each a module with ``run(quick)`` that yields its tables."""
 
 LONG = (
-    *('accuracy', 'trust', 'worlds', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
+    *('coverage', 'trust', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
     *('soak', 'transport', 'fleet', 'plan', 'peers'),
 )
 """Those that take some minutes: run when they are named."""
