@@ -29,7 +29,7 @@ def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[
         'total', 'star tracker noise', 'velocity'
     ]  # fmt: skip
     assert lines[first + 3].split()[-2:] == ['0.6"', '0.75"']
-    assert 'not given: 8 km/s per axis assumed' in lines[first + 3]
+    assert 'not given: 20 km/s per axis assumed' in lines[first + 3]
     assert 'stamps' not in '\n'.join(lines)
 
 
