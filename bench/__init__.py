@@ -5,7 +5,7 @@ NAMES = ('solver', 'measure', 'calibrate', 'observer', 'gate', 'onboard')
 """The benches, each a module with ``run(quick)`` that yields its tables."""
 
 LONG = (
-    *('accuracy', 'trust', 'worlds', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
+    *('coverage', 'trust', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
     *('soak', 'fleet', 'plan', 'peers'),
 )
 """Those that take some minutes: run when they are named."""

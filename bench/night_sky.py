@@ -19,7 +19,7 @@ import time
 import numpy as np
 
 from bench.table import Table
-from bench.trials import rms, shape_error_arcsec
+from bench.trials import rms, shape_errors_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
 from starcal_ground.simulation.rendering import images
@@ -128,5 +128,5 @@ def off_arcsec(found: Calibration, truth: CameraModel) -> tuple[float, float]:
     """RMS error of the lines of sight, common rotation removed, and their 1-sigma, arcsec."""
     pixels = pixel_grid(truth, 15, 15)
     mine = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
-    error_arcsec = shape_error_arcsec(line_of_sight(truth, pixels), mine.direction_camera)
+    error_arcsec = rms(shape_errors_arcsec(line_of_sight(truth, pixels), mine.direction_camera))
     return error_arcsec, rms(mine.shape_sigma_arcsec)

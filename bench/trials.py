@@ -36,7 +36,7 @@ class Score:
 
     ``shape``: lines of sight over the detector in the camera frame, the common rotation removed,
     rms; ``shape_arcsec`` the error and ``sigma_arcsec`` the 1-sigma of it.  ``pointing``: lines of
-    sight in the star tracker frame.
+    sight in the star tracker frame.  ``corners``: ``shape`` of the four corners of the detector.
     """
 
     accepted: bool
@@ -46,6 +46,7 @@ class Score:
     shape_arcsec: float = math.nan
     sigma_arcsec: float = math.nan
     seconds: float = math.nan  # processor time of the estimate
+    corners: float = math.nan
 
 
 def score(
@@ -67,19 +68,23 @@ def score(
         Rotation.from_quat(g.star_tracker_from_camera_xyzw) for g in (found.geometry, truth)
     )
     off = [to_tracker.apply(estimated) - to_true.apply(true) for true in true_directions]
-    shape_arcsec = rms([shape_error_arcsec(true, estimated) for true in true_directions])
+    off_arcsec = np.array([shape_errors_arcsec(true, estimated) for true in true_directions])
+    shape_arcsec = rms(off_arcsec)
     sigma_arcsec = rms(table.shape_sigma_arcsec)
     pointing_arcsec = rms(np.linalg.norm(off, axis=-1)) / ARCSECOND_RAD
+    corner = [0, GRID - 1, -GRID, -1]
+    corners = rms(off_arcsec[:, corner]) / rms(table.shape_sigma_arcsec[corner])
     return Score(
         *(found.accepted, found.reasons, shape_arcsec / sigma_arcsec),
         *(pointing_arcsec / rms(table.sigma_arcsec), shape_arcsec, sigma_arcsec, seconds),
+        corners,
     )
 
 
-def shape_error_arcsec(true: Floats, estimated: Floats) -> float:
-    """RMS angle between unit vectors (n, 3), the best common rotation removed."""
+def shape_errors_arcsec(true: Floats, estimated: Floats) -> Floats:
+    """Angles (n,) between unit vectors (n, 3), the best common rotation removed."""
     common, _ = Rotation.align_vectors(true, estimated)
-    return rms(np.linalg.norm(common.apply(estimated) - true, axis=1)) / ARCSECOND_RAD
+    return np.asarray(np.linalg.norm(common.apply(estimated) - true, axis=1) / ARCSECOND_RAD)
 
 
 def rms(values: Floats | Sequence[float]) -> float:

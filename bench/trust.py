@@ -7,7 +7,7 @@ seed renders a campaign of star images in that world, measures it as the observe
 it with the default options.  The error of the lines of sight over the detector, the best common
 rotation removed, is divided by the 1-sigma that the calibration reports.  A row is honest where
 the RMS of that ratio over the accepted calibrations is 0.7 to 1.5 and none exceeds 2, or where the
-gate refuses and names the cause.  The worlds of simulated observations follow (`bench.worlds`).
+gate refuses and names the cause.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
-from bench import worlds
 from bench.frames import load_set_up, observed
 from bench.table import Table
 from bench.trials import in_processes, rms, Score, score
@@ -45,7 +44,6 @@ def run(quick: bool) -> Iterator[Table]:
     for k, world in enumerate(chosen):
         table.add(*_summary(world, scores[seeds * k : seeds * (k + 1)]))
     yield table
-    yield from worlds.run(quick)
 
 
 def _summary(world: World, found: list[Score]) -> tuple[str | float | int, ...]:

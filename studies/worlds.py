@@ -30,8 +30,9 @@ from starcal_ground.simulation.scenario import Detector, Scenario, Scene
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project
+from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
-from starcal_ros.records import AttitudeSample, Ensemble, StarObservations
+from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, StarObservations
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.sky.catalog import cone, load_catalog
@@ -42,10 +43,10 @@ Lens = Callable[[Generator, Floats], Floats]
 MEMORY = math.exp(-0.1)  # correlation of neighbouring images: ten images
 _START_NS = 1786160160 * 10**9
 _CADENCE_S = 60.0
-_SATURATED_MAGNITUDE = 2.0
-_PSF_SIGMA_PX = 0.95
-_ELECTRONS_PER_DN = 0.0668
-_NOISE_ELECTRONS = 35.3  # of the window of a star
+SATURATED_MAGNITUDE = 2.0
+PSF_SIGMA_PX = 0.95
+ELECTRONS_PER_DN = 0.0668
+NOISE_ELECTRONS = 35.3  # of the window of a star
 _EARTH_RATE_RAD_S = 7.292115e-5
 _FIXED_TO_EARTH = ('small', 'paper')  # pointings named after their scenario
 _DITHER_DEG = 0.15
@@ -56,7 +57,7 @@ _SMOOTH_RAD = math.radians(60.0)  # correlation length of errors that depend on 
 _POINTING, _NOISE, _TRACKER, _CHANGE, _STARS, _LENS, _VELOCITY, _RATE, _OUTLIERS = range(80, 89)
 _SAMPLES = 89
 _GAP_S = 2.0  # the default of the package
-_BLENDS = 90
+_BLENDS, _OPTICS = 90, 91
 _BLEND_FREEDOM = 3.0  # degrees of freedom: medians of displacements are half of their rms
 _HALF_WIDTH_PX = 648.0
 _HALF_HEIGHT = 1024 / 1296  # half widths
@@ -150,9 +151,16 @@ class World:
 
     images: int = 18
     pointing: str = 'sky'
+    model: str = 'plumb_bob'  # of the lens, and of its prior
+    field_deg: float = 0.0  # along the rows; 0: the camera of the scenario
+    corner: float = 0.0  # radial distortion of that lens in a corner, relative
+    shutter: str = 'unknown'  # as stated
     magnitude_limit: float = 8.39  # sigma of a centroid 0.3 px
+    bright_px: float = 0.0  # sigma of the centroids of the brightest stars
+    claim: float = 1.0  # stated sigma of the centroids over the true one
     zero_point_dn: float = 3.98e6
     tracker_arcsec: float = 20.0
+    tracker_claim: float = 1.0  # stated sigma of the star tracker over the true one
     tracker_hz: float = 0.0  # of samples with errors of their own; 0: one error, an exact rate
     filter_s: float = 0.0  # correlation time of the errors of samples
     velocity_m_s: float = 0.0  # that the observer does not take into account
@@ -192,6 +200,8 @@ class Campaign:
         Angular rate of the camera at each image, camera frame.
     velocity_m_s : (3,)
         Velocity that the directions of the observations lack, ICRF axes.
+    scale : float
+        Focal length that the images had on average, over that of the scenario.
     """
 
     world: World
@@ -199,6 +209,7 @@ class Campaign:
     camera_from_icrf: Rotation
     rate_rad_s: Floats
     velocity_m_s: Floats
+    scale: float = 1.0
     ensemble: Ensemble = field(default_factory=Ensemble)
 
     @property
@@ -208,7 +219,7 @@ class Campaign:
 
         Of the camera, or before and after its lens sags.
         """
-        camera = self.scenario.truth.camera
+        camera = scaled(self.scenario.truth.camera, self.scale)
         grid = pixel_grid(camera, GRID, GRID)
         ideal = grid - self.displacement_px(grid)
         return [line_of_sight(sagged(camera, p1), ideal) for p1 in self.world.sags]
@@ -234,7 +245,8 @@ def simulate(world: World, seed: int, images: int | None = None) -> Campaign:
     reported_xyzw = (at_stamp.inv() * camera_from_tracker * errors).as_quat()
     change = _walk(_stream(seed, _CHANGE), world.images, 1, world.memory)[:, 0]
     offset_rad = _star_offsets_rad(world, scenario, camera_from_icrf)
-    made = Campaign(world, scenario, camera_from_icrf, rate_rad_s, velocity_m_s)
+    scale = 1.0 + world.breathing * float(change.mean())
+    made = Campaign(world, scenario, camera_from_icrf, rate_rad_s, velocity_m_s, scale)
     ensemble = Ensemble(
         tuple(
             _image(made, k, reported_xyzw[k], _camera_of(made, k, change[k]), offset_rad)
@@ -274,21 +286,57 @@ def _scenario(world: World, seed: int) -> Scenario:
     camera = base.truth.camera
     cx, cy = camera.intrinsics[3:] + world.principal_point_px
     own: dict[str, Any] = {}
+    truth = dataclasses.replace(base.truth, camera=camera.replace(cx=float(cx), cy=float(cy)))
+    if world.field_deg:
+        truth, own['prior'] = _optics(world, base)
     if world.pointing not in _FIXED_TO_EARTH:
-        own = {'start_ns': _START_NS, 'cadence_s': _CADENCE_S}
+        own |= {'start_ns': _START_NS, 'cadence_s': _CADENCE_S}
     return dataclasses.replace(
         base,
-        truth=dataclasses.replace(base.truth, camera=camera.replace(cx=float(cx), cy=float(cy))),
+        truth=truth,
         detector=Detector(
-            psf_sigma_px=_PSF_SIGMA_PX,
-            electrons_per_dn=_ELECTRONS_PER_DN,
-            zero_point_electrons=_ELECTRONS_PER_DN * world.zero_point_dn,
+            psf_sigma_px=PSF_SIGMA_PX,
+            electrons_per_dn=ELECTRONS_PER_DN,
+            zero_point_electrons=ELECTRONS_PER_DN * world.zero_point_dn,
         ),
-        star_tracker_sigma_arcsec=(world.tracker_arcsec,) * 3,
+        star_tracker_sigma_arcsec=(world.tracker_claim * world.tracker_arcsec,) * 3,
         image_count=world.images,
         magnitude_limit=world.magnitude_limit,
         **own,
     )
+
+
+def _optics(world: World, base: Scenario) -> tuple[CameraGeometry, CameraGeometry]:
+    """Truth of a camera of any field, and its design as the prior: off by what launch may do."""
+    camera, rng = base.truth.camera, _stream(base.seed, _OPTICS)
+    half_rad, is_fisheye = math.radians(world.field_deg) / 2.0, world.model == 'equidistant'
+    focal_px = camera.width / 2.0 / (half_rad if is_fisheye else math.tan(half_rad))
+    corner = math.hypot(camera.width, camera.height) / 2.0 / focal_px
+    middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
+    while True:
+        c = np.zeros(len(COEFFICIENTS[world.model]))
+        share = rng.dirichlet([4.0, 2.0, 1.0]) * np.append(1.0, rng.choice([-1.0, 1.0], 2))
+        c[:3] = world.corner * share / corner ** np.array([2, 4, 6])
+        if not is_fisheye:
+            c[3:5] = 0.05 * world.corner / corner * rng.normal(size=2)
+            c[5:6] = 0.3 * world.corner / corner**2 * rng.normal()
+        design = c * (1.0 + 0.2 * rng.normal(size=len(c)))
+        if min(fold_radius2(world.model, one) for one in (c, design)) > (1.3 * corner) ** 2:
+            break
+    off_px = 0.03 * camera.width * rng.uniform() * unit(rng.normal(size=2))
+    skew_px, stretch = 1e-4 * focal_px * rng.normal(), 1.0 + 3e-4 * rng.normal()
+    intrinsics = [focal_px, skew_px, stretch * focal_px, *(middle + off_px)]
+    prior_px = focal_px * (1.0 + rng.uniform(-0.02, 0.02))
+    true, prior = (
+        CameraModel(camera.width, camera.height, np.array([*values, *coefficients]), world.model)
+        for values, coefficients in (
+            (intrinsics, c),
+            ([prior_px, 0.0, prior_px, *middle], design),
+        )
+    )
+    turn = Rotation.from_rotvec(math.radians(rng.uniform()) * unit(rng.normal(size=3)))
+    mounting = (base.truth.star_tracker_from_camera * turn).as_quat()
+    return dataclasses.replace(base.truth, camera=true), CameraGeometry(prior, mounting)
 
 
 def _stream(seed: int, *purpose: int) -> Generator:
@@ -376,7 +424,7 @@ def _star_offsets_rad(world: World, scenario: Scenario, camera_from_icrf: Rotati
         # Most stars have hardly a neighbour within their PSF, and some a bright one: Student's t.
         blended = _stream(scenario.seed, _BLENDS)
         tail = np.sqrt(_BLEND_FREEDOM / blended.chisquare(_BLEND_FREEDOM, len(catalog)))
-        sigma_px = _sigma_px(_electrons(scenario, catalog.magnitude))
+        sigma_px = _sigma_px(world, _electrons(scenario, catalog.magnitude))
         tail *= world.blend * sigma_px / scenario.truth.camera.parameters[0]
         offsets += tail[:, None] * blended.normal(size=(len(catalog), 3))
     if world.bad_stars:
@@ -391,13 +439,20 @@ def _star_offsets_rad(world: World, scenario: Scenario, camera_from_icrf: Rotati
 def _camera_of(made: Campaign, k: int, change: float) -> CameraModel:
     """Camera of an image: its focal length breathes, its lens sags."""
     world, camera = made.world, made.scenario.truth.camera
-    fx, _, fy = (1.0 + world.breathing * change) * camera.intrinsics[:3]
     sag = world.sags[0 if 2 * k < world.images else -1]
-    return sagged(camera.replace(fx=float(fx), fy=float(fy)), sag)
+    return sagged(scaled(camera, 1.0 + world.breathing * change), sag)
+
+
+def scaled(camera: CameraModel, scale: float) -> CameraModel:
+    """Return a camera of another focal length."""
+    fx, _, fy = scale * camera.intrinsics[:3]
+    return camera.replace(fx=float(fx), fy=float(fy))
 
 
 def sagged(camera: CameraModel, sag: float) -> CameraModel:
     """Return a camera whose p1 is larger by ``sag``."""
+    if not sag:
+        return camera
     p1 = camera.parameters[camera.parameter_names.index('p1')]
     return camera.replace(p1=float(p1) + sag)
 
@@ -410,22 +465,22 @@ def _image(
     camera, time_ns = scenario.truth.camera, scenario.time_ns(k)
     catalog, R = load_catalog(None, world.magnitude_limit), made.camera_from_icrf[k].as_matrix()
     near = cone(catalog, R[2], field_radius_rad(camera, _MARGIN_PX))
-    near = near[catalog.magnitude[near] > _SATURATED_MAGNITUDE]
+    near = near[catalog.magnitude[near] > SATURATED_MAGNITUDE]
     stars = catalog.select(near)
     directions = apparent_directions(stars, time_ns)
     seen = aberrated(directions, made.velocity_m_s) + offset_rad[near]
     pixels = _pixels(made, made.rate_rad_s[k], own, seen @ R.T)
     pixels += _outliers_px(world, len(pixels), _stream(seed, _OUTLIERS, k))
     electrons = _electrons(scenario, stars.magnitude)
-    sigma_px = _sigma_px(electrons)
+    sigma_px = _sigma_px(world, electrons)
     noise_px = sigma_px[:, None] * _stream(seed, _NOISE, k).normal(size=pixels.shape)
     inside = np.all((pixels > 0) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
     scene = Scene(
         *(time_ns, R, reported_xyzw, stars.id, stars.magnitude, directions, pixels),
         *(electrons, stars.digest),
     )
-    covariance_px2 = sigma_px[:, None, None] ** 2 * np.eye(2)
-    snr = _PSF_SIGMA_PX / sigma_px
+    covariance_px2 = (world.claim * sigma_px[:, None, None]) ** 2 * np.eye(2)
+    snr = PSF_SIGMA_PX / sigma_px
     found = observations(scenario, scene, pixels + noise_px, covariance_px2, snr)
     return dataclasses.replace(
         found.select(np.asarray(inside)),
@@ -438,9 +493,10 @@ def _electrons(scenario: Scenario, magnitude: Floats) -> Floats:
     return np.asarray(scenario.detector.zero_point_electrons * 10 ** (-0.4 * magnitude))
 
 
-def _sigma_px(electrons: Floats) -> Floats:
+def _sigma_px(world: World, electrons: Floats) -> Floats:
     """1-sigma (n,) of centroids of stars by their light."""
-    return np.asarray(_PSF_SIGMA_PX * np.sqrt(electrons + _NOISE_ELECTRONS**2) / electrons)
+    by_light = PSF_SIGMA_PX * np.sqrt(electrons + NOISE_ELECTRONS**2) / electrons
+    return np.hypot(world.bright_px, by_light)
 
 
 def aberrated(directions: Floats, velocity_m_s: Floats) -> Floats:

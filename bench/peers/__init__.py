@@ -19,7 +19,7 @@ from bench.competitors import solve_ceres, solve_scipy
 from bench.peers import giant, solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
-from bench.trials import rms, shape_error_arcsec
+from bench.trials import rms, shape_errors_arcsec
 from starcal_ros.processes import one_blas_thread
 
 
@@ -73,7 +73,9 @@ def _best(campaign: Campaign, runs: tuple[list[Result], ...]) -> tuple[float, Re
     for seen in (one.directions for one in runs[0]):
         unit = seen / np.linalg.norm(seen, axis=1, keepdims=True)
         found = bool(np.isfinite(unit).all())  # or it did not converge
-        errors.append(shape_error_arcsec(campaign.true_directions, unit) if found else math.inf)
+        errors.append(
+            rms(shape_errors_arcsec(campaign.true_directions, unit)) if found else math.inf
+        )
     k = int(np.argmin(errors))
     least_s = min(results[k].processor_s for results in runs)
     return errors[k], runs[0][k]._replace(processor_s=least_s)

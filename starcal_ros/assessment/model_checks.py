@@ -23,6 +23,7 @@ from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
 
 _STATED = ('camera', 'mountings', 'velocity', 'readout', 'stamps')  # entries with a prior
+_CLEAR_SIGMA = 5.0  # from a prior; as a ratio of evidence e^12.5
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for
 _STRIP = 1 / 24  # of the width: a quarter of the shortest wave of the field
@@ -98,7 +99,8 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
 
     A held parameter is tested by one more Newton step with it free; an unknown with a prior by its
     estimate without the prior: what contradicts a narrow prior moves other unknowns, first the
-    field and the shapes of the images, and hardly its own.
+    field and the shapes of the images, and hardly its own.  Free unknowns also fit what is of the
+    lens: more than `_CLEAR_SIGMA` counts only where the data are likelier without the prior, too.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
@@ -119,13 +121,17 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         tested &= entry.widest > entry.sigma  # of any lens: nobody states it
         if entry.name not in _STATED or not tested.any():
             continue
-        means, variances = without_prior(estimate.sums, estimate.linear, entry.name)
+        means, variances, log_evidence = without_prior(estimate.sums, estimate.linear, entry.name)
+        is_clear = log_evidence - found.log_evidence > 0.5 * _CLEAR_SIGMA**2
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
             if not np.isfinite(variance):
                 continue
             off = float(layout.prior_offset[k] + mean)
             # Errors that observations share are in both variances.
-            apart2 = 1.0 / layout.prior_precision[k] + variance * total[k] / working[k]
+            prior2 = min(1.0 / layout.prior_precision[k], entry.usual**2)
+            apart2 = prior2 + variance * total[k] / working[k]
+            if not is_clear and math.isinf(entry.usual):
+                apart2 = max(apart2, (off / _CLEAR_SIGMA) ** 2)
             prior = float(problem.prior_parameters[k - camera[0]]) if k in camera else 0.0
             name, unit = layout.labels[k], 1.0
             head = (k - first) // 3 + 1

@@ -95,7 +95,8 @@ _ROUNDS = 16  # three or four are usual; principal points that stars hardly show
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
 _FIRST_SHAPE_PX = 1e-4
-_SPACE_VELOCITY_M_S = 8000.0  # an orbit about the Earth
+_SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
+_USUAL_M_S = 8000.0  # of orbits about the Earth
 _UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
 _LENS_RESIDUAL_LOG_SIGMA = 1.5  # of a residual by a data sheet: it is of the ground, not of flight
 _READOUT_ERROR = 0.01  # of the time by a data sheet: the tolerance of a clock, and rounding
@@ -341,10 +342,11 @@ def _round(
 def _assumed(data: Data) -> Assumptions:
     """Return the priors of what is stated by the options and the observations."""
     options = data.options
-    velocity_m_s = options.velocity_sigma_m_s
+    velocity_m_s, usual_m_s = options.velocity_sigma_m_s, math.inf
     if velocity_m_s < 0:
-        stated = float(data.velocity_sigma_m_s.max())
-        velocity_m_s = stated if math.isfinite(stated) else _SPACE_VELOCITY_M_S
+        velocity_m_s = float(data.velocity_sigma_m_s.max())
+        if not math.isfinite(velocity_m_s):
+            velocity_m_s, usual_m_s = _SPACE_VELOCITY_M_S, _USUAL_M_S
     readout_s = {
         'global': (0.0, 0.0),
         'rolling': (options.readout_s, _READOUT_ERROR * abs(options.readout_s)),
@@ -354,7 +356,8 @@ def _assumed(data: Data) -> Assumptions:
     lens = UNSTATED
     if options.lens_residual_px:
         lens = math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA
-    return Assumptions(velocity_m_s, readout, options.stamp_sigma_s, data.refraction, lens)
+    stamp_s = options.stamp_sigma_s
+    return Assumptions(velocity_m_s, readout, stamp_s, data.refraction, lens, usual_m_s)
 
 
 def _refraction(ensemble: Ensemble) -> Refraction | None:

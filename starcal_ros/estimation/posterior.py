@@ -21,6 +21,8 @@ from starcal_ros.estimation.amplitudes import (
     Amplitudes,
     averaged_field,
     field_amplitudes,
+    LOG_CENTRE,
+    LOG_SIGMA,
     NO_AMPLITUDE,
     Shapes,
     shapes,
@@ -96,6 +98,8 @@ class Posterior:
         Part of ``covariance``: of the shapes that all images share.
     information, gradient : (P, P), (P,)
         From the stars and the star trackers, without priors, the images eliminated.
+    log_evidence : float
+        Of the data given the priors, but for what follows from the data alone.
     errors : ErrorParts or None
         None before `with_shared_errors`.
     """
@@ -116,6 +120,7 @@ class Posterior:
     common_shape_px2: Floats
     information: Floats
     gradient: Floats
+    log_evidence: float
     errors: ErrorParts | None = None
 
     @property
@@ -158,7 +163,13 @@ def posterior(
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
         last = eliminated(normal, layout, found.sigma_px)
-    mean, covariance, last_octave, term = solver.solve(last, base)
+    mean, covariance, last_octave, term, log_evidence = solver.solve(last, base)
+    # The unknowns of the images, eliminated, and the prior of their amplitudes.
+    log_evidence += 0.5 * float(np.linalg.slogdet(last.covariance)[1].sum())
+    log_evidence += 0.5 * float((last.own * normal.c).sum())
+    log_px = np.log(found.sigma_px)
+    log_evidence -= len(normal.c) * float(log_px.sum())
+    log_evidence -= 0.5 * float((((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2).sum())
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
@@ -177,12 +188,15 @@ def posterior(
         common_shape_px2=found.common_px2,
         information=last.information,
         gradient=last.gradient,
+        log_evidence=log_evidence,
     )
 
 
-def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Floats, Floats]:
+def without_prior(
+    sums: StarSums, linear: Linearisation, name: str
+) -> tuple[Floats, Floats, float]:
     """
-    Return mean and variance (q,) of the unknowns of an entry without its prior.
+    Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
 
     The amplitudes are found again: field and shapes may hide that a prior is wrong.  The variance
     is that of the working weights; infinite where stars show less than what is possible at all.
@@ -198,7 +212,7 @@ def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Flo
     try:
         found = posterior(sums, linear, _SMALL_SHAPE_PX)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
-        return np.zeros(len(at)), np.full(len(at), np.inf)
+        return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
         shown = 1.0 / found.working_variance[at] - precision
@@ -206,7 +220,7 @@ def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Flo
         variance = np.where(seen, 1.0 / shown, np.inf)
         # The wide prior pulls a little: off + mean is the sum of both by their information.
         alone = (off + found.mean[at]) * (1.0 + precision * variance) - off
-    return np.where(seen, alone, 0.0), variance
+    return np.where(seen, alone, 0.0), variance, found.log_evidence
 
 
 def _without_prior(entry: Unknown) -> Floats:
@@ -253,8 +267,8 @@ class _Solver:
 
     def solve(
         self, arrow: Equations, amplitudes: Amplitudes
-    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes]:
-        """Return mean (P,), covariance (P, P), the last octave's posterior, and the lens term."""
+    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes, float]:
+        """Return mean (P,), covariance (P, P), last octave, lens term, and log evidence."""
         count = self.layout.count
         mean, covariance = np.zeros(count), np.zeros((count, count))
         information, left, free, gradient, back = self._of_field(arrow)
@@ -268,7 +282,14 @@ class _Solver:
         covariance[np.ix_(self.free, self.field)] = to_free * self.unit
         covariance[np.ix_(self.field, self.free)] = (to_free * self.unit).T
         covariance[np.ix_(self.free, self.free)] = free - to_free @ back.T
-        return mean, covariance, (field.log_px, field.weight), field.term
+        precision, offset = self.precision[self.free], self.layout.prior_offset[self.free]
+        stated = precision > 0
+        log_evidence = field.log_evidence + 0.5 * float(
+            np.linalg.slogdet(free)[1]
+            + gradient @ free @ gradient
+            + (np.log(precision[stated]) - precision[stated] * offset[stated] ** 2).sum()
+        )
+        return mean, covariance, (field.log_px, field.weight), field.term, log_evidence
 
     def resolved(self, arrow: Equations, covariance: Floats) -> float:
         """Return the number of shared unknowns that the data determine."""

@@ -42,6 +42,7 @@ from starcal_ros.estimation.amplitudes import (
 # a sixth of its longest wave, over which it keeps nine tenths of its correlation.
 _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
+_OF_ONE_LENGTH = 0.05  # of octaves: not tied to the one before, as any amplitude
 _STRIPS = (1 / 48, 1 / 192)  # of the width: height of groups of rows, width of groups of columns
 _NO_EFFECT = 0.01  # of the variance of the mean of a group
 _TAIL = 2.0  # degrees of freedom of the errors of stars
@@ -311,7 +312,9 @@ def _next_octave(log_px: Floats) -> Floats:
     """Weights (s, 240) on the grid of an octave that follows one of logarithms (s,)."""
     off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
     kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
-    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True).clip(1e-300))
+    kernel /= kernel.sum(axis=1, keepdims=True).clip(1e-300)
+    alone = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
+    return np.asarray((1.0 - _OF_ONE_LENGTH) * kernel + _OF_ONE_LENGTH * alone / alone.sum())
 
 
 def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[float]:

@@ -182,7 +182,7 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     log_prior = [-0.5 * (_LOG_NOISE / sigma) ** 2, odds - 0.5 * (wrong / _UNSTATED_SIGMA) ** 2]
     return (
         np.concatenate([_LOG_NOISE, wrong]),
-        np.concatenate([np.zeros(len(_LOG_NOISE)), wrong]),
+        np.concatenate([np.zeros(len(_LOG_NOISE)) if is_stated else _LOG_NOISE, wrong]),
         np.concatenate(log_prior),
     )
 

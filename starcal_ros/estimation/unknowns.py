@@ -104,6 +104,8 @@ class Unknown:
         Rotation of the camera, as the star tracker of each image predicts it.
     widest : float or (q,)
         Largest 1-sigma that is possible at all, whatever a data sheet says.
+    usual : float
+        1-sigma of what is usual: what stars show to be much farther has to be stated.
     """
 
     name: str
@@ -119,6 +121,7 @@ class Unknown:
     term: Floats | None = None
     tracker: Floats | None = None
     widest: Floats | float = np.inf
+    usual: float = np.inf
 
     def __len__(self) -> int:
         """Return the number of unknowns of the entry."""
@@ -211,6 +214,8 @@ class Assumptions:
         About a zenith that is not known exactly; None: in space, or corrected.
     lens_log_px : float, float
         Logarithm of the residual of the lens: mean and 1-sigma.
+    usual_m_s : float
+        Usual velocity against the Earth where none is given.
     """
 
     velocity_m_s: float
@@ -218,6 +223,7 @@ class Assumptions:
     stamp_s: float
     refraction: Refraction | None = None
     lens_log_px: tuple[float, float] = UNSTATED
+    usual_m_s: float = np.inf
 
 
 def unknowns_in_state(problem: Problem, state: State) -> Layout:
@@ -361,6 +367,7 @@ def unknowns_of(
                 np.zeros(3),
                 turn=functools.partial(_by_velocity, state.camera_from_icrf.as_matrix()),
                 widest=_FASTEST_M_S,
+                usual=assumed.usual_m_s,
             )
         )
     if assumed.refraction is not None:

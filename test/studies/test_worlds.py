@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.worlds import score
+from bench.coverage import drawn, score
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
@@ -99,8 +99,24 @@ def test_a_late_stamp_turns_the_reported_attitude_by_the_rate() -> None:
     assert np.allclose(turned_rad, 0.05 * late.rate_rad_s[3], atol=0.05 * ARCSECOND_RAD)
 
 
+@pytest.mark.parametrize('mission', range(12))
+def test_a_drawn_mission_is_within_the_priors_that_the_documents_promise(mission: int) -> None:
+    sound, departing = (drawn(3, mission, is_sound) for is_sound in (True, False))
+    same = ('images', 'pointing', 'model', 'field_deg', 'corner', 'magnitude_limit', 'shutter')
+    assert [getattr(sound, name) for name in same] == [getattr(departing, name) for name in same]
+    made = worlds.simulate(sound, 3, images=4)
+    truth, prior = made.scenario.truth.camera, made.scenario.prior.camera
+    assert truth.model == prior.model == sound.model
+    centre_px = np.linalg.norm(truth.intrinsics[3:] - prior.intrinsics[3:])
+    assert centre_px <= 0.03 * truth.width
+    assert prior.intrinsics[0] == pytest.approx(truth.intrinsics[0], rel=0.021)
+    assert np.isfinite(made.true_directions[0]).all()
+    if all(len(image) > 30 for image in made.ensemble.images) and not sound.velocity_m_s:
+        assert 0.75 < chi2_per_number(made) < 1.25
+
+
 @pytest.mark.slow
 def test_a_sound_world_is_honest_and_near_its_bound() -> None:
-    scores = [score('plain', seed) for seed in (1, 2, 3)]
+    scores = [score(worlds.WORLDS['plain'], seed) for seed in (1, 2, 3)]
     assert 0.5 < np.sqrt(np.mean([s.shape**2 for s, _ in scores])) < 1.6
     assert all(0.9 < over_bound < 1.6 for _, over_bound in scores)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,10 @@ from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks
+from studies import worlds
 
 CORNER_PX = float(np.hypot(WIDTH, HEIGHT)) / 2.0
 LIMIT_SIGMA = 5.0  # the gate's, of a held term
@@ -184,3 +189,16 @@ def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
     )
     names = {term.name for term in model_checks(found).held if 'velocity' in term.name}
     assert names == {'velocity_x_m_s', 'velocity_y_m_s'}
+
+
+@pytest.mark.slow
+def test_a_velocity_that_takes_the_place_of_a_tilt_is_no_contradiction() -> None:
+    """A fisheye that looks one way has no term of a tilt: by its distance alone 6.8 sigma."""
+    tilted = partial(worlds.tilt, 0.1)
+    lens: dict[str, Any] = {'model': 'equidistant', 'field_deg': 90.0, 'corner': -0.02}
+    stars: dict[str, Any] = {'magnitude_limit': 5.3, 'zero_point_dn': 8e5, 'bright_px': 0.03}
+    made = worlds.simulate(worlds.World(40, 'small', lens=tilted, **lens, **stars), 1)
+    options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0,) * 3, shutter='global')
+    found = estimate_calibration(made.ensemble, made.scenario.prior, options)
+    terms = [term for term in model_checks(found).held if 'velocity' in term.name]
+    assert 4.0 < max(term.significance for term in terms) <= LIMIT_SIGMA

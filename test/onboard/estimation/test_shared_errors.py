@@ -126,11 +126,16 @@ def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     moments = [(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)]
     found = chain_means(last[1] @ module._next_octave(last[0]), moments)
-    # Each octave is e^-0.7 of the one before, within e; the kernel is normalised on the grid.
-    steps = np.exp(-0.5 * (grid[None, :] - grid[:, None] + 0.7) ** 2)
-    steps /= steps.sum(axis=1, keepdims=True)
-    first = np.exp(-0.5 * (grid[None, :] - last[0][:, None] + 0.7) ** 2)
-    first = last[1] @ (first / first.sum(axis=1, keepdims=True))
+    # Each octave is e^-0.7 of the one before, within e, and one in twenty is as any amplitude.
+    alone = np.exp(-0.5 * ((grid - math.log(1e-5)) / 4.0) ** 2)
+
+    def following(log_px: Floats) -> Floats:
+        steps = np.exp(-0.5 * (grid[None, :] - log_px[:, None] + 0.7) ** 2)
+        return np.asarray(
+            0.95 * steps / steps.sum(axis=1, keepdims=True) + 0.05 * alone / alone.sum()
+        )
+
+    steps, first = following(np.asarray(grid, np.float64)), last[1] @ following(last[0])
     by = [np.exp(-0.5 * ((e - np.exp(2 * grid)) / s) ** 2) for e, s in moments]
     joint = np.einsum('a,a,ab,b,bc,c->abc', first, by[0], steps, by[1], steps, by[2])
     for k, one in enumerate(found):

@@ -107,7 +107,9 @@ def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -
     sigma = 0.5 if is_stated else 3.0
     # Of fifty data sheets one states no more than none: its noise is four times larger and more.
     rms = math.sqrt((error**2).mean())
-    sheets = [(b, 0.0, -0.5 * (b / sigma) ** 2) for b in np.linspace(-2.1, 2.8, 15)]
+    right = np.linspace(-2.1, 2.8, 15)
+    # Where none is stated, the slow error is as large as the noise.
+    sheets = [(b, 0.0 if is_stated else b, -0.5 * (b / sigma) ** 2) for b in right]
     for b in 0.35 * np.arange(4, math.ceil(max(2.8, math.log(rms) + 1.0) / 0.35) + 1):
         sheets.append((b, b, -0.5 * (b / 3.0) ** 2 + math.log(0.02 / 0.98 * sigma / 3.0)))
     for K in kernels:

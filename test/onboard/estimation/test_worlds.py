@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bench import worlds
+from bench.coverage import score
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
@@ -21,7 +21,7 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble
-from studies.worlds import Campaign, campaign, simulate, World
+from studies.worlds import Campaign, campaign, simulate, World, WORLDS
 
 SEEDS = range(1, 21)
 
@@ -183,7 +183,7 @@ DEPARTURES = {
 @pytest.mark.slow
 @pytest.mark.parametrize('name', DEPARTURES)
 def test_departures_are_in_the_sigma(name: str) -> None:
-    scores = [worlds.score(name, seed)[0] for seed in (1, 2)]
+    scores = [score(WORLDS[name], seed)[0] for seed in (1, 2)]
     shape = np.sqrt(np.mean([s.shape**2 for s in scores]))
     pointing = np.sqrt(np.mean([s.pointing**2 for s in scores]))
     assert shape < DEPARTURES[name][0]
