@@ -2,9 +2,9 @@
 """
 Simulated images of a star field.
 
-Modelled: pixel-integrated Gaussian stars with a PSF that may widen towards the corners; photon,
-dark and read noise; hot pixels; cosmic rays; saturation; quantisation.  Not modelled: smear and
-flat-field errors.
+Modelled: pixel-integrated Gaussian stars with a PSF that may widen towards the corners; a turn of
+the camera during the exposure; photon, dark and read noise; hot pixels; cosmic rays; saturation;
+quantisation.  Not modelled: flat-field errors.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from starcal_ground.simulation.scenario import (
@@ -27,6 +28,7 @@ from starcal_ground.simulation.scenario import (
     stamp_half_px,
 )
 from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.camera import project
 from starcal_ros.records import Image
 
 
@@ -116,11 +118,28 @@ def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None 
     shape = (camera.height, camera.width)
     rng = random_stream(scenario.seed, PIXEL_STREAM, index)
     mean = fixed_pattern(scenario) if pattern is None else pattern
-    mean = mean + star_electrons(
-        shown.pixel_px, shown.flux_electrons, detector.psf_sigma_at(shown.pixel_px, shape), shape
-    )
+    places_px = _places_px(scenario, shown)
+    for place_px in places_px:
+        flux_electrons = shown.flux_electrons / len(places_px)
+        sigma_px = detector.psf_sigma_at(place_px, shape)
+        mean = mean + star_electrons(place_px, flux_electrons, sigma_px, shape)
     mean += cosmic_ray_electrons(detector, shape, rng)
     return Image(shown.time_ns, expose(mean, detector, rng))
+
+
+def _places_px(scenario: Scenario, shown: Scene) -> list[Floats]:
+    """Places (n, 2) of the stars in equal parts of the exposure, a quarter of a pixel apart."""
+    camera, turn_rad = scenario.truth.camera, np.array(scenario.turn_rad)
+    if not turn_rad.any():
+        return [shown.pixel_px]
+    at_corner = np.array([1.0, 1.0, 0.5 * math.hypot(camera.width, camera.height)])
+    at_corner[:2] = camera.parameters[0]
+    count = math.ceil(4.0 * float(np.abs(turn_rad) @ at_corner))
+    in_camera = shown.direction_icrf @ shown.camera_from_icrf.T
+    return [
+        project(camera, Rotation.from_rotvec(part * turn_rad).inv().apply(in_camera))
+        for part in (np.arange(count) + 0.5) / count - 0.5
+    ]
 
 
 def images(scenario: Scenario) -> Iterator[Image]:

@@ -115,6 +115,7 @@ class Scenario:
     magnitude_limit: float = 9.0
     stars_per_image: int | None = None  # the brightest on the detector; None: all
     sky: StarCatalog | None = None  # sorted by magnitude; None: the bundled catalog
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera during each exposure
     star_tracker_hz: float = 0.0  # of samples with errors of their own; 0: at ATTITUDE_OFFSETS_S
 
     def time_ns(self, index: int) -> int:

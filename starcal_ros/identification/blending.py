@@ -16,7 +16,7 @@ from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 from starcal_ros.stars.centroiding import Centroids, SWAMPED_SIGMA
 from starcal_ros.stars.image_model import ImageModel
-from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
+from starcal_ros.stars.psf_fit import apart_px, neighbour_pull_px, stamp_radius_px
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
@@ -59,12 +59,13 @@ def neighbour_pulls(
     ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
     """
     sigma_px = model.psf_sigma_px or 1.0
-    reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
+    radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
+    reach_px = radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
     pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     offset_px = xy_px[other] - xy_px[star]
-    distance_px = np.linalg.norm(offset_px, axis=1)
+    distance_px = apart_px(offset_px, sigma_px, model.streaks_at(xy_px[star]))
     known = modelled[other]
     # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
     # centre of a double of similar stars is not used either: its orbital motion, which the catalog
@@ -87,6 +88,7 @@ def neighbour_pulls(
         sigma_px,
         model.background.noise_dn,
         model.pixel_noise,
+        model.streaks_at(xy_px[star]),
     )
     total_px, uncertain_px = np.zeros_like(xy_px), np.zeros_like(xy_px)
     np.add.at(total_px, star[~known], pull_px[~known])
