@@ -41,6 +41,16 @@ class Pulls:
     swamped: Mask
     outshone: Mask
 
+    def of_first(self, count: int) -> Pulls:
+        """Return those on the first stars."""
+        return Pulls(*(getattr(self, field.name)[:count] for field in dataclasses.fields(self)))
+
+
+def blend_reach_px(model: ImageModel) -> float:
+    """Distance from which the light of a neighbour does not reach the window of a star."""
+    radius_px = stamp_radius_px(model.psf_sigma_px or 1.0, model.longest_streak_px)
+    return radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
+
 
 def neighbour_pulls(
     xy_px: Floats,
@@ -59,9 +69,7 @@ def neighbour_pulls(
     ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
     """
     sigma_px = model.psf_sigma_px or 1.0
-    radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
-    reach_px = radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
-    pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
+    pairs = cKDTree(xy_px).query_pairs(blend_reach_px(model), output_type='ndarray')
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     offset_px = xy_px[other] - xy_px[star]
@@ -118,10 +126,16 @@ def _alone(direction: Floats, tested: Mask) -> Mask:
 
 
 def separate(
-    prediction: Prediction, catalog: StarCatalog, centroids: Centroids, model: ImageModel
+    prediction: Prediction,
+    catalog: StarCatalog,
+    centroids: Centroids,
+    model: ImageModel,
+    deeper: tuple[Floats, Floats],
 ) -> tuple[Centroids, Mask]:
     """
     Centroids corrected for catalog neighbours, and a mask (n,) of the isolated stars.
+
+    ``deeper`` are pixels (k, 2) and magnitudes (k,) of neighbours below the magnitude limit.
 
     The pull is subtracted and its uncertainty added to the covariance; a star with an uncertainty
     above `MAX_BLEND_SIGMA` is refused as a blend.  The same applies to close companions that the
@@ -130,11 +144,18 @@ def separate(
     magnitude = catalog.magnitude[prediction.catalog_index]
     # The search for lost lines also uses the stars measured far from their predictions.
     measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
+    deeper_px, deeper_magnitude = deeper
+    count, none = len(magnitude), np.zeros(len(deeper_magnitude), bool)
     pulls = neighbour_pulls(
-        prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled, measured
-    )
+        np.concatenate([prediction.xy_px, deeper_px]),
+        np.concatenate([magnitude, deeper_magnitude]),
+        np.concatenate([centroids.flux_dn, none]),
+        model,
+        np.concatenate([centroids.modelled, none]),
+        np.concatenate([measured, none]),
+    ).of_first(count)
     unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
-    faintest = float(catalog.magnitude[-1])
+    faintest = float((catalog.deeper or catalog).magnitude[-1])
     unlisted_px = np.where(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )

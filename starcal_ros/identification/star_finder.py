@@ -21,9 +21,10 @@ from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
-from starcal_ros.identification.blending import separate
+from starcal_ros.identification.blending import blend_reach_px, separate
 from starcal_ros.identification.match_checks import find_line_loss, refuse_by_brightness
 from starcal_ros.identification.prediction import (
+    deeper_stars,
     fit_warp,
     in_image,
     predict,
@@ -195,7 +196,17 @@ def measure_predicted(
     if instrument is not None and shape_changed(measured, model):
         raise ImageRefused('no_match', 'the stars have another shape than in the images before')
     # Faint stars are refused, but their light may pull the centroids of the others.
-    centroids, alone = separate(shown, catalog, with_faint(measured, shown.xy_px), model)
+    deeper = deeper_stars(
+        shown,
+        np.arange(len(shown.catalog_index)) < count,
+        blend_reach_px(model),
+        catalog.deeper,
+        exposure.image.time_ns,
+        exposure.velocity.m_s,
+        exposure.site,
+    )
+    faint = with_faint(measured, shown.xy_px)
+    centroids, alone = separate(shown, catalog, faint, model, deeper)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
     refusal = refuse_on_hot_pixels(
         shown.xy_px,

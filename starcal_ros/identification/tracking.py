@@ -147,7 +147,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
         direction_camera[near],
     )
     xy_px = project(camera, direction_camera)
-    return Prediction(index, direction_icrf, direction_camera, xy_px, float(camera.parameters[0]))
+    return Prediction(index, direction_icrf, direction_camera, xy_px, camera)
 
 
 def _find_rotation(
