@@ -33,10 +33,15 @@ from starcal_ros.records import Image
 
 
 def pixel_stamps(
-    centers_px: Floats, psf_sigma_px: float | Floats
+    centers_px: Floats,
+    psf_sigma_px: float | Floats,
+    off_px: float | Floats = 0.0,
+    reach_px: int = 0,
 ) -> tuple[NDArray[np.int64], Floats, Floats]:
     """
     Pixel indices around centers (n,) on one axis, with the share of light and its derivative.
+
+    The light is ``off_px`` (n,), at most ``reach_px``, from the center.
 
     Returns
     -------
@@ -47,11 +52,11 @@ def pixel_stamps(
         Derivative of the share by the center, 1/px.
     """
     sigma_px = np.broadcast_to(np.asarray(psf_sigma_px, np.float64), centers_px.shape)
-    half = stamp_half_px(float(sigma_px.max(initial=0.1)))
+    half = stamp_half_px(float(sigma_px.max(initial=0.1))) + reach_px
     edges = np.arange(-half, half + 2) - 0.5
     nearest = np.rint(centers_px).astype(np.int64)
     width = math.sqrt(2) * sigma_px[:, None]
-    z = (nearest[:, None] + edges - centers_px[:, None]) / width
+    z = (nearest[:, None] + edges - (centers_px + off_px)[:, None]) / width
     density = np.exp(-z * z) / (math.sqrt(math.pi) * width)
     pixels = nearest[:, None] + np.arange(-half, half + 1)
     return pixels, np.diff(erf(z), axis=1) / 2, -np.diff(density, axis=1)

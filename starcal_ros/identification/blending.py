@@ -16,11 +16,13 @@ from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 from starcal_ros.stars.centroiding import Centroids, SWAMPED_SIGMA
 from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.pixel_noise import expected_snr
 from starcal_ros.stars.psf_fit import apart_px, neighbour_pull_px, stamp_radius_px
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
 _NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
+_NEGLIGIBLE = 0.02  # of the sigma of a centroid: a smaller pull, roughly, is not computed
 MAX_BLEND_SIGMA = 3.0  # largest uncertainty by neighbours, in sigmas of the centroid
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
@@ -46,12 +48,6 @@ class Pulls:
         return Pulls(*(getattr(self, field.name)[:count] for field in dataclasses.fields(self)))
 
 
-def blend_reach_px(model: ImageModel) -> float:
-    """Distance from which the light of a neighbour does not reach the window of a star."""
-    radius_px = stamp_radius_px(model.psf_sigma_px or 1.0, model.longest_streak_px)
-    return radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
-
-
 def neighbour_pulls(
     xy_px: Floats,
     magnitude: Floats,
@@ -69,7 +65,9 @@ def neighbour_pulls(
     ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
     """
     sigma_px = model.psf_sigma_px or 1.0
-    pairs = cKDTree(xy_px).query_pairs(blend_reach_px(model), output_type='ndarray')
+    radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
+    reach_px = radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
+    pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     offset_px = xy_px[other] - xy_px[star]
@@ -82,9 +80,16 @@ def neighbour_pulls(
     swamped, outshone = np.zeros((2, len(xy_px)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
     outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
-    of_measured = measured[star]
-    star, ratio, known = star[of_measured], ratio[of_measured], known[of_measured]
-    offset_px, distance_px = offset_px[of_measured], distance_px[of_measured]
+    snr = expected_snr(flux_dn, model.blurred_px, model.background.noise_dn, model.pixel_noise)
+    least_px = _NEGLIGIBLE * sigma_px / np.maximum(snr, 1.0)
+    about_px = ratio * distance_px * np.exp(-((0.5 * distance_px / sigma_px) ** 2))
+    # In photon noise the core of a bright star weighs less, and so the wings more.
+    peak_dn = np.maximum(flux_dn, 0.0) / (2.0 * math.pi * sigma_px**2)
+    noise_dn2 = model.pixel_noise.gain_e_per_dn * model.background.noise_dn**2
+    about_px *= 1.0 + (peak_dn / noise_dn2)[star]
+    matters = measured[star] & (about_px > least_px[star])
+    star, ratio, known = star[matters], ratio[matters], known[matters]
+    offset_px, distance_px = offset_px[matters], distance_px[matters]
     flux = np.maximum(flux_dn[star], 1.0)
     # Share of the neighbour's light in the measured flux: the overlap of two Gaussians.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))

@@ -21,7 +21,7 @@ from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
-from starcal_ros.identification.blending import blend_reach_px, separate
+from starcal_ros.identification.blending import separate
 from starcal_ros.identification.match_checks import find_line_loss, refuse_by_brightness
 from starcal_ros.identification.prediction import (
     deeper_stars,
@@ -56,6 +56,7 @@ _SEARCH_SIGMAS = 3.0
 _CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
 _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
+_DEEPER_SIGMA = 4.0  # distance from which a star that is not measured pulls no centroid
 _MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
 _FEWEST_IN_FIELD = 2.0  # catalog stars in an image, on average over the window of the search
 _NEAREST = 200  # brightest predictions, searched in windows first
@@ -196,16 +197,16 @@ def measure_predicted(
     if instrument is not None and shape_changed(measured, model):
         raise ImageRefused('no_match', 'the stars have another shape than in the images before')
     # Faint stars are refused, but their light may pull the centroids of the others.
+    faint = with_faint(measured, shown.xy_px)
     deeper = deeper_stars(
         shown,
-        np.arange(len(shown.catalog_index)) < count,
-        blend_reach_px(model),
+        faint.refusal == StarRefusal.NONE,
+        _DEEPER_SIGMA * model.extent_px,
         catalog.deeper,
         exposure.image.time_ns,
         exposure.velocity.m_s,
         exposure.site,
     )
-    faint = with_faint(measured, shown.xy_px)
     centroids, alone = separate(shown, catalog, faint, model, deeper)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
     refusal = refuse_on_hot_pixels(

@@ -412,20 +412,28 @@ def _profiles(
     The columns have the weight of their node, so that the sum over the nodes of a row times a
     column is the light of a star.
     """
-    weights: Floats = np.ones(1)
+    n = len(sigma_px)
     if streak_px is None:
-        place_px = place_px[:, None]
-    else:
-        # The quadrature is good to 1e-4 of the peak.
-        count = math.ceil(longest_px(streak_px) / float(sigma_px.min(initial=1.0))) + 2
-        nodes, weights = (0.5 * values for values in np.polynomial.legendre.leggauss(count))
-        place_px = place_px[:, None] + nodes[:, None] * streak_px[:, None]
-    # One call for both axes.
-    both = np.moveaxis(place_px, -1, 0)
-    sigma = np.broadcast_to(sigma_px[:, None], both.shape)
-    profiles = _profile(both, sigma, width, second)
-    value, first, last = (profile[0] * weights[:, None] for profile in profiles)
-    return (value, first, last), (profiles[0][1], profiles[1][1], profiles[2][1])
+        # One call for both axes.
+        centre = np.concatenate([place_px[:, 0], place_px[:, 1]])
+        both = _profile(centre, np.concatenate([sigma_px, sigma_px]), width, second)
+        value, first, last = both
+        return (
+            (value[:n, None], first[:n, None], last[:n, None]),
+            (value[n:, None], first[n:, None], last[n:, None]),
+        )
+    # The quadrature is good to 1e-4 of the peak.
+    count = math.ceil(longest_px(streak_px) / float(sigma_px.min(initial=1.0))) + 2
+    nodes, weights = (0.5 * values for values in np.polynomial.legendre.leggauss(count))
+    centre = place_px.T[:, :, None] + nodes * streak_px.T[:, :, None]
+    value, first, last = _profile(
+        centre, np.broadcast_to(sigma_px[:, None], centre.shape), width, second
+    )
+    weight = weights[:, None]
+    return (
+        (value[0] * weight, first[0] * weight, last[0] * weight),
+        (value[1], first[1], last[1]),
+    )
 
 
 def _whitened_rows(
@@ -444,7 +452,6 @@ def _whitened_rows(
     (px, px1, px2), (py, py1, py2) = _profiles(
         parameters[:, :2], sigma_px, stamps.streak_px, width, count == 7
     )
-    half_variance = 0.5 * sigma_px[:, None, None] ** 2
     px1 = flux[:, None] * px1
     rows = np.empty((n, count + 1, width * width))
     multiply: Callable[..., object] = np.multiply
@@ -456,10 +463,11 @@ def _whitened_rows(
     px, px1, py, py1 = by_row(px), by_row(px1), by_column(py), by_column(py1)
     multiply(py, px1, out=rows[:, 0])
     multiply(py, px, out=rows[:, 2])
-    px = px * flux.reshape(n, *(1,) * (px.ndim - 1))
+    px = px * (flux if px.ndim == 2 else flux[:, None])
     multiply(py1, px, out=rows[:, 1])
     rows[:, 3] = 1.0
     if count == 7:
+        half_variance = 0.5 * sigma_px[:, None, None] ** 2
         multiply(py, by_row(flux[:, None] * half_variance * px2), out=rows[:, 4])
         multiply(by_column(half_variance * py2), px, out=rows[:, 5])
         multiply(py1, px1, out=rows[:, 6])

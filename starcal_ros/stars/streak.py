@@ -30,7 +30,7 @@ _CORE_PX = 4  # half width of a window that shows whether a source is round
 _HALF_PX = 15  # half width of a window: a streak of 20 px is seen to be too long
 _BRIGHT_SNR = 8.0
 _MOST = 40  # the brightest sources show the turn
-_TESTED = 15  # show whether there are streaks at all
+_TESTED, _TESTED_SNR = 15, 20.0  # sources that show whether there are streaks at all
 _FEWEST = 5
 _LEVEL = 0.3  # pixels above this part of the peak, joined to it, are the source
 _NOISE = 3.0  # and this many sigma above the background
@@ -84,9 +84,11 @@ def without_streaks(
     bright = sources.xy_px[sources.snr > _BRIGHT_SNR][:_MOST]
     if len(bright) < _FEWEST:
         return sources, None
-    # Most images are sharp, which the cores show.
-    _, moments_px2 = _extents(pixels, background, bright[:_TESTED], _CORE_PX)
-    if not _elongated(moments_px2):
+    # Most images are sharp, which the cores of the brightest show.
+    tested = bright[: min(_TESTED, np.count_nonzero(sources.snr > _TESTED_SNR))]
+    if len(tested) >= _FEWEST and not _elongated(
+        _extents(pixels, background, tested, _CORE_PX)[1]
+    ):
         return sources, None
     middle_px, moments_px2 = _extents(pixels, background, bright, _HALF_PX)
     apart = _apart(middle_px, _APART_PX)
@@ -119,10 +121,14 @@ def _elongated(moments_px2: Floats) -> bool:
 
 
 def _elongation(moments_px2: Floats) -> tuple[Floats, float]:
-    """Half the difference (n,) of the moments along and across, and the median of the latter."""
+    """
+    Half the difference (n,) of the moments along and across, and the median of the latter.
+
+    That is at least 1 px^2: noise makes sources of fewer pixels as long as streaks of 2 px.
+    """
     uu, vv, uv = moments_px2.T
     half = np.hypot(0.5 * (uu - vv), uv)
-    return half, max(median(0.5 * (uu + vv) - half), 0.1) if len(half) else 0.0
+    return half, max(median(0.5 * (uu + vv) - half), 1.0) if len(half) else 1.0
 
 
 def _extents(
