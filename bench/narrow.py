@@ -227,7 +227,7 @@ def _disc(axis: Floats, count: int, radius_rad: float, rng: np.random.Generator)
 
 
 def _solid_angle(camera: CameraModel) -> float:
-    """Of the field of a camera without distortion, sr."""
+    """Solid angle, sr, of the field of a camera without distortion."""
     u, v = 0.5 * camera.width / camera.parameters[0], 0.5 * camera.height / camera.parameters[0]
     return 4.0 * math.asin(u * v / math.sqrt((1.0 + u * u) * (1.0 + v * v)))
 
