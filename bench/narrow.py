@@ -1,11 +1,16 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Narrow cameras of 0.3 to 5 degrees, rendered and calibrated with attitudes and from images alone.
+Cameras of 0.3 to 110 degrees, rendered and calibrated with attitudes; narrow ones without, too.
 
-The sky is that of the bundled catalog to V = 9, and below a draw with the mean density of stars
-(Allen 2000, Astrophysical Quantities, section 19.2) in one region 10 degrees wide, in which all
-images lie; the catalog file covers that region.  The mounting is off by 5 arcsec to 0.3 degrees,
-stated as its sigma.  From images alone the focal length is given to 10 %, and the velocity.
+Fields from 2.5 degrees show the sky of the bundled catalog, about 200 stars an image above the
+limit of the detector and those below it, to V = 9.  Trails are those of a camera that turns by 6
+px during each exposure, in an arbitrary direction.
+
+The sky of a narrower field is that of the bundled catalog to V = 9, and below a draw with the mean
+density of stars (Allen 2000, Astrophysical Quantities, section 19.2) in one region 10 degrees
+wide, in which all images lie; the catalog file covers that region.  The mounting is off by 5
+arcsec to 0.3 degrees, stated as its sigma.  From images alone the focal length is given to 10 %,
+and the velocity.
 """
 
 from __future__ import annotations
@@ -40,38 +45,47 @@ from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble, MapCovariance
-from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE
+from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog
 from studies.trials import map_bound_px
 
 SIZE, IMAGES, SEEDS = (800, 640), 14, 10
 FIELDS_DEG = (0.3, 0.5, 1.0, 2.5, 5.0)  # of the width
-_STARS = 20  # in a mean image
+WIDE_DEG = (10.0, 20.0, 40.0, 70.0, 110.0)
+TRAIL_PX, TRAILED_DEG = 6.0, (0.5, 5.0, 20.0)
+_STARS, _STARS_OF_WIDE = 20, 200  # in a mean image
+_CENTRE_SIGMA_PX = 0.03 * SIZE[0]  # prior of the principal point
 _REGION_RAD = math.radians(5.0)
 _BELOW_LIMIT_MAG = 1.0  # rendered and in the catalog, too faint to be measured
 _MOST_MAG = 14.0
+_LEAST_ELECTRONS = 200.0  # of the faintest star that is measured
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """One line for each field, with attitudes and without; an hour, or a minute."""
-    fields, seeds = (FIELDS_DEG[:1], 2) if quick else (FIELDS_DEG, SEEDS)
+    """One line for each field, with attitudes, without, and with trails; two hours or a minute."""
+    kinds = [
+        *((field_deg, blind, 0.0) for field_deg in FIELDS_DEG for blind in (False, True)),
+        *((field_deg, False, 0.0) for field_deg in WIDE_DEG),
+        *((field_deg, False, TRAIL_PX) for field_deg in TRAILED_DEG),
+    ]
+    kinds, seeds = (kinds[:2], 2) if quick else (kinds, SEEDS)
     columns = (
-        'field deg, attitudes, accepted, of, error / bound, error / sigma, worst, error arcsec, '
-        'wrong stars, images, s an image, first reason'
+        'field deg, attitudes, trail px, accepted, of, error / bound, error / sigma, worst,'
+        ' error arcsec, wrong stars, images, s an image, first reason'
     )
-    table = Table(f'Narrow cameras, {IMAGES} images, {_STARS} stars each', columns.split(', '))
-    for field_deg in fields:
-        for blind in (False, True):
-            trials = in_processes(trial, [field_deg] * seeds, range(seeds), [blind] * seeds)
-            good = np.array([one.numbers for one in trials if not one.reason])
-            reason = next((one.reason for one in trials if one.reason), '')
-            figures = good.reshape(-1, 6).T
-            table.add(
-                *(field_deg, 'none' if blind else 'given', len(good), seeds),
-                *(rms(figures[0]), rms(figures[1]), float(figures[1].max(initial=0.0))),
-                *(rms(figures[2]), int(figures[3].sum()), float(figures[4].sum())),
-                *(float(figures[5].mean()) if len(good) else math.nan, reason[:60]),
-            )
-            print(*table.rows[-1], flush=True)
+    table = Table(f'Narrow cameras, {IMAGES} images', columns.split(', '))
+    for field_deg, blind, trail_px in kinds:
+        constant = ([value] * seeds for value in (field_deg, blind, trail_px))
+        trials = in_processes(trial, range(seeds), *constant)
+        good = np.array([one.numbers for one in trials if not one.reason])
+        reason = next((one.reason for one in trials if one.reason), '')
+        figures = good.reshape(-1, 6).T
+        table.add(
+            *(field_deg, 'none' if blind else 'given', trail_px, len(good), seeds),
+            *(rms(figures[0]), rms(figures[1]), float(figures[1].max(initial=0.0))),
+            *(rms(figures[2]), int(figures[3].sum()), float(figures[4].sum())),
+            *(float(figures[5].mean()) if len(good) else math.nan, reason[:60]),
+        )
+        print(*table.rows[-1], flush=True)
     yield table
 
 
@@ -83,9 +97,9 @@ class Trial:
     reason: str = ''
 
 
-def trial(field_deg: float, seed: int, blind: bool) -> Trial:
+def trial(seed: int, field_deg: float, blind: bool, trail_px: float) -> Trial:
     """The calibration of a camera against its truth."""
-    given = scenario_of(field_deg, seed)
+    given = scenario_of(field_deg, seed, trail_px)
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         folder = Path(name)
         start_s = time.process_time()
@@ -104,7 +118,7 @@ def trial(field_deg: float, seed: int, blind: bool) -> Trial:
     return Trial(numbers, '' if found.accepted else found.reasons[0])
 
 
-def scenario_of(field_deg: float, seed: int) -> Scenario:
+def scenario_of(field_deg: float, seed: int, trail_px: float = 0.0) -> Scenario:
     """A campaign of a camera of this width, whose mounting is off by what is stated."""
     rng = np.random.default_rng([seed, round(100 * field_deg)])
     fx = SIZE[0] / 2 / math.tan(math.radians(field_deg / 2))
@@ -126,7 +140,10 @@ def scenario_of(field_deg: float, seed: int) -> Scenario:
     axis /= np.linalg.norm(axis)
     if limit + _BELOW_LIMIT_MAG > BUNDLED_MAGNITUDE and field_deg < 2.0:
         sky = deep_sky(axis, _REGION_RAD, limit + _BELOW_LIMIT_MAG, rng)
-    limit = limit if sky else BUNDLED_MAGNITUDE - 0.1
+    if sky is None:
+        bundled = load_catalog(None, BUNDLED_MAGNITUDE - 0.1).magnitude
+        in_sky = _STARS_OF_WIDE * 4.0 * math.pi / _solid_angle(nominal)
+        limit = float(bundled[min(int(in_sky), len(bundled)) - 1])
     apart = disc(axis, IMAGES, 0.9 * _REGION_RAD if sky else math.pi, rng)
     ra_deg, dec_deg = (
         np.degrees(np.arctan2(apart[:, 1], apart[:, 0])),
@@ -135,9 +152,10 @@ def scenario_of(field_deg: float, seed: int) -> Scenario:
     attitudes = np.stack([ra_deg, dec_deg, rng.uniform(0.0, 360.0, IMAGES)], axis=-1)
     base = synthetic.scenario('small', seed)
     detector = dataclasses.replace(
-        base.detector, zero_point_electrons=200.0 * 10 ** (0.4 * limit), bits=14
+        base.detector, zero_point_electrons=_LEAST_ELECTRONS * 10 ** (0.4 * limit), bits=14
     )
     off_rad = mounting_sigma_rad(seed) * rng.normal(size=3)
+    along_rad = rng.uniform(0.0, 2.0 * math.pi)
     mounting = base.prior.star_tracker_from_camera
     return dataclasses.replace(
         base,
@@ -149,6 +167,9 @@ def scenario_of(field_deg: float, seed: int) -> Scenario:
         image_count=IMAGES,
         magnitude_limit=limit + _BELOW_LIMIT_MAG if sky else BUNDLED_MAGNITUDE,
         sky=sky,
+        turn_rad=tuple(
+            (trail_px / fx * np.array([math.cos(along_rad), math.sin(along_rad), 0.0])).tolist()
+        ),
     )
 
 
@@ -157,9 +178,18 @@ def mounting_sigma_rad(seed: int) -> float:
     return float(np.geomspace(5.0, 1080.0, SEEDS)[seed % SEEDS]) * ARCSECOND_RAD
 
 
+def _solid_angle(camera: CameraModel) -> float:
+    """Solid angle, sr, of the field of a camera without distortion."""
+    u, v = 0.5 * camera.width / camera.parameters[0], 0.5 * camera.height / camera.parameters[0]
+    return 4.0 * math.asin(u * v / math.sqrt((1.0 + u * u) * (1.0 + v * v)))
+
+
 def _write_catalog(given: Scenario, folder: Path) -> dict[str, object]:
     """Options of the sky of a scenario, whose catalog is written to a folder."""
-    values: dict[str, object] = {'magnitude_limit': given.magnitude_limit}
+    limit = 2.5 * math.log10(given.detector.zero_point_electrons / _LEAST_ELECTRONS)
+    values: dict[str, object] = {
+        'magnitude_limit': min(limit + _BELOW_LIMIT_MAG, given.magnitude_limit)
+    }
     if given.sky is not None:
         path = folder / 'catalog.npz'
         path.write_bytes(catalog_file(integer_columns(vars(given.sky))))
@@ -196,12 +226,25 @@ def _from_images(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:
 
 
 def bound_px(given: Scenario) -> float:
-    """Cramer-Rao bound of the RMS error of the lines of sight, px."""
-    names = given.truth.camera.parameter_names
-    columns = [names.index(name) for name in centroids.bound_names(given.truth.camera)]
+    """
+    Cramer-Rao bound of the RMS error of the lines of sight, px.
+
+    The principal point is free within its prior: only in a wide field is it no rotation.
+    """
+    camera = given.truth.camera
+    names = list(camera.parameter_names)
+    information = np.zeros((len(names), len(names)))
+    for shown in synthetic.scenes(given):
+        covariance, _, keep = centroids.scene_bound(given, shown)
+        in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
+        information += centroids.camera_information(
+            camera, in_camera, covariance[keep], range(len(names))
+        )
+    for name in ('cx', 'cy'):
+        information[names.index(name), names.index(name)] += _CENTRE_SIGMA_PX**-2.0
     bound = np.zeros((len(names) + 3, len(names) + 3))
-    bound[np.ix_(columns, columns)] = centroids.cramer_rao_covariance(given)
-    return map_bound_px(given.truth.camera, MapCovariance(bound))
+    bound[:-3, :-3] = centroids.scaled_inverse(information)
+    return map_bound_px(camera, MapCovariance(bound))
 
 
 def wrong_stars(given: Scenario, ensemble: Ensemble) -> int:

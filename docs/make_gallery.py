@@ -85,7 +85,7 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
         'incomplete_lost': lost,
         'incomplete_torn': torn,
         'no_stars': expose(rendering.fixed_pattern(SCENARIO)),
-        'too_few_stars': expose(electrons(25.0)),
+        'smeared': expose(electrons(25.0)),
     }
     found = {}
     earlier = Image(SCENARIO.time_ns(FIELD - 1), before)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import pixel_stamps
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, project_jacobians
+from starcal_ros.camera import CameraModel, project_jacobians, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
@@ -81,8 +82,16 @@ def scene_bound(
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
     camera = scenario.truth.camera
+    path_px = None
+    if any(scenario.turn_rad):
+        in_camera = shown.direction_icrf @ shown.camera_from_icrf.T
+        path_px = rotation_jacobian(camera, in_camera) @ scenario.turn_rad
     covariance, snr = centroid_bound(
-        shown.pixel_px, shown.flux_electrons, scenario.detector, (camera.height, camera.width)
+        shown.pixel_px,
+        shown.flux_electrons,
+        scenario.detector,
+        (camera.height, camera.width),
+        path_px,
     )
     inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
     return covariance, snr, inside.all(axis=1) & (snr > BOUND_SNR)
@@ -119,12 +128,17 @@ def observations(
 
 
 def centroid_bound(
-    pixels_px: Floats, flux_electrons: Floats, detector: synthetic.Detector, shape: tuple[int, int]
+    pixels_px: Floats,
+    flux_electrons: Floats,
+    detector: synthetic.Detector,
+    shape: tuple[int, int],
+    path_px: Floats | None = None,
 ) -> tuple[Floats, Floats]:
     """
     Cramer-Rao bound of the centroids of single stars, flux free and background fixed.
 
-    Saturated pixels and pixels outside the detector carry no information.
+    Saturated pixels and pixels outside the detector carry no information.  ``path_px`` (n, 2) is
+    the path of each star during the exposure.
 
     Returns
     -------
@@ -135,18 +149,20 @@ def centroid_bound(
     """
     height, width = shape
     sigma_px = detector.psf_sigma_at(pixels_px, shape)
-    u, share_u, slope_u = pixel_stamps(pixels_px[:, 0], sigma_px)
-    v, share_v, slope_v = pixel_stamps(pixels_px[:, 1], sigma_px)
+    path_px = np.zeros_like(pixels_px) if path_px is None else path_px
+    reach_px = math.ceil(0.5 * float(np.abs(path_px).max(initial=0.0)))
+    count = 8 * reach_px + 1  # parts of the path, a quarter of a pixel each
     flux = np.asarray(flux_electrons, np.float64)[:, None, None]
-    shape_of_star = share_v[:, :, None] * share_u[:, None, :]
-    gradients = np.stack(
-        [
-            flux * share_v[:, :, None] * slope_u[:, None, :],
-            flux * slope_v[:, :, None] * share_u[:, None, :],
-            flux * shape_of_star,  # by log flux, which keeps the matrix well scaled
-        ],
-        axis=1,
-    )
+    shape_of_star, by_u, by_v = np.zeros((3, 1, 1, 1))
+    for part in (np.arange(count) + 0.5) / count - 0.5:
+        off_u, off_v = part * path_px.T
+        u, share_u, slope_u = pixel_stamps(pixels_px[:, 0], sigma_px, off_u, reach_px)
+        v, share_v, slope_v = pixel_stamps(pixels_px[:, 1], sigma_px, off_v, reach_px)
+        shape_of_star = shape_of_star + share_v[:, :, None] * share_u[:, None, :] / count
+        by_u = by_u + share_v[:, :, None] * slope_u[:, None, :] / count
+        by_v = by_v + slope_v[:, :, None] * share_u[:, None, :] / count
+    # By log flux, which keeps the matrix well scaled.
+    gradients = flux[:, None] * np.stack([by_u, by_v, shape_of_star], axis=1)
     mean = flux * shape_of_star
     full_electrons = (detector.full_dn - detector.offset_dn) * detector.electrons_per_dn
     usable = (mean + detector.background_electrons < full_electrons) & (

@@ -2,9 +2,9 @@
 """
 Simulated images of a star field.
 
-Modelled: pixel-integrated Gaussian stars with a PSF that may widen towards the corners; photon,
-dark and read noise; hot pixels; cosmic rays; saturation; quantisation.  Not modelled: smear and
-flat-field errors.
+Modelled: pixel-integrated Gaussian stars with a PSF that may widen towards the corners; a turn of
+the camera during the exposure; photon, dark and read noise; hot pixels; cosmic rays; saturation;
+quantisation.  Not modelled: flat-field errors.
 """
 
 from __future__ import annotations
@@ -14,18 +14,25 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.camera import project
 from starcal_ros.records import Image
 
 
 def pixel_stamps(
-    centers_px: Floats, psf_sigma_px: float | Floats
+    centers_px: Floats,
+    psf_sigma_px: float | Floats,
+    off_px: float | Floats = 0.0,
+    reach_px: int = 0,
 ) -> tuple[NDArray[np.int64], Floats, Floats]:
     """
     Pixel indices around centers (n,) on one axis, with the share of light and its derivative.
+
+    The light is ``off_px`` (n,), at most ``reach_px``, from the center.
 
     Returns
     -------
@@ -36,11 +43,11 @@ def pixel_stamps(
         Derivative of the share by the center, 1/px.
     """
     sigma_px = np.broadcast_to(np.asarray(psf_sigma_px, np.float64), centers_px.shape)
-    half = synthetic.stamp_half_px(float(sigma_px.max(initial=0.1)))
+    half = synthetic.stamp_half_px(float(sigma_px.max(initial=0.1))) + reach_px
     edges = np.arange(-half, half + 2) - 0.5
     nearest = np.rint(centers_px).astype(np.int64)
     width = math.sqrt(2) * sigma_px[:, None]
-    z = (nearest[:, None] + edges - centers_px[:, None]) / width
+    z = (nearest[:, None] + edges - (centers_px + off_px)[:, None]) / width
     density = np.exp(-z * z) / (math.sqrt(math.pi) * width)
     pixels = nearest[:, None] + np.arange(-half, half + 1)
     return pixels, np.diff(erf(z), axis=1) / 2, -np.diff(density, axis=1)
@@ -111,11 +118,28 @@ def render(
     shape = (camera.height, camera.width)
     rng = synthetic.random_stream(scenario.seed, synthetic.PIXEL_STREAM, index)
     mean = fixed_pattern(scenario) if pattern is None else pattern
-    mean = mean + star_electrons(
-        shown.pixel_px, shown.flux_electrons, detector.psf_sigma_at(shown.pixel_px, shape), shape
-    )
+    places_px = _places_px(scenario, shown)
+    for place_px in places_px:
+        flux_electrons = shown.flux_electrons / len(places_px)
+        sigma_px = detector.psf_sigma_at(place_px, shape)
+        mean = mean + star_electrons(place_px, flux_electrons, sigma_px, shape)
     mean += cosmic_ray_electrons(detector, shape, rng)
     return Image(shown.time_ns, expose(mean, detector, rng))
+
+
+def _places_px(scenario: synthetic.Scenario, shown: synthetic.Scene) -> list[Floats]:
+    """Places (n, 2) of the stars in equal parts of the exposure, a quarter of a pixel apart."""
+    camera, turn_rad = scenario.truth.camera, np.array(scenario.turn_rad)
+    if not turn_rad.any():
+        return [shown.pixel_px]
+    at_corner = np.array([1.0, 1.0, 0.5 * math.hypot(camera.width, camera.height)])
+    at_corner[:2] = camera.parameters[0]
+    count = math.ceil(4.0 * float(np.abs(turn_rad) @ at_corner))
+    in_camera = shown.direction_icrf @ shown.camera_from_icrf.T
+    return [
+        project(camera, Rotation.from_rotvec(part * turn_rad).inv().apply(in_camera))
+        for part in (np.arange(count) + 0.5) / count - 0.5
+    ]
 
 
 def images(scenario: synthetic.Scenario) -> Iterator[Image]:

@@ -58,7 +58,7 @@ class Mistakes:
     clock_error_s : float
         Delay of the stamps of images.
     smear_px : int
-        Length of the streak of each star, along +x.
+        Length of the streak of each star in the middle of the image, along x.
     gamma : float
         Pixel values are proportional to light to the power 1 / gamma.
     """
@@ -77,8 +77,6 @@ class Mistakes:
         """The image with its mistakes, as written to the bag."""
         pixels = image.pixels
         full = float(np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else pixels.max())
-        if self.smear_px > 1:
-            pixels = _as_before(_smeared(pixels, self.smear_px), pixels, full)
         if self.gamma != 1.0:
             light = np.clip(pixels.astype(np.float64) - np.median(pixels), 0.0, None) / full
             curved = 0.05 * full + 0.9 * full * light ** (1 / self.gamma)
@@ -106,15 +104,6 @@ class Mistakes:
         return CameraGeometry(
             prior.camera.replace(fx=grown * fx, fy=grown * fy), alignment.as_quat()
         )
-
-
-def _smeared(pixels: Pixels, length_px: int) -> Floats:
-    """The image of a camera that turned during the exposure."""
-    level = float(np.median(pixels))
-    light = np.zeros(pixels.shape)
-    for k in range(length_px):
-        light += np.roll(pixels.astype(np.float64), k, axis=1) - level
-    return level + light / math.sqrt(length_px)
 
 
 def _as_before(changed: Floats, before: Pixels, full: float) -> Pixels:
@@ -217,7 +206,11 @@ def write_bag(
     truth, params, camera, table = (writer.file.with_name(name) for name in beside)
     tables = [] if scenario.table is None else [table]
     check_outputs((*writer.outputs(), truth, params, camera, *tables))
-    scenario = dataclasses.replace(scenario, prior=mistakes.prior(scenario.prior))
+    length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0
+    turn_rad = length_px / float(scenario.truth.camera.parameters[0])
+    scenario = dataclasses.replace(
+        scenario, prior=mistakes.prior(scenario.prior), turn_rad=(0.0, turn_rad, 0.0)
+    )
     content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
     if scenario.table is not None:
         content['/**']['ros__parameters'] |= {

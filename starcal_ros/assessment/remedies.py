@@ -22,6 +22,7 @@ REMEDIES: Mapping[str, str] = {
     'frozen': 'check that the camera is read out',
     'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
     'glare': 'keep Sun, Moon and Earth out of the field',
+    'smeared': 'expose for a shorter time, or point more steadily',
     'not_in_catalog': (
         'raise magnitude_limit, or give starcal catalog a table of this sky (docs/mission.md)'
     ),

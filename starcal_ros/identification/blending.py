@@ -16,11 +16,13 @@ from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 from starcal_ros.stars.centroiding import Centroids, SWAMPED_SIGMA
 from starcal_ros.stars.image_model import ImageModel
-from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
+from starcal_ros.stars.pixel_noise import expected_snr
+from starcal_ros.stars.psf_fit import apart_px, neighbour_pull_px, stamp_radius_px
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
 _NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
+_NEGLIGIBLE = 0.02  # of the sigma of a centroid: a smaller pull, roughly, is not computed
 MAX_BLEND_SIGMA = 3.0  # largest uncertainty by neighbours, in sigmas of the centroid
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
@@ -41,6 +43,10 @@ class Pulls:
     swamped: Mask
     outshone: Mask
 
+    def of_first(self, count: int) -> Pulls:
+        """Return those on the first stars."""
+        return Pulls(*(getattr(self, field.name)[:count] for field in dataclasses.fields(self)))
+
 
 def neighbour_pulls(
     xy_px: Floats,
@@ -59,12 +65,13 @@ def neighbour_pulls(
     ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
     """
     sigma_px = model.psf_sigma_px or 1.0
-    reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
+    radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
+    reach_px = radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
     pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     offset_px = xy_px[other] - xy_px[star]
-    distance_px = np.linalg.norm(offset_px, axis=1)
+    distance_px = apart_px(offset_px, sigma_px, model.streaks_at(xy_px[star]))
     known = modelled[other]
     # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
     # centre of a double of similar stars is not used either: its orbital motion, which the catalog
@@ -73,9 +80,16 @@ def neighbour_pulls(
     swamped, outshone = np.zeros((2, len(xy_px)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
     outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
-    of_measured = measured[star]
-    star, ratio, known = star[of_measured], ratio[of_measured], known[of_measured]
-    offset_px, distance_px = offset_px[of_measured], distance_px[of_measured]
+    snr = expected_snr(flux_dn, model.blurred_px, model.background.noise_dn, model.pixel_noise)
+    least_px = _NEGLIGIBLE * sigma_px / np.maximum(snr, 1.0)
+    about_px = ratio * distance_px * np.exp(-((0.5 * distance_px / sigma_px) ** 2))
+    # In photon noise the core of a bright star weighs less, and so the wings more.
+    peak_dn = np.maximum(flux_dn, 0.0) / (2.0 * math.pi * sigma_px**2)
+    noise_dn2 = model.pixel_noise.gain_e_per_dn * model.background.noise_dn**2
+    about_px *= 1.0 + (peak_dn / noise_dn2)[star]
+    matters = measured[star] & (about_px > least_px[star])
+    star, ratio, known = star[matters], ratio[matters], known[matters]
+    offset_px, distance_px = offset_px[matters], distance_px[matters]
     flux = np.maximum(flux_dn[star], 1.0)
     # Share of the neighbour's light in the measured flux: the overlap of two Gaussians.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))
@@ -87,6 +101,7 @@ def neighbour_pulls(
         sigma_px,
         model.background.noise_dn,
         model.pixel_noise,
+        model.streaks_at(xy_px[star]),
     )
     total_px, uncertain_px = np.zeros_like(xy_px), np.zeros_like(xy_px)
     np.add.at(total_px, star[~known], pull_px[~known])
@@ -116,10 +131,16 @@ def _alone(direction: Floats, tested: Mask) -> Mask:
 
 
 def separate(
-    prediction: Prediction, catalog: StarCatalog, centroids: Centroids, model: ImageModel
+    prediction: Prediction,
+    catalog: StarCatalog,
+    centroids: Centroids,
+    model: ImageModel,
+    deeper: tuple[Floats, Floats],
 ) -> tuple[Centroids, Mask]:
     """
     Centroids corrected for catalog neighbours, and a mask (n,) of the isolated stars.
+
+    ``deeper`` are pixels (k, 2) and magnitudes (k,) of neighbours below the magnitude limit.
 
     The pull is subtracted and its uncertainty added to the covariance; a star with an uncertainty
     above `MAX_BLEND_SIGMA` is refused as a blend.  The same applies to close companions that the
@@ -128,11 +149,18 @@ def separate(
     magnitude = catalog.magnitude[prediction.catalog_index]
     # The search for lost lines also uses the stars measured far from their predictions.
     measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
+    deeper_px, deeper_magnitude = deeper
+    count, none = len(magnitude), np.zeros(len(deeper_magnitude), bool)
     pulls = neighbour_pulls(
-        prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled, measured
-    )
+        np.concatenate([prediction.xy_px, deeper_px]),
+        np.concatenate([magnitude, deeper_magnitude]),
+        np.concatenate([centroids.flux_dn, none]),
+        model,
+        np.concatenate([centroids.modelled, none]),
+        np.concatenate([measured, none]),
+    ).of_first(count)
     unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
-    faintest = float(catalog.magnitude[-1])
+    faintest = float((catalog.deeper or catalog).magnitude[-1])
     unlisted_px = np.where(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )

@@ -135,14 +135,14 @@ def refuse_by_brightness(
     good = np.flatnonzero(refusal == StarRefusal.NONE)
     if len(good) < _FEWEST:
         return refusal
-    psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
+    blurred_px, noise_dn = model.blurred_px, model.background.noise_dn
     zero_point = magnitude[good] + 2.5 * np.log10(centroids.flux_dn[good])
     # Peaks of noise lie near faint catalog stars by chance. The zero point of the brightest stars
     # shows which stars are too faint to be detected: their measurements are noise.
     brightest = np.argsort(magnitude[good], kind='stable')[:_BRIGHTEST]
     highest = median(zero_point[brightest])
     most_dn = 10.0 ** (0.4 * (highest - magnitude[good].astype(np.float64)))
-    unseen = expected_snr(most_dn, psf_sigma_px, noise_dn, model.pixel_noise) < min_snr
+    unseen = expected_snr(most_dn, blurred_px, noise_dn, model.pixel_noise) < min_snr
     refusal[good[unseen]] = StarRefusal.FAINT
     good, zero_point = good[~unseen], zero_point[~unseen]
     if len(good) < _FEWEST:
@@ -160,7 +160,7 @@ def refuse_by_brightness(
     # Stars bright enough to be detected even if they are fainter by the largest deviation.
     faintest = median(zero_point) - most_mag
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
-    seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
+    seen = expected_snr(least_dn, blurred_px, noise_dn, model.pixel_noise) > min_snr
     refusal[seen & (refusal == StarRefusal.FAINT)] = StarRefusal.NOT_DETECTED
     alone = _alone_in_part(refusal, seen, predicted_px, model.background.shape)
     refusal[alone] = StarRefusal.AMBIGUOUS

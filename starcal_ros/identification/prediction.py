@@ -8,6 +8,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
@@ -30,14 +32,19 @@ class Prediction:
     Catalog stars in and near the image.
 
     ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3)
-    apparent; ``direction_camera`` (n, 3); ``xy_px`` (n, 2); ``px_per_rad`` focal length.
+    apparent; ``direction_camera`` (n, 3); ``xy_px`` (n, 2) by ``camera``.
     """
 
     catalog_index: Indices
     direction_icrf: Floats
     direction_camera: Floats
     xy_px: Floats
-    px_per_rad: float
+    camera: CameraModel
+
+    @property
+    def px_per_rad(self) -> float:
+        """Focal length."""
+        return float(self.camera.parameters[0])
 
     def select(self, stars: Mask) -> Prediction:
         """Return the stars of a mask (n,)."""
@@ -46,7 +53,7 @@ class Prediction:
             self.direction_icrf[stars],
             self.direction_camera[stars],
             self.xy_px[stars],
-            self.px_per_rad,
+            self.camera,
         )
 
 
@@ -84,8 +91,37 @@ def predict(
     near[near] &= np.einsum(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
     ) > np.cos(1e-6)
-    px_per_rad = float(camera.parameters[0])
-    return Prediction(index, direction_icrf, direction_camera, xy_px, px_per_rad).select(near)
+    return Prediction(index, direction_icrf, direction_camera, xy_px, camera).select(near)
+
+
+def deeper_stars(
+    prediction: Prediction,
+    near: Mask,
+    reach_px: float,
+    deeper: StarCatalog | None,
+    time_ns: int,
+    velocity_m_s: Floats | None,
+    site: SiteOptions,
+) -> tuple[Floats, Floats]:
+    """
+    Predicted pixels (k, 2) and magnitudes (k,) of fainter stars about some (n,) of a prediction.
+
+    The prediction may have been corrected to an image: each follows its nearest star.
+    """
+    if deeper is None or np.count_nonzero(near) < 3:
+        return np.empty((0, 2)), np.empty(0)
+    camera, about = prediction.camera, prediction.select(near)
+    index = deeper.near(about.direction_icrf, reach_px / about.px_per_rad)
+    index, direction_icrf = visible(deeper, index, time_ns, velocity_m_s, site)
+    camera_from_icrf, _ = Rotation.align_vectors(about.direction_camera, about.direction_icrf)
+    direction_camera = camera_from_icrf.apply(direction_icrf.reshape(-1, 3))
+    ahead = direction_camera[:, 2] > 0.0
+    xy_px = project(camera, direction_camera[ahead])
+    expected_px = project(camera, about.direction_camera)
+    distance_px, nearest = cKDTree(expected_px).query(np.nan_to_num(xy_px, nan=-1e6))
+    xy_px = xy_px + (about.xy_px - expected_px)[nearest]
+    reached = distance_px < reach_px
+    return xy_px[reached], deeper.magnitude[index][ahead][reached]
 
 
 def visible(

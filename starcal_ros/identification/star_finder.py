@@ -24,6 +24,7 @@ from starcal_ros.identification.acquisition import acquire
 from starcal_ros.identification.blending import separate
 from starcal_ros.identification.match_checks import find_line_loss, refuse_by_brightness
 from starcal_ros.identification.prediction import (
+    deeper_stars,
     fit_warp,
     in_image,
     predict,
@@ -36,7 +37,7 @@ from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
 from starcal_ros.sky.astrometry import EARTH, julian_year, SiteOptions, Velocity
 from starcal_ros.sky.catalog import sky_circle, StarCatalog
-from starcal_ros.stars.centroiding import Centroids, measure_stars, with_faint
+from starcal_ros.stars.centroiding import Centroids, measure_stars, shape_changed, with_faint
 from starcal_ros.stars.detection import (
     Background,
     detect,
@@ -49,11 +50,13 @@ from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
 from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
 from starcal_ros.stars.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.stars.psf_fit import stamp_radius_px
+from starcal_ros.stars.streak import Streak, without_streaks
 
 _SEARCH_SIGMAS = 3.0
 _CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
 _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
+_DEEPER_SIGMA = 4.0  # distance from which a star that is not measured pulls no centroid
 _MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
 _FEWEST_IN_FIELD = 2.0  # catalog stars in an image, on average over the window of the search
 _NEAREST = 200  # brightest predictions, searched in windows first
@@ -139,7 +142,8 @@ def observe_stars(
     With too few measured stars the observations have the refusal ``too_few_stars`` and still list
     the refusal reason of each star.
 
-    Raises ImageRefused ``no_stars``, ``no_match``, ``not_in_catalog`` or ``incomplete``.
+    Raises ImageRefused ``no_stars``, ``smeared``, ``no_match``, ``not_in_catalog`` or
+    ``incomplete``.
     """
     image, options = exposure.image, search.identification
     background = measure_background(image.pixels)
@@ -154,12 +158,13 @@ def observe_stars(
         exposure.site,
     )
     _check_catalog(prediction, exposure, geometry, search)
-    predicted_px, sources = _find(image.pixels, background, prediction, geometry, search)
-    model = model_image(image.pixels, background, sources, search.centroid)
+    predicted_px, sources, streak = _find(image.pixels, background, prediction, geometry, search)
+    model = model_image(image.pixels, background, sources, search.centroid, streak)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
         sources = detect(image.pixels, background)
-        model = model_image(image.pixels, background, sources, search.centroid)
+        sources, streak = without_streaks(image.pixels, background, sources, geometry.camera)
+        model = model_image(image.pixels, background, sources, search.centroid, streak)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
     return measure_predicted(exposure, prediction, model, None, search)
 
@@ -178,7 +183,7 @@ def measure_predicted(
     measured stars the observations have the refusal ``too_few_stars``.
 
     Raises ImageRefused ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses
-    contradict the catalog.
+    contradict the catalog or the shapes the instrument.
     """
     catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
@@ -189,17 +194,28 @@ def measure_predicted(
     measured = measure_stars(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
+    if instrument is not None and shape_changed(measured, model):
+        raise ImageRefused('no_match', 'the stars have another shape than in the images before')
     # Faint stars are refused, but their light may pull the centroids of the others.
-    centroids, alone = separate(shown, catalog, with_faint(measured, shown.xy_px), model)
+    faint = with_faint(measured, shown.xy_px)
+    deeper = deeper_stars(
+        shown,
+        faint.refusal == StarRefusal.NONE,
+        _DEEPER_SIGMA * model.extent_px,
+        catalog.deeper,
+        exposure.image.time_ns,
+        exposure.velocity.m_s,
+        exposure.site,
+    )
+    centroids, alone = separate(shown, catalog, faint, model, deeper)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
-    psf_sigma_px = model.psf_sigma_px or 1.0
     refusal = refuse_on_hot_pixels(
         shown.xy_px,
         _refuse_displaced(shown.xy_px, centroids, width),
         exposure.hot_pixels,
         width,
-        stamp_radius_px(psf_sigma_px),
-        psf_sigma_px,
+        stamp_radius_px(model.psf_sigma_px or 1.0, model.longest_streak_px),
+        model.blurred_px,
     )
     magnitude = catalog.magnitude[shown.catalog_index]
     centroids = dataclasses.replace(centroids, refusal=refusal)
@@ -322,21 +338,23 @@ def _find(
     prediction: Prediction,
     geometry: CameraGeometry,
     search: StarSearch,
-) -> tuple[Floats, Sources]:
+) -> tuple[Floats, Sources, Streak | None]:
     """
-    Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
+    Predicted pixels (n, 2) corrected to match the sources, those sources, and their streaks.
 
     The brighter stars are searched near their predictions first; without a match, the whole image
     is searched over the full range of alignment errors.
 
-    Raises ImageRefused ``no_stars`` or ``no_match``.
+    Raises ImageRefused ``no_stars``, ``smeared`` or ``no_match``.
     """
     camera = geometry.camera
     inside = in_image(prediction.xy_px, camera.width, camera.height)
     near = detect_near(pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX)
     try:
         reach_px = float(SEARCH_RADIUS_PX)
-        return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near
+        near, streak = without_streaks(pixels, background, near, camera)
+        matched_px = acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD)
+        return matched_px, near, streak
     except ImageRefused:
         pass
     sources = detect(pixels, background)
@@ -344,9 +362,10 @@ def _find(
         raise ImageRefused(
             'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
         )
+    sources, streak = without_streaks(pixels, background, sources, camera)
     tilt_rad, roll_rad = search.reach_rad(camera)
     reach_px = tilt_rad * float(camera.parameters[0])
-    return acquire(prediction, sources, geometry, reach_px, roll_rad), sources
+    return acquire(prediction, sources, geometry, reach_px, roll_rad), sources, streak
 
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:

@@ -94,7 +94,8 @@ def track_stars(
     """
     Observations of the next image, and the updated track.
 
-    Raises ImageRefused ``no_match`` if the track is lost, ``too_few_stars`` or ``incomplete``.
+    Raises ImageRefused ``no_match`` if the track is lost or its PSF is another one, as where the
+    camera turned during the exposure; ``too_few_stars`` or ``incomplete``.
     """
     pixels = exposure.image.pixels
     prediction = _predict(exposure, before, search)
@@ -146,7 +147,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
         direction_camera[near],
     )
     xy_px = project(camera, direction_camera)
-    return Prediction(index, direction_icrf, direction_camera, xy_px, float(camera.parameters[0]))
+    return Prediction(index, direction_icrf, direction_camera, xy_px, camera)
 
 
 def _find_rotation(

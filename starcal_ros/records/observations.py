@@ -45,6 +45,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'incomplete': ('part of the image is constant, repeated, shifted or from an earlier image'),
     'glare': 'the background varies too strongly over most of the image to be subtracted',
     'no_stars': 'too few star-like sources in the image',
+    'smeared': 'the camera turned too far during the exposure: streaks of over 10 px',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
     'not_in_catalog': 'the catalog has too few stars where the image points',
     'too_few_stars': 'too few stars were measured well',
@@ -90,7 +91,7 @@ class StarRefusal(IntEnum):
     AMBIGUOUS = 1, 'position or brightness contradicts the other stars'
     BLEND = 2, 'another catalog star or source is in the measuring window'
     BORDER = 3, 'the core of the star, or its window for moments, extends beyond the image'
-    ELONGATED = 4, 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy'
+    ELONGATED = 4, 'not the shape of the other stars: cosmic ray, hot pixel or galaxy'
     FAINT = 5, 'signal-to-noise below the limit'
     HOT_PIXEL = 6, 'the light of the star falls on a hot pixel'
     NOT_DETECTED = 7, 'bright enough to be detected, but there is no source'

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
@@ -50,6 +51,9 @@ NO_COLOUR = -32768
 
 # Largest separation of a close pair.
 CLOSE_PAIR_RAD = 20.0 * ARCSECOND_RAD
+
+DEEPER_MAG = 2.0
+"""Stars so far below the magnitude limit are kept for blends: they have 16 % of its light."""
 
 # Margin of a cone: 35 years of motion of the fastest star (8.7 arcsec a year) and 20 arcsec of
 # aberration.
@@ -115,6 +119,9 @@ class StarCatalog:
     epoch_jyear : float
     digest : str
         SHA-256 of the columns of the file, also in selections: identifies the source catalog.
+    deeper : StarCatalog, optional
+        Fainter stars of the file, to `DEEPER_MAG` below the magnitude limit: too faint to be
+        measured, but their light moves the centroids of others.
     """
 
     id: Indices
@@ -129,6 +136,7 @@ class StarCatalog:
     close_pair: Mask
     epoch_jyear: float
     digest: str
+    deeper: StarCatalog | None = None
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -143,12 +151,23 @@ class StarCatalog:
             axis=-1,
         )
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.direction_icrs)
+
+    def near(self, direction_icrs: Floats, radius_rad: float) -> NDArray[np.intp]:
+        """Rows (m,), ascending, of the stars near any of some directions (n, 3), as `cone`."""
+        chord = 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
+        rows = self._tree.query_ball_point(direction_icrs, chord)
+        indices = np.concatenate([np.empty(0, np.intp), *rows]).astype(np.intp)
+        return np.asarray(np.unique(indices))
+
     def select(self, rows: Mask | Indices | NDArray[np.intp] | slice) -> StarCatalog:
         """Return the stars selected by a mask (n,), row numbers or a slice, in that order."""
         columns = {
             field.name: getattr(self, field.name)[rows]
             for field in fields(self)
-            if field.name not in ('epoch_jyear', 'digest')
+            if field.name not in ('epoch_jyear', 'digest', 'deeper')
         }
         return replace(self, **columns)
 
@@ -237,11 +256,20 @@ def _bundled(magnitude_limit: float | None) -> StarCatalog:
 
 def _read(path: Path, magnitude_limit: float | None) -> StarCatalog:
     columns, digest = _read_columns(path)
-    rows = slice(None)
-    if magnitude_limit is not None:
-        limit = math.floor(magnitude_limit / MAGNITUDE_UNIT + 1e-6)
-        rows = slice(int(np.searchsorted(columns['magnitude'], limit, side='right')))
-    cut = {name: column[rows] for name, column in columns.items()}
+    if magnitude_limit is None:
+        return _scaled(columns, digest)
+    limits = np.array([magnitude_limit, magnitude_limit + DEEPER_MAG])
+    limits = np.floor(limits / MAGNITUDE_UNIT + 1e-6)
+    count, most = np.searchsorted(columns['magnitude'], limits, side='right').tolist()
+    catalog, deeper = (
+        _scaled({name: column[rows] for name, column in columns.items()}, digest)
+        for rows in (slice(count), slice(count, most))
+    )
+    return replace(catalog, deeper=deeper) if len(deeper) else catalog
+
+
+def _scaled(cut: Mapping[str, NDArray[np.generic]], digest: str) -> StarCatalog:
+    """Catalog of integer columns."""
 
     def scaled(name: str, unit: float) -> Floats:
         return np.asarray(cut[name], np.float64) * unit

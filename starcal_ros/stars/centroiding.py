@@ -21,7 +21,7 @@ from starcal_ros.records import StarRefusal
 from starcal_ros.stars import detection, psf_fit
 from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import CentroidOptions, ImageModel, MAX_SHAPE_CHANGE
-from starcal_ros.stars.pixel_noise import expected_snr, PixelNoise
+from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, PixelNoise
 from starcal_ros.stars.psf_field import PsfWidth
 
 # The mask of Eqs. 8 and 9; the radius holds 99 % of the light of a star of 1 px.
@@ -31,6 +31,8 @@ _MIN_MASK_PIXELS = 4
 _MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their neighbours
 SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
 _NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
+_BRIGHT_SNR, _FEWEST_BRIGHT = 15.0, 5  # stars that show a common change of shape
+_COMMON_CHANGE = 0.5 * MAX_SHAPE_CHANGE
 _IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away shows another source
 
 
@@ -120,15 +122,20 @@ def _measure_by_psf(
         model.pixel_noise,
     )
     fit = psf_fit.fit_at(stamps, parameters, model.pixel_noise)
+    # The brightest pixel is anywhere along a streak.
+    in_place_px = _IN_PLACE_PX + model.extent_px - (model.psf_sigma_px or 1.0)
     refusal = _first_reason(
         (~inside, StarRefusal.BORDER),
         (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
         ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
-        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
+        (np.abs(fit.parameters[:, :2]).max(axis=1) > in_place_px, StarRefusal.NOT_DETECTED),
         (_misshapen(fit, model), StarRefusal.ELONGATED),
     )
+    xy_px = centre + fit.parameters[:, :2]
+    if model.streak is not None:
+        xy_px = xy_px - model.streak.bend_px(xy_px)
     return Centroids(
-        xy_px=centre + fit.parameters[:, :2],
+        xy_px=xy_px,
         covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
         flux_dn=fit.parameters[:, 2],
         snr=fit.snr,
@@ -177,7 +184,7 @@ def _windows(
     pixels: Pixels, centre: Indices, model: ImageModel, psf: PsfWidth, hot_pixels: Indices
 ) -> _Windows:
     """Windows for a fit about pixels (n, 2), without pixels that show no light of the star."""
-    radius = psf_fit.stamp_radius_px(psf.sigma_px)
+    radius = psf_fit.stamp_radius_px(psf.sigma_px, model.longest_streak_px)
     stamps, outside = detection.stamps_at_edges(pixels, centre, radius)
     saturated = (stamps >= model.saturation_dn) & ~outside
     noise_dn = model.background.noise_at(centre)
@@ -193,7 +200,13 @@ def _windows(
         stamps[hot] = level_dn[np.nonzero(hot)[0]]
     out = saturated | hot | outside | invalid
     return _Windows(
-        psf_fit.Stamps(stamps, psf.at(centre), noise_dn[:, None] ** 2, out if out.any() else None),
+        psf_fit.Stamps(
+            stamps,
+            psf.at(centre),
+            noise_dn[:, None] ** 2,
+            out if out.any() else None,
+            model.streaks_at(centre),
+        ),
         level_dn,
         noise_dn,
         np.count_nonzero(saturated & ~hot, axis=(1, 2)),
@@ -218,6 +231,16 @@ def _misshapen(fit: psf_fit.PsfFit, model: ImageModel) -> Mask:
     return np.asarray(other | (fit.worst_pixel_sigma > psf_fit.MISFIT_SIGMA))
 
 
+def shape_changed(measured: Centroids, model: ImageModel) -> bool:
+    """Return True if most bright stars have another shape than the model: streaks, or defocus."""
+    if measured.fit is None:
+        return False
+    change = measured.fit.shape_change[measured.snr > _BRIGHT_SNR]
+    if len(change) < _FEWEST_BRIGHT:
+        return False
+    return bool(np.abs(np.median(change, axis=0) - model.shape_median).max() > _COMMON_CHANGE)
+
+
 def _without_neighbours(
     stamps: psf_fit.Stamps,
     parameters: Floats,
@@ -232,16 +255,22 @@ def _without_neighbours(
     Also the parameters (n, 4) near the minimum of the fit, and a mask (n,) of the modelled stars.
     """
     flux, sigma_px = parameters[:, 2], stamps.sigma_px
-    snr = expected_snr(flux, sigma_px, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
+    streak_px = psf_fit.longest_px(stamps.streak_px)
+    blurred = blurred_px(sigma_px, streak_px)
+    snr = expected_snr(flux, blurred, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
     in_place = np.abs(parameters[:, :2]).max(axis=1) < _IN_PLACE_PX
     modelled = usable & (snr > _MODELLED_SNR) & in_place
     if len(stamps) < 2:
         return stamps, parameters, modelled
     widest_px = float(sigma_px.max())
     # The wing of a star outside the stamp adds light to it.
-    reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px
+    reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px + 0.5 * streak_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
-    apart_px = np.hypot(*(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]]).T)
+    apart_px = psf_fit.apart_px(
+        predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]],
+        sigma_px[pairs[:, 0]],
+        None if stamps.streak_px is None else stamps.streak_px[pairs[:, 0]],
+    )
     # Both fits would follow the light of the brighter one, which comes first.
     modelled[pairs[apart_px < max(3.0, 3.0 * widest_px)].max(axis=1)] = False
     # The fainter of two unresolved stars cannot be separated: `blending` refuses it.
@@ -260,7 +289,11 @@ def _without_neighbours(
     for _ in range(2):
         before = light
         light = psf_fit.light_in_stamps(
-            away_px + parameters[other, :2], parameters[other, 2], sigma_px[other], stamps.width
+            away_px + parameters[other, :2],
+            parameters[other, 2],
+            sigma_px[other],
+            stamps.width,
+            None if stamps.streak_px is None else stamps.streak_px[other],
         )
         if not (np.abs(light - before).max(axis=1, initial=0.0) > little_dn).any():
             break
@@ -276,6 +309,7 @@ def _without_neighbours(
             sigma_px,
             stamps.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
             stamps.out,
+            stamps.streak_px,
         )
         parameters = parameters.copy()
         parameters[again] = psf_fit.approach(separated.select(again), parameters[again], noise)

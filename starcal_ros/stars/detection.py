@@ -33,7 +33,7 @@ _SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their 
 # Matched filter of detection; stars of 0.7 to 1.5 px lose under 10 % of S/N.
 _DETECTION_SIGMA_PX = 1.0
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
-_NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
+NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
 _AROUND = [(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1) if (dv, du) != (0, 0)]
 _RIM_PX = 4  # reach of the filter, plus one pixel to interpolate the maximum
@@ -272,7 +272,7 @@ def detect(
         cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
         np.float32,
     )
-    lowest = detection_sigma * _NOISE_LEFT * float(background.noise_mesh.min())
+    lowest = detection_sigma * NOISE_LEFT * float(background.noise_mesh.min())
     # Few pixels pass the lowest threshold; all later steps use only those.  The search of the flat
     # image takes a tenth of the time of that by rows and columns.
     place = np.flatnonzero(filtered > lowest)
@@ -285,7 +285,7 @@ def detect(
     v, u = np.divmod(place, width)
     centre = flat[place]
     noise = background.noise_at(np.stack([u, v], axis=-1))
-    bright = centre > detection_sigma * _NOISE_LEFT * noise
+    bright = centre > detection_sigma * NOISE_LEFT * noise
     v, u, centre, noise = v[bright], u[bright], centre[bright], noise[bright]
     sharp = image[v, u] > _HOT_PEAK_RATIO * centre
     v, u, centre, noise = v[~sharp], u[~sharp], centre[~sharp], noise[~sharp]
@@ -294,7 +294,7 @@ def detect(
     )
     order = np.argsort(-centre, kind='stable')
     xy = vertex.T + np.stack([u, v], axis=-1)
-    snr = (centre / (_NOISE_LEFT * noise)).astype(np.float64)
+    snr = (centre / (NOISE_LEFT * noise)).astype(np.float64)
     return Sources(xy[order], snr[order], float(width * height))
 
 
@@ -355,7 +355,7 @@ def brightest_near(
     # A maximum at the rim of the window is the flank of a source outside.
     star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
     star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
-    snr = np.where(star_like, peak / (_NOISE_LEFT * noise), 0.0)
+    snr = np.where(star_like, peak / (NOISE_LEFT * noise), 0.0)
     return xy + place.T, snr
 
 

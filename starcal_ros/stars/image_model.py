@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+import functools
+import math
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.options import option
 from starcal_ros.robust_statistics import centre_and_scatter, median
 from starcal_ros.stars import detection
-from starcal_ros.stars.pixel_noise import PixelNoise
+from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise
 from starcal_ros.stars.psf_field import Instrument, MIN_PSF_SIGMA_PX, PsfWidth, uniform_width
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums, stamp_radius_px
+from starcal_ros.stars.streak import refined, Streak
 
 MAX_SHAPE_CHANGE = 0.35  # departure of second moments from the PSF's, a fraction: a blend
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
@@ -61,6 +64,7 @@ class ImageModel:
     ``psf`` is None if the image has too few bright stars.  ``shape_median`` and ``shape_scatter``
     (3,) are median and scatter of `PsfFit.shape_change` of its stars: real lenses do not make
     circular stars, so a star is refused only if its shape differs from the common one.
+    ``streak`` is the turn of the camera during the exposure, None where it blurs no star.
     """
 
     background: detection.Background
@@ -69,11 +73,31 @@ class ImageModel:
     saturation_dn: float
     shape_median: Floats
     shape_scatter: Floats
+    streak: Streak | None = None
 
     @property
     def psf_sigma_px(self) -> float:
         """Mean Gaussian width of the stars; 0 without a PSF."""
         return self.psf.sigma_px if self.psf else 0.0
+
+    @property
+    def blurred_px(self) -> float:
+        """Width of a Gaussian over as many pixels of noise as a star; 1 without a PSF."""
+        return float(blurred_px(self.psf_sigma_px or 1.0, self.longest_streak_px))
+
+    @property
+    def extent_px(self) -> float:
+        """Largest root of the second moment of a star along any direction; 1 without a PSF."""
+        return math.hypot(self.psf_sigma_px or 1.0, self.longest_streak_px / math.sqrt(12.0))
+
+    @functools.cached_property
+    def longest_streak_px(self) -> float:
+        """Length of a streak that nine of ten places of the image do not exceed."""
+        return self.streak.longest_px if self.streak else 0.0
+
+    def streaks_at(self, xy_px: Floats | Indices) -> Floats | None:
+        """Paths (n, 2), px, of stars at pixels (n, 2) during the exposure; None: sharp."""
+        return self.streak.at(xy_px) if self.streak else None
 
 
 def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
@@ -97,29 +121,33 @@ def model_image(
     background: detection.Background,
     sources: detection.Sources,
     options: CentroidOptions,
+    streak: Streak | None = None,
 ) -> ImageModel:
     """
     PSF width, pixel noise and saturation of an image from its own brighter sources.
 
     The width is the median over up to 80 bright, unsaturated, isolated sources; gain and PSF
     error are a robust regression of the squared residuals of their pixels on their signal.
+    Streaks are fitted with the width, from the ``streak`` that the second moments gave.
     """
     saturation_dn = saturation_level(pixels, options) or np.inf
     gain = options.gain_e_per_dn
     unknown = ImageModel(
         background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
-    bright = sources.xy_px[sources.snr > 15.0][:400]
+    least_snr = 15.0 if streak is None else 8.0  # the peak of a streak is lower than its light
+    bright = sources.xy_px[sources.snr > least_snr][:400]
     nearest = np.rint(bright).astype(np.int64)
     bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
-    isolated = cKDTree(bright).query_ball_point(bright, _ISOLATED_PX, return_length=True) == 1
+    apart_px = _ISOLATED_PX + (streak.longest_px if streak else 0.0)
+    isolated = cKDTree(bright).query_ball_point(bright, apart_px, return_length=True) == 1
     xy = bright[isolated][:80]
     sigma = 1.2
     if len(xy) < 5:
         return unknown
     noise_model = PixelNoise(gain or 1.0, 0.02)
     for _ in range(6):
-        radius = stamp_radius_px(sigma)
+        radius = stamp_radius_px(sigma, streak.longest_px if streak else 0.0)
         centre = np.rint(xy).astype(np.int64)
         inside = detection.windows_inside(pixels.shape, centre, radius)
         xy, centre = xy[inside], centre[inside]
@@ -129,9 +157,16 @@ def model_image(
         if len(xy) < 5:
             return unknown
         noise_dn = background.noise_at(xy)
-        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
-        change = median(fit.shape_change[:, :2].mean(axis=1))
+        paths_px = streak.at(xy) if streak else None
+        fit = fit_psf(stamps, sigma, noise_dn, noise_model, paths_px)
         sigma_before = sigma
+        if streak is None:
+            change = median(fit.shape_change[:, :2].mean(axis=1))
+        else:
+            moments_px2 = streak.moments_px2(xy) + sigma**2 * fit.shape_change
+            moments_px2[:, :2] += sigma**2
+            streak, variance_px2, _ = refined(streak, sigma**2, xy, moments_px2)
+            change = variance_px2 / sigma**2 - 1.0
         sigma *= float(np.sqrt(np.clip(1.0 + change, 0.5, 2.0)))
         sigma = float(np.clip(sigma, MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
         if abs(sigma - sigma_before) < 1e-3 * sigma:
@@ -140,12 +175,15 @@ def model_image(
     limit = np.maximum(MAX_SHAPE_CHANGE, 3.0 * shape_scatter)
     star_like = (np.abs(fit.shape_change - shape_median) < limit).all(axis=1)
     stamps, noise_dn = stamps[star_like], noise_dn[star_like]
+    paths_px = streak.at(xy[star_like]) if streak else None
     for _ in range(3):
-        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
+        fit = fit_psf(stamps, sigma, noise_dn, noise_model, paths_px)
         noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
     psf = uniform_width(sigma, pixels.shape[1], pixels.shape[0])
     noise_model = _at_least_sky(noise_model, background)
-    return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
+    return ImageModel(
+        background, psf, noise_model, saturation_dn, shape_median, shape_scatter, streak
+    )
 
 
 def known_model(

@@ -52,6 +52,12 @@ def expected_snr(
     return np.asarray(flux / np.sqrt(sky_dn2 + flux / noise.gain_e_per_dn))
 
 
+def blurred_px(sigma_px: float | Floats, streak_px: float | Floats) -> Floats:
+    """Width of the Gaussian with the noise-equivalent area of one moved along a line, to 5 %."""
+    # The area is 4 pi sigma^2 without, 2 sqrt(pi) sigma s with a long path s.
+    return np.asarray(sigma_px * (1.0 + (streak_px / sigma_px) ** 2 / (4.0 * math.pi)) ** 0.25)
+
+
 @dataclass(frozen=True)
 class NoiseSums:
     """

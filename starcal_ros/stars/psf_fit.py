@@ -3,11 +3,13 @@
 Gaussian fits to stars, all stars of an image at once.
 
 A pixel-integrated circular Gaussian with free position, flux and local background, weighted by the
-noise of each pixel, attains the Cramer-Rao bound of the stamp.
+noise of each pixel, attains the Cramer-Rao bound of the stamp.  In an image with streaks it is the
+mean of such Gaussians along a line, by Gauss-Legendre quadrature.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 import math
 
@@ -25,6 +27,7 @@ _FIT_STEPS = 4  # stars converge in two or three; other sources may not
 # that noise.
 _SETTLED = 0.3
 _MOMENTS = np.array([[-1, 0, 1] * 3, [-1] * 3 + [0] * 3 + [1] * 3, [1] * 9], np.float64).T
+_MOST_RADIUS_PX = 15
 MISFIT_SIGMA = 5.0  # normal noise in 81 pixels exceeds it for one star in 20,000
 
 
@@ -60,9 +63,9 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | Mask) -> PsfFit:
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
 
-def stamp_radius_px(psf_sigma_px: float) -> int:
+def stamp_radius_px(psf_sigma_px: float, streak_px: float = 0.0) -> int:
     """Half width of the fitting window; beyond 3 sigma a PSF gives no position information."""
-    return min(max(math.ceil(3.0 * psf_sigma_px), 3), 12)
+    return min(max(math.ceil(3.0 * psf_sigma_px + 0.5 * streak_px), 3), _MOST_RADIUS_PX)
 
 
 @dataclass(frozen=True)
@@ -80,12 +83,15 @@ class Stamps:
         Pixel variance for each star, or for each pixel, without the photon noise of the star.
     out : (n, w, w), optional
         Mask of the pixels to leave out: saturated, hot, outside the image.
+    streak_px : (n, 2), optional
+        Path of each star during the exposure; None: sharp stars.
     """
 
     data_dn: Floats
     sigma_px: Floats
     noise2_dn2: Floats
     out: Mask | None = None
+    streak_px: Floats | None = None
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -115,17 +121,26 @@ class Stamps:
             self.sigma_px[stars],
             self.noise2_dn2[stars],
             None if self.out is None else self.out[stars],
+            None if self.streak_px is None else self.streak_px[stars],
         )
 
 
-def fit_psf(stamps: Floats, sigma_px: float, noise_dn: Floats, pixel_noise: PixelNoise) -> PsfFit:
+def fit_psf(
+    stamps: Floats,
+    sigma_px: float,
+    noise_dn: Floats,
+    pixel_noise: PixelNoise,
+    streak_px: Floats | None = None,
+) -> PsfFit:
     """
     Weighted least-squares fit of the pixel-integrated Gaussian to every stamp (n, w, w), DN.
 
     Each star is within about a pixel of the centre.  ``sigma_px`` is the width of the PSF,
-    ``noise_dn`` (n,) the pixel noise without the photon noise of the star.
+    ``noise_dn`` (n,) the pixel noise without the photon noise of the star, ``streak_px`` (n, 2)
+    the path of each star during the exposure.
     """
-    windows = Stamps(stamps, np.full(len(stamps), sigma_px), noise_dn[:, None] ** 2)
+    sigma = np.full(len(stamps), sigma_px)
+    windows = Stamps(stamps, sigma, noise_dn[:, None] ** 2, streak_px=streak_px)
     guess = first_guess(windows, border_level_dn(stamps))
     return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
 
@@ -255,6 +270,10 @@ def first_guess(windows: Stamps, background: Floats) -> Floats:
     ``background`` (n,) is the result of `border_level_dn`.
     """
     stamps, sigma_px, c = windows.data_dn, windows.sigma_px, windows.width // 2
+    if windows.streak_px is not None:
+        # The middle pixels do not show the place along a streak.
+        flux = stamps.sum(axis=(1, 2)) - windows.width**2 * background
+        return np.stack([*np.zeros((2, len(stamps))), flux, background], axis=-1)
     core = stamps[:, c - 1 : c + 2, c - 1 : c + 2].reshape(-1, 9)
     off_x, off_y, total = (core @ _MOMENTS).T
     total = total - 9.0 * background
@@ -276,17 +295,17 @@ def border_level_dn(stamps: Floats) -> Floats:
     return np.asarray(np.partition(border, middle, axis=1)[:, middle])
 
 
-def light_in_stamps(place_px: Floats, flux_dn: Floats, sigma_px: Floats, width: int) -> Floats:
+def light_in_stamps(
+    place_px: Floats,
+    flux_dn: Floats,
+    sigma_px: Floats,
+    width: int,
+    streak_px: Floats | None = None,
+) -> Floats:
     """Light (k, width^2) in stamps from stars at (k, 2) from their middles, inside or outside."""
-    count = len(flux_dn)
-    value, _, _ = _profile(
-        np.concatenate([place_px[:, 0], place_px[:, 1]]),
-        np.concatenate([sigma_px, sigma_px]),
-        width,
-        False,
-    )
-    light = value[count:, :, None] * (flux_dn[:, None] * value[:count])[:, None, :]
-    return np.asarray(light.reshape(count, width * width))
+    (columns, _, _), (rows, _, _) = _profiles(place_px, sigma_px, streak_px, width, False)
+    light = rows.transpose(0, 2, 1) @ (flux_dn[:, None, None] * columns)
+    return np.asarray(light.reshape(len(flux_dn), width * width))
 
 
 def neighbour_pull_px(
@@ -296,6 +315,7 @@ def neighbour_pull_px(
     sigma_px: float,
     noise_dn: float,
     pixel_noise: PixelNoise,
+    streak_px: Floats | None = None,
 ) -> Floats:
     """
     Shift (k, 2) of the fitted position of a star by the light of a neighbour.
@@ -303,7 +323,7 @@ def neighbour_pull_px(
     It is the position that the fit finds in the noise-free light of both stars.  ``offset_px``
     (k, 2) points from the star to its neighbour; PSF and noise are those of `fit_psf`.
     """
-    width = 2 * stamp_radius_px(sigma_px) + 1
+    width = 2 * stamp_radius_px(sigma_px, longest_px(streak_px)) + 1
     count = len(flux_dn)
     sigma = np.full(count, sigma_px)
     own, other = light_in_stamps(
@@ -311,8 +331,9 @@ def neighbour_pull_px(
         np.concatenate([flux_dn, neighbour_flux_dn]),
         np.full(2 * count, sigma_px),
         width,
+        None if streak_px is None else np.concatenate([streak_px, streak_px]),
     ).reshape(2, count, width, width)
-    stamps = Stamps(own + other, sigma, np.full((count, 1), noise_dn**2))
+    stamps = Stamps(own + other, sigma, np.full((count, 1), noise_dn**2), streak_px=streak_px)
     alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
     # After two steps a hundredth of the shift remains.
     for _ in range(2):
@@ -340,6 +361,23 @@ def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums
     return NoiseSums(A @ A.T, A @ np.where(keep, squared * weight, 0.0).ravel())
 
 
+def longest_px(streak_px: Floats | None) -> float:
+    """Length of the longest of the streaks (n, 2), px; 0 without any."""
+    if streak_px is None:
+        return 0.0
+    return float(np.hypot(streak_px[:, 0], streak_px[:, 1]).max(initial=0.0))
+
+
+def apart_px(offset_px: Floats, sigma_px: float | Floats, streak_px: Floats | None) -> Floats:
+    """Distances (k,) over offsets (k, 2), shorter along a streak as its light is wider there."""
+    apart2 = (offset_px**2).sum(axis=-1)
+    if streak_px is not None:
+        variance = (streak_px**2).sum(axis=-1) / 12.0
+        along2 = (offset_px * streak_px).sum(axis=-1) ** 2 / 12.0 / np.maximum(variance, 1e-9)
+        apart2 = apart2 - along2 * variance / (variance + np.square(sigma_px))
+    return np.asarray(np.sqrt(apart2))
+
+
 def _gauss(t: Floats) -> Floats:
     return np.asarray(np.exp(-0.5 * t * t) / math.sqrt(2.0 * math.pi))
 
@@ -350,19 +388,52 @@ def _profile(
     """
     Pixel-integrated Gaussian along one axis with its first and second derivative by the centre.
 
-    ``centre`` (n,) from the middle of ``width`` pixels, ``sigma_px`` (n,); results are (n, width).
-    The derivative by sigma^2 is half of the second one by the centre (heat equation).
+    ``centre`` (...) from the middle of ``width`` pixels, ``sigma_px`` alike; results are (...,
+    width).  The derivative by sigma^2 is half of the second one by the centre (heat equation).
     """
     edges = np.arange(width + 1) - width / 2.0
-    t = (edges - centre[:, None]) / sigma_px[:, None]
+    t = (edges - centre[..., None]) / sigma_px[..., None]
     density = _gauss(t)
     cumulative = ndtr(t)
-    value = cumulative[:, 1:] - cumulative[:, :-1]
-    first = (density[:, :-1] - density[:, 1:]) / sigma_px[:, None]
+    value = cumulative[..., 1:] - cumulative[..., :-1]
+    first = (density[..., :-1] - density[..., 1:]) / sigma_px[..., None]
     if not second:
         return value, first, first
     density *= t
-    return value, first, (density[:, :-1] - density[:, 1:]) / sigma_px[:, None] ** 2
+    return value, first, (density[..., :-1] - density[..., 1:]) / sigma_px[..., None] ** 2
+
+
+def _profiles(
+    place_px: Floats, sigma_px: Floats, streak_px: Floats | None, width: int, second: bool
+) -> tuple[tuple[Floats, Floats, Floats], tuple[Floats, Floats, Floats]]:
+    """
+    `_profile` of columns and of rows at the nodes of streaks, each (n, nodes, width).
+
+    The columns have the weight of their node, so that the sum over the nodes of a row times a
+    column is the light of a star.
+    """
+    n = len(sigma_px)
+    if streak_px is None:
+        # One call for both axes.
+        centre = np.concatenate([place_px[:, 0], place_px[:, 1]])
+        both = _profile(centre, np.concatenate([sigma_px, sigma_px]), width, second)
+        value, first, last = both
+        return (
+            (value[:n, None], first[:n, None], last[:n, None]),
+            (value[n:, None], first[n:, None], last[n:, None]),
+        )
+    # The quadrature is good to 1e-4 of the peak.
+    count = math.ceil(longest_px(streak_px) / float(sigma_px.min(initial=1.0))) + 2
+    nodes, weights = (0.5 * values for values in np.polynomial.legendre.leggauss(count))
+    centre = place_px.T[:, :, None] + nodes * streak_px.T[:, :, None]
+    value, first, last = _profile(
+        centre, np.broadcast_to(sigma_px[:, None], centre.shape), width, second
+    )
+    weight = weights[:, None]
+    return (
+        (value[0] * weight, first[0] * weight, last[0] * weight),
+        (value[1], first[1], last[1]),
+    )
 
 
 def _whitened_rows(
@@ -377,27 +448,30 @@ def _whitened_rows(
     inverse (n, p) of that noise.
     """
     n, width, sigma_px = len(stamps), stamps.width, stamps.sigma_px
-    x, y, flux, level = parameters.T
-    value, first, second = _profile(
-        np.concatenate([x, y]), np.concatenate([sigma_px, sigma_px]), width, count == 7
+    flux, level = parameters[:, 2, None], parameters[:, 3]
+    (px, px1, px2), (py, py1, py2) = _profiles(
+        parameters[:, :2], sigma_px, stamps.streak_px, width, count == 7
     )
+    px1 = flux[:, None] * px1
     rows = np.empty((n, count + 1, width * width))
-    flux = flux[:, None]
-    # Columns are spread over the stamp first: products of long rows take a third of the time.
-    px, py = _in_each_row(value[:n]), value[n:].repeat(width, axis=1)
-    flux_px1 = _in_each_row(flux * first[:n])
-    py1 = first[n:].repeat(width, axis=1)
-    np.multiply(py, flux_px1, out=rows[:, 0])
-    np.multiply(py, px, out=rows[:, 2])
-    px *= flux
-    np.multiply(py1, px, out=rows[:, 1])
+    multiply: Callable[..., object] = np.multiply
+    # Profiles are spread over the stamp first: products of long rows take a third of the time.
+    by_row: Callable[[Floats], Floats] = _in_each_row
+    by_column: Callable[[Floats], Floats] = _in_each_column
+    if stamps.streak_px is not None:
+        multiply, by_row, by_column = _over_nodes, np.asarray, np.asarray
+    px, px1, py, py1 = by_row(px), by_row(px1), by_column(py), by_column(py1)
+    multiply(py, px1, out=rows[:, 0])
+    multiply(py, px, out=rows[:, 2])
+    px = px * (flux if px.ndim == 2 else flux[:, None])
+    multiply(py1, px, out=rows[:, 1])
     rows[:, 3] = 1.0
     if count == 7:
-        variance = sigma_px[:, None] ** 2
-        np.multiply(py, _in_each_row(0.5 * flux * variance * second[:n]), out=rows[:, 4])
-        np.multiply(px, (0.5 * variance * second[n:]).repeat(width, axis=1), out=rows[:, 5])
-        py1 *= variance
-        np.multiply(py1, flux_px1, out=rows[:, 6])
+        half_variance = 0.5 * sigma_px[:, None, None] ** 2
+        multiply(py, by_row(flux[:, None] * half_variance * px2), out=rows[:, 4])
+        multiply(by_column(half_variance * py2), px, out=rows[:, 5])
+        multiply(py1, px1, out=rows[:, 6])
+        rows[:, 6] *= 2.0 * half_variance[:, 0]
     residual = rows[:, count]
     np.multiply(rows[:, 2], -flux, out=residual)
     residual += stamps.flat_dn
@@ -412,12 +486,23 @@ def _whitened_rows(
     return rows, light, root_weight
 
 
+def _over_nodes(of_rows: Floats, of_columns: Floats, out: Floats) -> None:
+    """Write the light (n, w * w) of profiles (n, nodes, w) of rows and columns to ``out``."""
+    n, _, width = of_rows.shape
+    np.matmul(of_rows.transpose(0, 2, 1), of_columns, out=out.reshape(n, width, width))
+
+
 def _in_each_row(of_columns: Floats) -> Floats:
-    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
-    n, width = of_columns.shape
+    """Values (n, 1, w) of columns, spread over the pixels (n, w * w) of a stamp."""
+    n, _, width = of_columns.shape
     spread = np.empty((n, width, width))
-    spread[:] = of_columns[:, None, :]
+    spread[:] = of_columns
     return spread.reshape(n, width * width)
+
+
+def _in_each_column(of_rows: Floats) -> Floats:
+    """Values (n, 1, w) of rows, spread over the pixels (n, w * w) of a stamp."""
+    return of_rows[:, 0].repeat(of_rows.shape[2], axis=1)
 
 
 def _normal(rows: Floats) -> tuple[Floats, Floats]:

@@ -499,7 +499,7 @@ def test_a_star_with_a_cosmic_ray_through_it_is_refused() -> None:
 
 
 @both_methods
-def test_a_smeared_star_is_refused(options: CentroidOptions) -> None:
+def test_a_long_star_among_round_ones_is_refused(options: CentroidOptions) -> None:
     # Four exposures on a line of 4 px: sigma 1.8 px along it.
     line = np.array([[299.0, 200.0], [300.0, 200.4], [301.0, 200.8], [302.0, 201.2]])
     light = star_electrons(line, np.full(4, 2500.0), QUIET.psf_sigma_px, SHAPE)

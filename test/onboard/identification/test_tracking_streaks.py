@@ -1,0 +1,97 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Stars of a camera that turns during its exposures: measured, where they were at its middle."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from starcal_ground.simulation.rendering import render
+from starcal_ground.simulation.scenario import scenario, Scene, scene
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
+from starcal_ros.identification.tracking import start_tracking, track_stars
+from starcal_ros.records import StarObservations
+from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.stars.psf_field import Instrument
+
+SCENARIO = scenario('tiny', seed=8)
+FOCAL_PX = float(SCENARIO.truth.camera.parameters[0])
+CORNER_PX = 410.0
+SEARCH = StarSearch(load_catalog(None, 9.0))
+SHARP = np.zeros(3)
+LEAST = 0.45  # of the stars of a sharp image: streaks lie over each other and in their noise
+
+
+def turned(u_px: float, v_px: float, roll_px: float) -> np.ndarray:
+    """Turn, rad, that moves stars by pixels in the middle and, by roll, in the corners."""
+    return np.array([v_px / FOCAL_PX, u_px / FOCAL_PX, roll_px / CORNER_PX])
+
+
+def exposed(turn_rad: np.ndarray, index: int = 1) -> tuple[Scene, Exposure]:
+    moving = dataclasses.replace(SCENARIO, turn_rad=tuple(turn_rad.tolist()))
+    shown = scene(moving, index)
+    image = render(moving, shown, index)
+    return shown, Exposure(image, shown.icrf_from_star_tracker_xyzw, 0.5)
+
+
+@functools.cache
+def sharp() -> tuple[StarObservations, Instrument | None]:
+    return observe_stars(exposed(SHARP)[1], SCENARIO.prior, SEARCH)
+
+
+def errors_sigma(shown: Scene, observations: StarObservations) -> np.ndarray:
+    """Errors (n, 2) of the centroids by the places in the middle of the exposure."""
+    row = {star: k for k, star in enumerate(shown.catalog_id.tolist())}
+    true_px = shown.pixel_px[[row[star] for star in observations.catalog_id.tolist()]]
+    sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
+    return np.asarray((observations.measured_px - true_px) / sigma_px)
+
+
+@pytest.mark.parametrize(
+    'turn_rad',
+    [
+        turned(3.0, 0.0, 0.0),
+        turned(0.0, 6.0, 0.0),
+        turned(4.5, -4.5, 0.0),
+        turned(9.5, 0.0, 0.0),
+        turned(0.0, 0.0, 8.0),
+        turned(3.0, 3.0, 6.0),
+    ],
+    ids=['3 px', '6 px', 'diagonal', '9.5 px', 'roll', 'turn and roll'],
+)
+@pytest.mark.parametrize('tracked', [False, True])
+def test_streaks_are_measured_at_their_middle(turn_rad: np.ndarray, tracked: bool) -> None:
+    before, instrument = sharp()
+    shown, image = exposed(turn_rad)
+    if tracked:
+        track = start_tracking(SCENARIO.prior, before, instrument)
+        assert track is not None
+        # The track is sharp: it leaves the image to the search, as any other that it cannot fit.
+        with pytest.raises(ImageRefused, match='shape|match'):
+            track_stars(image, track, SEARCH)
+        return
+    observations, _ = observe_stars(image, SCENARIO.prior, SEARCH)
+    assert len(observations) > LEAST * len(before)
+    error = errors_sigma(shown, observations)
+    assert 0.85 < np.sqrt(np.mean(error**2)) < 1.15
+    # A bent path is no bias: the mean of some 100 stars is good to 0.1 sigma per axis.
+    assert np.abs(error.mean(axis=0)).max() < 0.35
+
+
+@pytest.mark.parametrize('length_px', [14.0, 25.0])
+def test_a_longer_streak_is_refused_with_its_length(length_px: float) -> None:
+    _, image = exposed(turned(length_px, 0.0, 0.0))
+    with pytest.raises(ImageRefused, match=r'streaks of \d+ px, up to 10') as refused:
+        observe_stars(image, SCENARIO.prior, SEARCH)
+    assert refused.value.reason == 'smeared'
+
+
+def test_sharp_images_stay_tracked() -> None:
+    track = start_tracking(SCENARIO.prior, *sharp())
+    assert track is not None
+    for index in (2, 3, 4):
+        _, track = track_stars(exposed(SHARP, index)[1], track, SEARCH)

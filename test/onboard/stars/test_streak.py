@@ -1,0 +1,57 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Light along a path, and the place of a star over an exposure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.stars.psf_fit import light_in_stamps, stamp_radius_px
+from starcal_ros.stars.streak import Streak
+
+CAMERA = CameraModel(
+    800, 640, np.array([500.0, 0.0, 500.0, 399.5, 319.5, -0.05, 0.01, 0.0, 0.0, 0.0])
+)
+PARTS = (np.arange(2000) + 0.5) / 2000 - 0.5
+
+
+@pytest.mark.parametrize('sigma_px', [0.5, 0.95, 2.0])
+@pytest.mark.parametrize('length_px', [2.0, 6.0, 10.0])
+@pytest.mark.parametrize('angle_rad', [0.0, 0.5, 2.0])
+def test_light_of_a_streak_is_the_mean_of_its_places(
+    sigma_px: float, length_px: float, angle_rad: float
+) -> None:
+    path_px = length_px * np.array([math.cos(angle_rad), math.sin(angle_rad)])
+    middle_px, width = np.array([0.2, -0.3]), 2 * stamp_radius_px(sigma_px, length_px) + 1
+    many = len(PARTS)
+    exact = light_in_stamps(
+        middle_px + PARTS[:, None] * path_px,
+        np.full(many, 1.0 / many),
+        np.full(many, sigma_px),
+        width,
+    ).sum(axis=0)
+    light = light_in_stamps(
+        middle_px[None], np.ones(1), np.array([sigma_px]), width, path_px[None]
+    )
+    # The quadrature has some nodes only, and fits are good to a hundredth of a pixel.
+    assert np.abs(light[0] - exact).max() < 1e-4 * exact.max()
+
+
+@pytest.mark.parametrize('turn_rad', [[0.0, 0.0, 0.03], [0.01, -0.015, 0.0], [0.005, 0.01, 0.02]])
+def test_the_mean_of_a_bent_path_is_known(turn_rad: list[float]) -> None:
+    turn = np.array(turn_rad)
+    middle_px = np.array([[40.0, 30.0], [760.0, 320.0], [399.5, 600.0], [399.5, 319.5]])
+    direction = line_of_sight(CAMERA, middle_px)
+    places_px = np.array(
+        [project(CAMERA, Rotation.from_rotvec(-part * turn).apply(direction)) for part in PARTS]
+    )
+    streak = Streak(CAMERA, turn)
+    bend_px = places_px.mean(axis=0) - middle_px
+    assert np.abs(streak.bend_px(middle_px) - bend_px).max() < 1e-3 * np.abs(bend_px).max() + 1e-6
+    # Straight to first order.
+    path_px = places_px[-1] - places_px[0]
+    assert np.abs(streak.at(middle_px) - path_px).max() < 0.03 * np.abs(path_px).max()
