@@ -20,6 +20,10 @@ from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
 
 _START_BYTES, _YAML_BYTES = 512, 2**18
+_YAML_FILES = (
+    (b'ros__parameters', 'parameters', '--params '),
+    (b'camera_matrix', 'a camera file', '--set camera_info_url='),
+)
 _OF_IMAGES = (
     ': starcal calibrate, inspect and diagnose take images alone; starcal import makes a bag of'
     ' image files and attitudes'
@@ -145,10 +149,11 @@ def _instead(file: Path, kind: FileKind) -> str:
     if kind.instead:
         return f' but {kind.name}: {kind.instead.replace("FILE", shlex.quote(str(file)))}'
     if kind is UNKNOWN and file.suffix in ('.yaml', '.yml'):
-        is_parameters = b'ros__parameters' in file.read_bytes()[:_YAML_BYTES]
-        option = '--params FILE' if is_parameters else '--set camera_info_url=FILE'
-        name = 'parameters' if is_parameters else 'a YAML file'
-        return f' but {name}: {option.replace("FILE", shlex.quote(str(file)))} takes it'
+        with regular_file(file) as opened:
+            content = opened.read(_YAML_BYTES)
+        for word, name, option in _YAML_FILES:
+            if word in content:
+                return f' but {name}: {option}{shlex.quote(str(file))} takes it'
     if kind not in (SQLITE_BAG, ROS_1_BAG):
         return ''
     # rosbags converts the folder with its metadata.yaml, not the file in it.

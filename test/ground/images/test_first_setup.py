@@ -179,7 +179,7 @@ STATED = f'--params {TINY}/params.yaml -o out'
 WRONG = [
     ('calibrate {bag}', ['-o/--output DIR: not given', '-o out']),
     ('calibrate params.yaml -o out', ['parameters: --params params.yaml takes it']),
-    ('calibrate camera.yaml -o out', ['YAML file: --set camera_info_url=camera.yaml']),
+    ('calibrate camera.yaml -o out', ['a camera file: --set camera_info_url=camera.yaml']),
     ('calibrate {bag} --params camera.yaml -o out',
      ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
     ('calibrate {bag} -o out --set camera_info_url=none.yaml',

@@ -276,10 +276,8 @@ def test_each_limit_of_a_change_trips_alone(
     # A change from the prior may be larger, as far as it is documented.
     more, factor = OF_THE_PRIOR.get(limit, (0.0, 1.0)) if active is None else (0.0, 1.0)
     value = (check.found - more) / factor
-    at_limit, beyond = (
-        dataclasses.replace(GateOptions(), **{limit: factor_of_it * value})  # type: ignore[arg-type]
-        for factor_of_it in (1 + 1e-12, 0.99)
-    )
+    limits: list[dict[str, Any]] = [{limit: value * (1 + 1e-12)}, {limit: 0.99 * value}]
+    at_limit, beyond = (GateOptions(**row) for row in limits)
     assert reasons(found, at_limit, active) == ()
     (reason,) = reasons(found, beyond, active)
     assert reason.startswith(check.name) and f'({limit})' in reason
