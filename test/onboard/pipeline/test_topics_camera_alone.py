@@ -120,6 +120,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
         (TF, ['PARAMS', '--camera-alone']),
     ],
 )
+@pytest.mark.slow
 def test_inspect_takes_images_without_attitudes_where_calibrate_does(
     kind: str, options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
