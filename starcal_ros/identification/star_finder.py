@@ -183,7 +183,7 @@ def measure_predicted(
     measured stars the observations have the refusal ``too_few_stars``.
 
     Raises ImageRefused ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses
-    contradict the catalog or the shapes the instrument.
+    contradict the catalog, or where stars are streaks that the instrument does not have.
     """
     catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
@@ -195,7 +195,11 @@ def measure_predicted(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
     if instrument is not None and shape_changed(measured, model):
-        raise ImageRefused('no_match', 'the stars have another shape than in the images before')
+        # The focus may drift from image to image: only streaks need the search.
+        sources = Sources(shown.xy_px[:count], np.nan_to_num(measured.snr), float(height * width))
+        pixels, camera = exposure.image.pixels, prediction.camera
+        if without_streaks(pixels, model.background, sources, camera)[1] is not None:
+            raise ImageRefused('no_match', 'the stars are streaks, in the images before not')
     # Faint stars are refused, but their light may pull the centroids of the others.
     faint = with_faint(measured, shown.xy_px)
     deeper = deeper_stars(
