@@ -229,7 +229,6 @@ def end():
     print('signals answered no more')
 rclpy.try_shutdown = end
 told_of(node_module, 'Executor')
-told_of(bag_player, 'Executor')
 node_module._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
 bag_player.BagPlayer.play = lambda player: os.kill(os.getpid(), signal.SIGTERM) or 0
 node = {'calibrator': calibrator, 'bag_player': bag_player}[sys.argv.pop(1)]
