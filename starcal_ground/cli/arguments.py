@@ -126,9 +126,10 @@ def add_inputs(command: argparse.ArgumentParser) -> None:
         'focal length of the lens, mm, with --pixel-size-um (default: from EXIF or FITS, else '
         'estimated)'
     )
-    command.add_argument('--focal-length-mm', type=float, default=0.0, metavar='MM', help=what)
+    positive = number(float, 1e-3, 1e6)
+    command.add_argument('--focal-length-mm', type=positive, default=0.0, metavar='MM', help=what)
     what = 'size of a pixel of the images, micrometres'
-    command.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
+    command.add_argument('--pixel-size-um', type=positive, default=0.0, metavar='UM', help=what)
     add_topics(command)
 
 
@@ -145,7 +146,7 @@ def given(args: argparse.Namespace, **options: object) -> Given:
         topics(args),
         values | settings,
         args.params,
-        tuple(settings),
+        tuple(dict(args.set)),
         args.camera_alone,
         lens,
     )

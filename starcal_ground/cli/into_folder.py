@@ -46,12 +46,12 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
 
 @contextlib.contextmanager
 def failure_recorded(
-    folder: Path, bags: Sequence[Path], kinds: tuple[type[StarcalError], ...]
+    folder: Path, bags: Sequence[Path], kind: type[StarcalError]
 ) -> Iterator[None]:
-    """Write an error of some kinds that ends the block to the folder as well."""
+    """Write an error of a kind that ends the block to the folder as well."""
     try:
         yield
-    except kinds as error:
+    except kind as error:
         outputs.make_folder(folder)
         look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
         raise type(error)(f'{error}{look}') from error
@@ -125,6 +125,8 @@ def _calibrated(
         made = campaign.calibrate(observed, inputs)
     except TooFewObservations as error:
         failure = _failure(str(error), observed)
+        if observed.source.through_air is not None:  # its bags are temporary
+            failure = dataclasses.replace(failure, inputs=tuple(inputs))
         look = _write_failure(folder, failure, album.unmatched)
         raise TooFewObservations(f'{failure.reason}{look}') from error
     made = with_images_to_reach(made)

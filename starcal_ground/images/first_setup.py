@@ -22,6 +22,7 @@ import numpy as np
 import yaml
 
 from starcal_ground.images import night_sky
+from starcal_ground.images.from_stars import FEWEST_IMAGES
 from starcal_ground.images.photographs import image_paths
 from starcal_ground.outputs import make_folder
 from starcal_ground.products import write_camera_info
@@ -49,6 +50,7 @@ from starcal_ros.pipeline.topics import (
     Topics,
     without_attitudes,
 )
+from starcal_ros.text import printable
 
 PARAMETER_FILE, CAMERA_FILE = 'params.yaml', 'camera.yaml'
 _LOOKED_AT = 20  # images, the first ones
@@ -106,7 +108,7 @@ class Given:
                 if self.states_camera
                 else '--focal-length-mm, --pixel-size-um: bags need both'
             )
-        with self._with_place():
+        with self.with_place():
             if self.is_by_stars or not self.states_camera:
                 frames = option_groups(self.options, NODE_OPTION_CLASSES)['frames']
                 setup = None
@@ -116,7 +118,8 @@ class Given:
         return setup, [*filter(None, [self.params]), *files_of(frames).values()]
 
     @contextlib.contextmanager
-    def _with_place(self) -> Iterator[None]:
+    def with_place(self) -> Iterator[None]:
+        """Name the file, or ``--set``, of an option that is an error in the block."""
         try:
             yield
         except OptionError as error:
@@ -163,7 +166,7 @@ class FirstSetup:
         values |= paths_from(self.given.options, Path.cwd())
         values['camera_info_url'] = CAMERA_FILE
         text = ''.join(f'{name}: {_in_a_line(value)}\n' for name, value in values.items())
-        found = ''.join(f'# {line}\n' for line in self.found)
+        found = ''.join(f'# {printable(line)}\n' for line in self.found)
         to_state = ''.join(f'# {name}: {what}\n' for name, what in self.assumed(topics))
         return f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
 
@@ -178,7 +181,7 @@ class FirstSetup:
             ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
             ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
             ('shutter', 'unknown, read out within 20 ms', has_tracker),
-            ('observer', 'space, in an orbit about the Earth' if has_tracker else 'by the stars',
+            ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
              not (has_velocity or self.setup.site.observer == 'ground'
                   or 'observer_velocity_m_s' in stated)),
         ]  # fmt: skip
@@ -208,16 +211,18 @@ def first_setup(
     """
     files = list(filter(None, [given.params]))
     if given.is_by_stars:
-        sky, images = night_sky.from_images(
-            given.paths, given.topics, given.options, bag_folder, given.lens, on_notes
-        )
+        with given.with_place():
+            sky, images = night_sky.from_images(
+                given.paths, given.topics, given.options, bag_folder, given.lens, on_notes
+            )
         read = (*images, *files)
         return FirstSetup(given, sky.bags, sky.topics, sky.setup, read, sky.notes, sky.through_air)
     read = (*reader.mcap_files(given.paths), *files)
     paths = tuple(given.paths)
     if stated is not None:
         return FirstSetup(given, paths, given.topics, stated, read)
-    setup, found = _of_attitudes(given, folder)
+    with given.with_place():
+        setup, found = _of_attitudes(given, folder)
     return FirstSetup(given, paths, given.topics, setup, read, found)
 
 
@@ -229,7 +234,10 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
             ' parameter file of these observations (--params)'
         )
     topic = choose_image_topic(given.paths, given.topics)
-    stars = night_sky.camera_of_bags(given.paths, topic, given.options, _LOOKED_AT, given.lens)
+    # The gate counts all images of the bags; these are the first ones.
+    least = min(int(str(given.options.get('min_images', FEWEST_IMAGES))), FEWEST_IMAGES)
+    few = {**given.options, 'min_images': least}
+    stars = night_sky.camera_of_bags(given.paths, topic, few, _LOOKED_AT, given.lens)
     make_folder(folder)
     write_camera_info(stars.camera, folder / CAMERA_FILE)
     options = {'lens_model': 'auto', **given.options}

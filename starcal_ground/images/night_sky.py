@@ -46,7 +46,7 @@ from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.identification.blind.images import FEWEST_SOURCES
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.diagnosis.bags import refusals
-from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, Setup
+from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, option_groups, Setup
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
@@ -115,6 +115,7 @@ def from_images(
     ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
     the stars give no camera.
     """
+    option_groups(values, NODE_OPTION_CLASSES)  # before a long search
     photographs = image_paths(paths)
     if not photographs:
         return from_bags(paths, topics, values, folder, lens), reader.mcap_files(paths)

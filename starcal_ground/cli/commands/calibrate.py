@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 import math
 from pathlib import Path
@@ -37,6 +37,7 @@ from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict, print_wrapped
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import NotFromStars, OptionError
+from starcal_ros.files import same_as_one_of
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -108,10 +109,16 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
     from starcal_ground.outputs import check_outputs, make_folder
+    from starcal_ros.assessment.requirements import requirements_of
 
+    requirements_of(args.require or ())
     given = arguments.given(args, **({'requirements': args.require} if args.require else {}))
     setup, files = given.checked()
+    named = tuple(files)
     files += given.photographs
+    folders = [path for path in given.paths if path.is_dir()]
+    if given.photographs and same_as_one_of(args.output, folders):
+        raise OptionError(f'{args.output}: holds the images; choose another folder (-o)')
     check_folder(args.output, [] if given.photographs else given.paths, files)
     if setup is None:  # a long search, whose result must have its place
         names = (first_setup.PARAMETER_FILE, first_setup.CAMERA_FILE)
@@ -123,8 +130,10 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
         if not args.quiet:
             arguments.print_notes(notes)
 
-    with failure_recorded(args.output, given.paths, (NotFromStars, OptionError)):
+    with failure_recorded(args.output, given.paths, NotFromStars):
         first = first_setup.first_setup(given, setup, args.output, bag_folder, note)
+    first = replace(first, files=tuple(dict.fromkeys((*first.files, *named))))
+    with failure_recorded(args.output, given.paths, OptionError):  # no alignment was found
         source = first.source()
     note(source.notes)
     if not given.states_camera:
