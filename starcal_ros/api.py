@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment import lookup
 from starcal_ros.assessment.gate import GateOptions
-from starcal_ros.assessment.lookup import Derivatives, sigma_arcsec
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera import project as project_in_camera
@@ -448,10 +448,13 @@ def line_of_sight_covariance(
     """
     camera, frame_from_camera = _in_frame(calibration, frame)
     pixels = np.asarray(pixels_px, np.float64)
-    derivatives = Derivatives.at(camera, pixels.reshape(-1, 2))
-    J = derivatives.J if frame == 'star_tracker' else derivatives.of_shape(camera)
-    covariance = derivatives.covariance_rad2(calibration.map_covariance, J)
-    turned = frame_from_camera @ covariance @ frame_from_camera.T
+    flat = pixels.reshape(-1, 2)
+    parts: list[Floats] = [np.empty((0, 3, 3))]
+    for k in range(0, len(flat), lookup.CHUNK):
+        derivatives = lookup.Derivatives.at(camera, flat[k : k + lookup.CHUNK])
+        J = derivatives.J if frame == 'star_tracker' else derivatives.of_shape(camera)
+        parts.append(derivatives.covariance_rad2(calibration.map_covariance, J))
+    turned = frame_from_camera @ np.concatenate(parts) @ frame_from_camera.T
     return turned.reshape(*pixels.shape[:-1], 3, 3)
 
 
@@ -473,7 +476,7 @@ def line_of_sight_sigma_arcsec(
     >>> bool(alone < 1.0 < pointing)
     True
     """
-    return sigma_arcsec(line_of_sight_covariance(calibration, pixels_px, frame))
+    return lookup.sigma_arcsec(line_of_sight_covariance(calibration, pixels_px, frame))
 
 
 def _in_frame(

@@ -152,7 +152,12 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
         meant = meant_node(name, nodes)
         if meant and meant not in named:
             raise OptionError(f'{path}: section {shown(name)} is not read: write /**/{meant}')
-    if cameras := _OF_CAMERAS & {*sections}:
+    of_nodes = {
+        name
+        for name, body in sections.items()
+        if isinstance(body, dict) and 'ros__parameters' in body
+    }
+    if cameras := (_OF_CAMERAS & {*sections}) - of_nodes:
         raise OptionError(
             f'{path}: a camera file ({min(cameras)}), not a parameter file: give it as'
             f' camera_info_url in one, or --set camera_info_url={path}'

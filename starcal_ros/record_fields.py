@@ -225,7 +225,9 @@ class Record:
 
 def _is_equal(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return np.array_equal(a, b, equal_nan=True)
+        return np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind in 'fc')
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_is_equal(a[key], b[key]) for key in a)
     if isinstance(a, (tuple, list)) and isinstance(b, (tuple, list)):
         return len(a) == len(b) and all(map(_is_equal, a, b))
     return bool(a == b) or (a != a and b != b)  # NaN alone differs from itself

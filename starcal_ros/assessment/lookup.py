@@ -13,7 +13,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.record_fields import Record
 from starcal_ros.records import MapCovariance
 
-_CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
+CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
 GRID = 25  # pixels a side over which calibrations are compared and common rotations taken
 
 
@@ -56,7 +56,7 @@ def line_of_sight_table(
     camera: CameraModel, covariance: MapCovariance, pixels: Floats
 ) -> LineOfSightTable:
     """Return the lines of sight of pixels (n, 2)."""
-    parts = [pixels[k : k + _CHUNK] for k in range(0, len(pixels), _CHUNK)]
+    parts = [pixels[k : k + CHUNK] for k in range(0, len(pixels), CHUNK)]
     found = [_table(camera, covariance, part) for part in parts]
     return LineOfSightTable(
         pixels, *(np.concatenate(column) for column in zip(*found, strict=True))

@@ -131,7 +131,8 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             prior2 = min(1.0 / layout.prior_precision[k], entry.usual**2)
             apart2 = prior2 + variance * total[k] / working[k]
             if not is_clear and math.isinf(entry.usual):
-                apart2 = max(apart2, (off / _CLEAR_SIGMA) ** 2)
+                # Below the default limit by more than rounding.
+                apart2 = max(apart2, (off / (0.99 * _CLEAR_SIGMA)) ** 2)
             prior = float(problem.prior_parameters[k - camera[0]]) if k in camera else 0.0
             name, unit = layout.labels[k], 1.0
             head = (k - first) // 3 + 1

@@ -165,8 +165,8 @@ def _sigma_with(
     held = np.setdiff1d(first + np.flatnonzero(np.isfinite(problem.prior_sigma)), kept)
     by_held = covariance @ whole[np.ix_(kept, held)] * problem.prior_sigma[held - first]
     variance = np.diag(covariance) + (by_held**2).sum(axis=1)
-    if options.method != 'single':  # which takes star trackers as exact
-        here = np.flatnonzero(problem.star_tracker == 0)
+    here = np.flatnonzero(problem.star_tracker == 0)
+    if options.method != 'single' and len(here):  # 'single' takes star trackers as exact
         stamps_ns = np.array([ensemble.images[k].time_ns for k in here], np.int64)
         slow_rad = expected_slow_of_mean(
             correlations_of(stamps_ns, state.camera_from_icrf[here]),

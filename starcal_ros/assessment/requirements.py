@@ -98,6 +98,8 @@ class Requirement:
         maps, scale = calibration.maps, 1.0 if self.unit != 'arcsec' else ARCSECOND_RAD
         if maps is None:
             raise ValueError('calibration: the gate needs its detector maps')
+        if self.quantity == POINTING and not calibration.has_alignment:
+            return math.nan
         if self.quantity == POINTING:
             budget = calibration.sigma_budget
             return next((p.pointing_arcsec for p in budget if p.cause == TOTAL), math.nan)
@@ -117,7 +119,7 @@ class Requirement:
         names = ('fx', 'fy') if self.quantity == FOCAL else (self.quantity,)
         sigma = dict(zip(calibration.parameter_names, calibration.sigma, strict=True))
         # One that is held has no sigma of its own.
-        return max(float(sigma.get(name, 0.0)) or math.nan for name in names) / scale
+        return float(np.max([sigma.get(name, 0.0) or math.nan for name in names])) / scale
 
     def _over(self, sigma: Floats) -> float:
         """Upper limit of a sigma over the share; NaN where it has none."""

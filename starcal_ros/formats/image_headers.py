@@ -53,6 +53,9 @@ def jpeg_header(content: bytes) -> Header | None:
             mark, code, length = struct.unpack_from('>BBH', content, at)
             if mark != 0xFF:
                 break
+            if code == 0xFF:  # a byte of fill
+                at += 1
+                continue
             if 0xC0 <= code <= 0xCF and code not in (0xC4, 0xC8, 0xCC):  # tables, not a frame
                 height, width, channels = struct.unpack_from('>HHB', content, at + 5)
                 return Header(width, height, channels)

@@ -196,7 +196,9 @@ def measure_predicted(
     )
     if instrument is not None and shape_changed(measured, model):
         # The focus may drift from image to image: only streaks need the search.
-        sources = Sources(shown.xy_px[:count], np.nan_to_num(measured.snr), float(height * width))
+        snr = np.nan_to_num(measured.snr)
+        order = np.argsort(-snr, kind='stable')
+        sources = Sources(shown.xy_px[:count][order], snr[order], float(height * width))
         pixels, camera = exposure.image.pixels, prediction.camera
         if without_streaks(pixels, model.background, sources, camera)[1] is not None:
             raise ImageRefused('no_match', 'the stars are streaks, in the images before not')

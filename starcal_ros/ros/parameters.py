@@ -103,7 +103,10 @@ def folders_of_paths(arguments: Sequence[str], node: str) -> dict[tuple[str, obj
                 folders |= {
                     (name, value): Path(file).absolute().parent
                     for name, value in values.items()
-                    if isinstance(value, str) and paths[name] != value
+                    # Launch files may write parameters to a temporary file of their own.
+                    if isinstance(value, str)
+                    and paths[name] != value
+                    and Path(str(paths[name])).exists()
                 }
     return folders
 

@@ -191,7 +191,8 @@ class CalibratorState:
             if self._ensemble is not ensemble:  # emptied meanwhile: start with this image
                 grown = solving.add_to_ensemble(Ensemble(), observations, self._setup)
             self._ensemble = grown
-            self._details[counted_refusal(observations.refusal)] = observations.detail
+            if observations.refusal:
+                self._details[counted_refusal(observations.refusal)] = observations.detail
         self.save()
 
     def reset(self) -> Answer:
@@ -199,6 +200,7 @@ class CalibratorState:
         with self._records:
             images = len(self._ensemble.images)
             self._ensemble = Ensemble()
+            self._details.clear()
         self.save()
         return self._answer(f'{images} images dropped; the active calibration stays')
 

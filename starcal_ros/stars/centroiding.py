@@ -258,11 +258,12 @@ def _without_neighbours(
     streak_px = psf_fit.longest_px(stamps.streak_px)
     blurred = blurred_px(sigma_px, streak_px)
     snr = expected_snr(flux, blurred, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
-    in_place = np.abs(parameters[:, :2]).max(axis=1) < _IN_PLACE_PX
+    widest_px = float(sigma_px.max(initial=0.0))
+    in_place_px = _IN_PLACE_PX + math.hypot(widest_px, streak_px / math.sqrt(12.0)) - widest_px
+    in_place = np.abs(parameters[:, :2]).max(axis=1) < in_place_px
     modelled = usable & (snr > _MODELLED_SNR) & in_place
     if len(stamps) < 2:
         return stamps, parameters, modelled
-    widest_px = float(sigma_px.max())
     # The wing of a star outside the stamp adds light to it.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px + 0.5 * streak_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')

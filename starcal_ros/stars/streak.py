@@ -186,7 +186,8 @@ def refined(
 
     Robust Gauss-Newton: companions and cosmic rays change the moments of some sources.
     """
-    J = rotation_jacobian(streak.camera, line_of_sight(streak.camera, xy_px))
+    # A source without a line of sight is an outlier.
+    J = np.nan_to_num(rotation_jacobian(streak.camera, line_of_sight(streak.camera, xy_px)))
     turn = streak.turn_rad
     unit = 1.0 / float(streak.camera.parameters[0])
 

@@ -175,6 +175,8 @@ somebody_else:
   ros__parameters: {a: 9, e: 9}
 /space/observer:
   ros__parameters: {a: 9}
+cam0:
+  ros__parameters: {exposure: 3}
 """,
     )
     values = read_parameter_file(path, ('observer', 'calibrator'))

@@ -142,6 +142,8 @@ COMPARED = {
     'part': ({'parts': (np.ones(2), 3)}, False),
     'value': ({'value': 1.0}, False),
     'text': ({'name': 'two'}, False),
+    'mapping': ({'parts': ({'a': np.zeros(2)},)}, False),
+    'words': ({'numbers': np.array(['a', 'b'])}, False),
 }
 
 

@@ -108,6 +108,12 @@ def test_twice_the_images_have_half_the_variance() -> None:
     np.testing.assert_allclose(two * np.sqrt(2), one, rtol=1e-9)
 
 
+def test_a_first_star_tracker_without_images_leaves_the_camera_known() -> None:
+    images = tuple(dataclasses.replace(one, star_tracker='second') for one in ensemble().images)
+    sigma = predicted_sigma(Ensemble(images), PRIOR, OPTIONS)
+    assert np.isfinite(sigma[:-3]).all()
+
+
 def test_what_cannot_be_known_is_infinite() -> None:
     assert np.isinf(predicted_sigma(Ensemble(), PRIOR, OPTIONS)).all()
     first = ensemble().images[0]

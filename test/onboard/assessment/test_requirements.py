@@ -68,6 +68,15 @@ def test_the_camera_alone_has_its_own_lines_of_sight() -> None:
     alone = dataclasses.replace(FOUND, parent_frame='')
     assert not alone.has_alignment
     assert Requirement.of('line_of_sight=5arcsec').sigma(alone) == 0.9
+    assert np.isnan(Requirement.of('pointing=5arcsec').sigma(alone))
+
+
+@pytest.mark.parametrize('held', [0, 2])
+def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
+    covariance = FOUND.covariance.copy()
+    covariance[held, held] = 0.0
+    one_held = dataclasses.replace(FOUND, covariance=covariance)
+    assert np.isnan(Requirement.of('f=1px').sigma(one_held))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.stars.psf_fit import light_in_stamps, stamp_radius_px
-from starcal_ros.stars.streak import Streak
+from starcal_ros.stars.streak import refined, Streak
 
 CAMERA = CameraModel(
     800, 640, np.array([500.0, 0.0, 500.0, 399.5, 319.5, -0.05, 0.01, 0.0, 0.0, 0.0])
@@ -55,3 +55,16 @@ def test_the_mean_of_a_bent_path_is_known(turn_rad: list[float]) -> None:
     # Straight to first order.
     path_px = places_px[-1] - places_px[0]
     assert np.abs(streak.at(middle_px) - path_px).max() < 0.03 * np.abs(path_px).max()
+
+
+def test_a_source_without_a_line_of_sight_hides_no_turn() -> None:
+    """The corners of a lens that folds are seen by no pixel, but hot pixels shine there."""
+    parameters = np.array([700.0, 0.0, 700.0, 499.5, 499.5, -0.35, 0.0, 0.0, 0.0, 0.0])
+    streak = Streak(CameraModel(1000, 1000, parameters), np.array([0.006, 0.004, 0.0]))
+    rng = np.random.default_rng(1)
+    xy_px = np.concatenate([rng.uniform(300.0, 700.0, (30, 2)), [[2.0, 2.0]]])
+    moments_px2 = streak.moments_px2(xy_px) + np.array([1.0, 1.0, 0.0])
+    start = Streak(streak.camera, 0.8 * streak.turn_rad)
+    turn, variance_px2, _ = refined(start, 1.0, xy_px, moments_px2)
+    np.testing.assert_allclose(turn.turn_rad[:2], streak.turn_rad[:2], rtol=0.01)
+    assert abs(variance_px2 - 1.0) < 0.01

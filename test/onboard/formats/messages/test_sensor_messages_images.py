@@ -19,6 +19,7 @@ from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 from starcal_ground.bag_writer import image_to_message
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.image_headers import jpeg_header
 from starcal_ros.formats.messages.message_codec import make_header
 from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
@@ -201,3 +202,11 @@ def test_image_round_trip(make: Any, dtype: Any) -> None:
     assert back.time_ns == TIME_NS - 25_000_000
     assert back.pixels.dtype == dtype
     np.testing.assert_array_equal(back.pixels, image.pixels)
+
+
+def test_bytes_of_fill_hide_no_frame_of_a_jpeg() -> None:
+    """ITU T.81, B.1.1.2: any number of them may come before a marker."""
+    content = cv2.imencode('.jpg', np.zeros((12, 20), np.uint8))[1].tobytes()
+    at = content.index(b'\xff\xc0')
+    padded = content[:at] + b'\xff\xff' + content[at:]
+    assert jpeg_header(padded) == jpeg_header(content) == (20, 12, 1)
