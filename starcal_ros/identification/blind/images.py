@@ -27,6 +27,7 @@ from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.stars.streak import LONGEST_PX
 
 _IMAGES = 8  # identified: more would not change an answer
 _SEARCHED = 12  # at most
@@ -35,6 +36,7 @@ LOOKED_AT = 40  # at most, those without sources included
 _OTHER_SCALES = (0.55, 1.8, 0.3, 3.3)
 _FEW = 3  # identified, with which no image is searched further
 FEWEST_SOURCES = 6
+_BLURRED_ENDS_PX = 1.0  # by which the sources of a streak are longer than it
 _SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
 _MISFIT_PX = 3.0  # of a star whose identification is left out of a rotation
 
@@ -172,8 +174,9 @@ def identify_images(
                 break
             continue
         looked_at.append(bright.sources)
-        # The pattern of streaks is none of points.
-        if len(bright.sources.xy_px) >= FEWEST_SOURCES and smear(bright.sources) is None:
+        streak = smear(bright.sources)
+        is_measured = streak is None or streak[0] < LONGEST_PX + _BLURRED_ENDS_PX
+        if len(bright.sources.xy_px) >= FEWEST_SOURCES and is_measured:
             searched += 1
             rankings = [bright.sources.xy_px]
             sky = finder.guess(rankings, guesses(bright.time_ns))

@@ -119,6 +119,21 @@ def test_attitudes_that_do_not_fit_are_diagnosed(
 
 
 @pytest.mark.slow
+def test_streaks_that_are_measured_are_identified_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twice as long as wide, but their middles make the patterns of points."""
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    assert main(['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8']) == 0
+    capsys.readouterr()
+    assert main(['calibrate', str(bag), '-o', str(out), '--no-report']) == 0
+    assert '10 of 10 images identified by their stars' in capsys.readouterr().err
+    calibration = read_calibration(out / 'calibration.json')
+    truth = json.loads((bag / 'truth.json').read_text())['k_true'][0]
+    assert abs(calibration.geometry.camera.parameters[0] - truth) < 4 * calibration.sigma[0]
+
+
+@pytest.mark.slow
 def test_photographs_of_which_nothing_is_stated(
     tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
 ) -> None:
