@@ -103,10 +103,10 @@ def folders_of_paths(arguments: Sequence[str], node: str) -> dict[tuple[str, obj
                 folders |= {
                     (name, value): Path(file).absolute().parent
                     for name, value in values.items()
-                    # Launch files may write parameters to a temporary file of their own.
+                    # A launch file writes its parameters to a temporary file of its own.
                     if isinstance(value, str)
                     and paths[name] != value
-                    and Path(str(paths[name])).exists()
+                    and (Path(str(paths[name])).exists() or not Path(value).exists())
                 }
     return folders
 
