@@ -203,7 +203,7 @@ WRONG = [
     ('calibrate {bag} -o out --set observer=ground', ['observer: ground needs the site']),
     ('calibrate {bag} -o out --set obsrver=ground', ['--set obsrver', 'did you mean observer?']),
     ('calibrate {bag} -o out --set observer', ['--set', 'not of the form NAME=VALUE']),
-    ('calibrate {bag} -o out --require line=5arcsec', ['--set requirements: line is not']),
+    ('calibrate {bag} -o out --require line=5arcsec', ['requirements: line is not']),
     ('calibrate {bag} -o out --require map=5', ['the sigma of map is in arcsec or px']),
     ('calibrate {bag} -o out --focal-length-mm 50', ['--pixel-size-um: bags need both']),
     ('calibrate {bag} {stated} --focal-length-mm 50', ['a camera_info_url has them already']),
