@@ -48,6 +48,7 @@ from starcal_ros.text import printable
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
 
+_END_S = 30  # for the middleware to let a node go; on busy cores it takes a second
 _ANSWERED_S = 1.0  # after a signal, by which the thread of rclpy has shut ROS down
 _told: list[float] = []  # times of the signals
 _SILENT_S = 5.0
@@ -448,12 +449,17 @@ def shut_down() -> None:
 
 
 def end_quietly(node: Node | None) -> None:
-    """Destroy a node and leave ROS; a second signal does not interrupt it."""
+    """Destroy a node and leave ROS; a second signal does not interrupt it, and it ends in time."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    # The middleware may wait for a thread of its own for ever, with the lock of the interpreter
+    # held, so that only the default action of a signal ends the process.
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(_END_S)
     if node is not None:
         node.destroy_node()
     shut_down()
+    signal.alarm(0)
 
 
 def _end(node: StarcalNode | None, executor: Executor | None) -> None:

@@ -210,6 +210,26 @@ def test_a_signal_leaves_no_lock_taken(argument: str, said: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, said, '')
 
 
+NEVER_LET_GO = """
+import ctypes
+import rclpy
+from starcal_ros.ros import node
+
+class Held:
+    def destroy_node(self):
+        ctypes.PyDLL(None).sleep(60)  # keeps the lock of the interpreter, as the middleware does
+
+node._END_S = 1
+rclpy.init()
+node.end_quietly(Held())
+"""
+
+
+def test_a_node_that_the_middleware_never_lets_go_ends() -> None:
+    done = subprocess.run([sys.executable, '-c', NEVER_LET_GO], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGALRM, '')
+
+
 EXECUTOR_OF_A_NODE = """
 import os, signal, sys
 import rclpy
