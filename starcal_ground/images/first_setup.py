@@ -235,8 +235,8 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
         )
     topic = choose_image_topic(given.paths, given.topics)
     # The gate counts all images of the bags; these are the first ones.
-    least = min(int(str(given.options.get('min_images', FEWEST_IMAGES))), FEWEST_IMAGES)
-    few = {**given.options, 'min_images': least}
+    stated = option_groups(given.options, NODE_OPTION_CLASSES)['calibration'].min_images
+    few = {**given.options, 'min_images': min(stated, FEWEST_IMAGES)}
     stars = night_sky.camera_of_bags(given.paths, topic, few, _LOOKED_AT, given.lens)
     make_folder(folder)
     write_camera_info(stars.camera, folder / CAMERA_FILE)

@@ -39,7 +39,6 @@ from starcal_ground.images.photographs import (
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import NotFromStars
-from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -284,7 +283,7 @@ def _found(
         hint = read_camera_info(url)
     path = str(values.get('catalog', ''))
     catalog = load_catalog(Path(path) if path else None)
-    least = int(str(values.get('min_images', CalibrationOptions().min_images)))
+    least = option_groups(values, NODE_OPTION_CLASSES)['calibration'].min_images
     return from_stars(images, catalog, hint, least)
 
 

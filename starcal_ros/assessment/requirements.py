@@ -98,16 +98,14 @@ class Requirement:
         maps, scale = calibration.maps, 1.0 if self.unit != 'arcsec' else ARCSECOND_RAD
         if maps is None:
             raise ValueError('calibration: the gate needs its detector maps')
-        if self.quantity == POINTING and not calibration.has_alignment:
-            return math.nan
         if self.quantity == POINTING:
-            budget = calibration.sigma_budget
+            budget = calibration.sigma_budget if calibration.has_alignment else ()
             return next((p.pointing_arcsec for p in budget if p.cause == TOTAL), math.nan)
         if self.quantity == LINE_OF_SIGHT:
             # Without an alignment the common rotation has no meaning.
             aligned = calibration.has_alignment
-            return self._over(maps.line_of_sight_sigma_arcsec if aligned else
-                              maps.shape_sigma_arcsec)  # fmt: skip
+            full = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
+            return self._over(full)
         if self.quantity == MAP and self.unit == 'arcsec':
             return self._over(maps.shape_sigma_arcsec)
         if self.quantity == MAP:

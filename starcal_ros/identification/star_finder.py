@@ -195,13 +195,8 @@ def measure_predicted(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
     if instrument is not None and shape_changed(measured, model):
-        # The focus may drift from image to image: only streaks need the search.
-        snr = np.nan_to_num(measured.snr)
-        order = np.argsort(-snr, kind='stable')
-        sources = Sources(shown.xy_px[:count][order], snr[order], float(height * width))
-        pixels, camera = exposure.image.pixels, prediction.camera
-        if without_streaks(pixels, model.background, sources, camera)[1] is not None:
-            raise ImageRefused('no_match', 'the stars are streaks, in the images before not')
+        looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
+        _refuse_streaks(exposure.image, looked_at, measured, model)
     # Faint stars are refused, but their light may pull the centroids of the others.
     faint = with_faint(measured, shown.xy_px)
     deeper = deeper_stars(
@@ -246,6 +241,18 @@ def measure_predicted(
     )
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
+
+
+def _refuse_streaks(
+    image: Image, shown: Prediction, measured: Centroids, model: ImageModel
+) -> None:
+    """Leave streaks to the search; the focus may drift from image to image without."""
+    snr = np.nan_to_num(measured.snr)
+    order = np.argsort(-snr, kind='stable')
+    sources = Sources(shown.xy_px[order], snr[order], float(image.pixels.size))
+    _, streak = without_streaks(image.pixels, model.background, sources, shown.camera)
+    if streak is not None:
+        raise ImageRefused('no_match', 'the stars are streaks, in the images before not')
 
 
 def _observations(

@@ -8,18 +8,21 @@ are the only description of a record: `record_fields` reads and writes JSON and 
 
 from starcal_ros.records.calibration import (
     ALIGNMENT_NAMES,
-    Amplitude,
-    BUDGET_COLUMNS,
-    BUDGET_ROWS,
     Calibration,
     CameraGeometry,
     check_calibration,
     check_drawable,
     Correlation,
     DetectorMaps,
+    GateCheck,
+    TemperatureTerms,
+)
+from starcal_ros.records.calibration_parts import (
+    Amplitude,
+    BUDGET_COLUMNS,
+    BUDGET_ROWS,
     DetectorStep,
     factored_field,
-    GateCheck,
     HeldTerm,
     MapCovariance,
     ModelChecks,
@@ -29,7 +32,6 @@ from starcal_ros.records.calibration import (
     SigmaPart,
     StarTrackerAlignment,
     Statement,
-    TemperatureTerms,
     TOTAL,
 )
 from starcal_ros.records.observations import (

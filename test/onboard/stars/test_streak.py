@@ -66,5 +66,6 @@ def test_a_source_without_a_line_of_sight_hides_no_turn() -> None:
     moments_px2 = streak.moments_px2(xy_px) + np.array([1.0, 1.0, 0.0])
     start = Streak(streak.camera, 0.8 * streak.turn_rad)
     turn, variance_px2, _ = refined(start, 1.0, xy_px, moments_px2)
+    # Without noise: what is left is the last step of the fit, and the pull of the outlier.
     np.testing.assert_allclose(turn.turn_rad[:2], streak.turn_rad[:2], rtol=0.01)
     assert abs(variance_px2 - 1.0) < 0.01
