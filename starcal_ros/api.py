@@ -31,7 +31,7 @@ from starcal_ros.formats.products.product_files import calibration_file
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.setup import load_setup, read_setup, read_values
+from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, read_values
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import Topics, without_attitudes
 from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
@@ -288,10 +288,12 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
-    inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
     if without_attitudes(paths, requested, read_values(Path(params))):
         raise OptionError(f'{paths[0]}: no attitudes; starcal_ground.calibrate_images needs none')
-    return calibrate_bags(paths, read_setup(Path(params)), requested, inputs).calibration
+    setup = read_setup(Path(params))
+    named = files_of(setup.frames).values()
+    inputs = inputs_of((*reader.mcap_files(paths), Path(params), *named))
+    return calibrate_bags(paths, setup, requested, inputs).calibration
 
 
 def read_calibration(path: Path | str) -> Calibration:
