@@ -16,9 +16,8 @@ from sample_records import calibration  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import Activation, Ensemble, StarObservations
 from starcal_ros.ros.archive import Archive
-from starcal_ros.ros.state import Activation
 
 
 @functools.cache

@@ -7,6 +7,7 @@ are the only description of a record: `record_fields` reads and writes JSON and 
 """
 
 from starcal_ros.records.calibration import (
+    Activation,
     ALIGNMENT_NAMES,
     Calibration,
     CameraGeometry,

@@ -397,6 +397,20 @@ class Calibration(Record):
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
+@dataclass(frozen=True)
+class Activation:
+    """
+    A calibration was activated, for the first time or by a roll-back.
+
+    ``event`` counts activations; ``before`` is the event that a roll-back of this one returns to,
+    0 for none.  The calibration is active until the next event.
+    """
+
+    event: int
+    before: int
+    calibration: Calibration
+
+
 _MOST = 1e15  # largest camera parameter: its cube must be finite
 _UNIT_TOLERANCE = 1e-6  # rounded decimals change the norm of a quaternion by less
 

@@ -48,8 +48,13 @@ from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CA
 from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import Count, json_object, read_record
-from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
-from starcal_ros.ros.state import Activation
+from starcal_ros.records import (
+    Activation,
+    Calibration,
+    counted_refusal,
+    Ensemble,
+    StarObservations,
+)
 from starcal_ros.untrusted import json_value, read_bytes
 
 ARCHIVE_SCHEMA = 1

@@ -25,6 +25,7 @@ from starcal_ros.errors import (
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup
 from starcal_ros.records import (
+    Activation,
     Calibration,
     counted_refusal,
     Ensemble,
@@ -37,20 +38,6 @@ if TYPE_CHECKING:
     from starcal_ros.ros.archive import Archive
 
 _HISTORY = 20  # activations kept for roll-back, under 1 MB each
-
-
-@dataclass(frozen=True)
-class Activation:
-    """
-    A calibration was activated, for the first time or by a roll-back.
-
-    ``event`` counts activations; ``before`` is the event that a roll-back of this one returns to,
-    0 for none.  The calibration is active until the next event.
-    """
-
-    event: int
-    before: int
-    calibration: Calibration
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,8 @@ from sample_records import assert_same  # type: ignore[import-not-found]
 
 from starcal_ros.errors import ArchiveError
 from starcal_ros.formats.bag import reader as bag_reader
-from starcal_ros.records import Ensemble
+from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive, Seal, TOPIC
-from starcal_ros.ros.state import Activation
 
 
 def numbers(history: tuple[Activation, ...]) -> list[tuple[int, int]]:

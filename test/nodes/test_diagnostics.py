@@ -30,10 +30,9 @@ from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.record_messages import observations_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
-from starcal_ros.records import Ensemble, IMAGE_REFUSALS
+from starcal_ros.records import Activation, Ensemble, IMAGE_REFUSALS
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.node import make_message
-from starcal_ros.ros.state import Activation
 
 pytestmark = pytest.mark.nodes
 

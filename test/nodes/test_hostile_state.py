@@ -30,9 +30,9 @@ import pytest
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline.setup import CalibratorOptions
-from starcal_ros.records import Ensemble
+from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive, CHECKSUMS, Seal
-from starcal_ros.ros.state import Activation, CalibratorState
+from starcal_ros.ros.state import CalibratorState
 
 pytestmark = pytest.mark.slow
 

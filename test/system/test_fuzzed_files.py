@@ -40,9 +40,8 @@ from starcal_ros.formats.products.product_files import (
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, NODES
-from starcal_ros.records import Calibration, Ensemble, Image
+from starcal_ros.records import Activation, Calibration, Ensemble, Image
 from starcal_ros.ros.archive import Archive
-from starcal_ros.ros.state import Activation
 
 SCENARIO = scenario('tiny')
 BAG = Path(__file__).parents[2] / 'bags' / 'tiny'

@@ -29,9 +29,8 @@ from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
-from starcal_ros.records import Ensemble
+from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive
-from starcal_ros.ros.state import Activation
 
 pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes of 2 s and more
 

@@ -31,9 +31,8 @@ from starcal_ros.formats.products.product_files import (
     write_calibration,
 )
 from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Ensemble
+from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive
-from starcal_ros.ros.state import Activation
 from starcal_ros.text import significant
 
 FIGURES = (
