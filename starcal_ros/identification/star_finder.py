@@ -232,12 +232,13 @@ def measure_predicted(
     observations = _observations(exposure, shown, catalog, centroids, model)
     if observations.refusal or measured.fit is None:
         return observations, instrument
+    fitted = measured.fitted
     stars = MeasuredStars(
-        centroids.xy_px[:count],
+        centroids.xy_px[fitted],
         measured.fit,
-        measured.psf_sigma_px,
-        measured.noise_dn,
-        ((refusal == StarRefusal.NONE) & alone)[:count],
+        measured.psf_sigma_px[fitted],
+        measured.noise_dn[fitted],
+        ((refusal == StarRefusal.NONE) & alone)[fitted],
     )
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))

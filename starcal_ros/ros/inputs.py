@@ -21,6 +21,8 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 
+from starcal_ros.formats.messages.message_codec import RawMessage
+
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Profile of a topic whose last message also reaches later subscribers."""
 
@@ -40,6 +42,7 @@ class _Input:
     adapts: bool
     group: CallbackGroup
     override: QoSOverridingOptions | None
+    raw: bool
     kind: Any = None
     subscription: Any = None
     lost: int = 0
@@ -70,17 +73,20 @@ class Inputs:
         qos: QoSProfile,
         *,
         adapts: bool = False,
+        raw: bool = False,
         group: CallbackGroup | None = None,
     ) -> None:
         """
         Subscribe to a topic, whose publishers may send any one of some types of message.
 
-        With ``adapts`` its reliability may fall to best effort.
+        With ``adapts`` its reliability may fall to best effort.  With ``raw`` the callback gets a
+        `RawMessage`, also of bytes that are none of a message and that rclpy would drop.
         """
         group = group or MutuallyExclusiveCallbackGroup()
         name = self._node.resolve_topic_name(topic)
         override = _reliability_override(self._node, name) if adapts else None
-        entry = _Input(kinds, topic, name, callback, qos, adapts and not override, group, override)
+        adapts = adapts and not override
+        entry = _Input(kinds, topic, name, callback, qos, adapts, group, override, raw)
         with self._lock:
             entry.kind = _kind_of(entry, self._node.get_publishers_info_by_topic(name))
             self._subscribe(entry)
@@ -148,13 +154,20 @@ class Inputs:
         def count(event: Any) -> None:
             entry.lost += event.total_count_change
 
+        received = _type_name(entry.kind)
+
+        def take(data: bytes) -> None:
+            now_ns = self._node.get_clock().now().nanoseconds
+            entry.callback(RawMessage(entry.name, received, '', now_ns, memoryview(data)))
+
         entry.subscription = self._node.create_subscription(
             entry.kind,
             entry.topic,
-            entry.callback,
+            take if entry.raw else entry.callback,
             entry.qos,
             callback_group=entry.group,
             qos_overriding_options=entry.override,
+            raw=entry.raw,
             # rclpy's own event callback warns of the name before remapping.
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda _event: None, message_lost=count

@@ -26,7 +26,12 @@ from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import sensor_messages
-from starcal_ros.formats.messages.message_codec import nearest_stamp_ns, offset_ns, stamp_ns
+from starcal_ros.formats.messages.message_codec import (
+    nearest_stamp_ns,
+    offset_ns,
+    RawMessage,
+    stamp_ns,
+)
 from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     camera_info_to_message,
@@ -34,8 +39,9 @@ from starcal_ros.formats.messages.record_messages import (
 )
 from starcal_ros.formats.messages.sensor_messages import (
     color_image_to_message,
-    image_from_message,
+    image_of,
     latest_at,
+    view_image,
 )
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
@@ -56,6 +62,7 @@ from starcal_ros.sky.attitude import attitude_sample
 
 NAME = 'star_observer'
 _ATTITUDES = (QuaternionStamped, PoseStamped, TransformStamped, Imu)
+_IMAGE_TYPES = (ImageMessage, CompressedImage)
 _IMAGES = 20  # that wait with their pixels: 200 MB of 5 megapixels and 16 bit
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
@@ -129,19 +136,19 @@ class StarObserver(StarcalNode):
         )
         self._worker = threading.Thread(target=self._measure_all, name='measure')
         self._worker.start()
-        images = QoSProfile(depth=_IMAGES)
         for kinds, topic, callback, qos, adapts in (
             ((CalibrationMessage,), 'calibration', self._on_calibration, LATCHED, False),
             ((TwistStamped,), 'velocity', self._on_velocity, _SAMPLES, True),
             ((Temperature,), 'temperature', self._on_temperature, _SAMPLES, True),
             (_ATTITUDES, 'attitude', self._on_attitude, _SAMPLES, True),
-            ((ImageMessage, CompressedImage), 'image', self._on_image, images, True),
         ):
             self.inputs.add(kinds, topic, self.taking(callback), qos, adapts=adapts)
         for which, mounting in enumerate(self._setup.mountings, 1):
             callback = functools.partial(self._add_attitude, which)
             topic = f'{mounting.frame}/attitude'
             self.inputs.add(_ATTITUDES, topic, self.taking(callback), _SAMPLES, adapts=True)
+        take, depth = self.taking(self._on_image), QoSProfile(depth=_IMAGES)
+        self.inputs.add(_IMAGE_TYPES, 'image', take, depth, adapts=True, raw=True)
 
     def deactivate(self) -> None:
         """Close the inputs and drop the images in the queue."""
@@ -209,13 +216,18 @@ class StarObserver(StarcalNode):
         }
         return [self.resolve_topic_name(topic) for topic, count in taken.items() if not count]
 
-    def _on_image(self, message: Any) -> None:
+    def _on_image(self, raw: RawMessage) -> None:
         self._image_arrivals.add(0.0)
+        try:
+            message = view_image(raw)
+        except ImageRefused:
+            self._in_worker(self._publish, image_of(raw))
+            return
         self._publish_camera_info(message)
         time_ns = stamp_ns(message.header.stamp)
         time_ns += offset_ns(self._setup.attitude.stamp_offset_s)
         width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
-        self._queue.put(time_ns, width, height, message)
+        self._queue.put(time_ns, width, height, raw)
 
     def _publish_camera_info(self, message: Any) -> None:
         """Publish the active calibration with the header of an image message."""
@@ -225,7 +237,8 @@ class StarObserver(StarcalNode):
         # A compressed image has no size; an image of another size is from another camera.
         size = (camera_info.width, camera_info.height)
         if (getattr(message, 'width', size[0]), getattr(message, 'height', size[1])) == size:
-            camera_info.header = message.header
+            stamp = make_message('builtin_interfaces/msg/Time', **vars(message.header.stamp))
+            camera_info.header.stamp, camera_info.header.frame_id = stamp, message.header.frame_id
             self._camera_infos.publish(camera_info)
 
     def _on_attitude(self, message: Any) -> None:
@@ -311,15 +324,10 @@ class StarObserver(StarcalNode):
             self._publish(self._refused(waiting, 'overrun', detail))
             return
         offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
-        try:
-            image = image_from_message(
-                waiting.message,
-                offset_s,
-                (camera.width, camera.height),
-                self._setup.frames.image_channel,
-            )
-        except ImageRefused as refused:
-            self._publish(self._refused(waiting, refused.reason, refused.detail))
+        size, channel = (camera.width, camera.height), self._setup.frames.image_channel
+        image = image_of(waiting.message, offset_s, size, channel)
+        if isinstance(image, StarObservations):
+            self._publish(image)
             return
         if self._geometry is not self._predicted_from:
             self._predicted_from = self._geometry

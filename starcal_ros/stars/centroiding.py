@@ -43,8 +43,9 @@ class Centroids:
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
     ``refusal`` (n,) uint8 codes of `StarRefusal`, 0 where the star is good.
-    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are PSF width and noise of the
-    fit; ``modelled`` (n,) masks the stars whose light was subtracted from their neighbours.
+    ``fit`` is that of the stars ``fitted`` (k,), all that are not faint, and None for moments;
+    ``psf_sigma_px``, ``noise_dn`` (n,) are PSF width and noise of the fit; ``modelled`` (n,) masks
+    the stars whose light was subtracted from their neighbours.
     """
 
     xy_px: Floats
@@ -53,6 +54,7 @@ class Centroids:
     snr: Floats
     refusal: NDArray[np.uint8]
     fit: psf_fit.PsfFit | None
+    fitted: Indices
     psf_sigma_px: Floats
     noise_dn: Floats
     modelled: Mask
@@ -95,6 +97,7 @@ def with_faint(measured: Centroids, predicted_px: Floats) -> Centroids:
         snr=extended(measured.snr, 0.0),
         refusal=np.concatenate([measured.refusal, np.full(more, StarRefusal.FAINT, np.uint8)]),
         fit=None,
+        fitted=measured.fitted,
         psf_sigma_px=extended(measured.psf_sigma_px, np.nan),
         noise_dn=extended(measured.noise_dn, np.nan),
         modelled=np.concatenate([measured.modelled, np.zeros(more, bool)]),
@@ -113,34 +116,43 @@ def _measure_by_psf(
     centre, inside = _brightest_beside(pixels, predicted_px, hot_pixels)
     windows = _windows(pixels, centre, model, psf, hot_pixels)
     guess = psf_fit.first_guess(windows.stamps, windows.level_dn)
-    stamps, parameters, modelled = _without_neighbours(
+    stamps, parameters, done, modelled = _without_neighbours(
         windows.stamps,
-        psf_fit.approach(windows.stamps, guess, model.pixel_noise),
+        *psf_fit.approach(windows.stamps, guess, model.pixel_noise),
         predicted_px,
         centre,
         inside & (windows.saturated_pixels == 0),
         model.pixel_noise,
     )
-    fit = psf_fit.fit_at(stamps, parameters, model.pixel_noise)
+    # Most stars of the catalog are too faint: their refusal needs no covariance and no shape.
+    faint = psf_fit.surely_fainter(stamps, parameters, done, options.min_snr, model.pixel_noise)
+    fitted = np.flatnonzero(~faint)
+    fit = psf_fit.fit_at(stamps.select(fitted), parameters[fitted], model.pixel_noise)
+    parameters[fitted] = fit.parameters
+    snr, misshapen = np.zeros(len(faint)), np.zeros(len(faint), bool)
+    snr[fitted], misshapen[fitted] = fit.snr, _misshapen(fit, model)
+    covariance_px2 = np.full((len(faint), 3), np.nan)
+    covariance_px2[fitted] = fit.covariance[:, [0, 0, 1], [0, 1, 1]]
     # The brightest pixel is anywhere along a streak.
     in_place_px = _IN_PLACE_PX + model.extent_px - (model.psf_sigma_px or 1.0)
     refusal = _first_reason(
         (~inside, StarRefusal.BORDER),
         (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
-        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
-        (np.abs(fit.parameters[:, :2]).max(axis=1) > in_place_px, StarRefusal.NOT_DETECTED),
-        (_misshapen(fit, model), StarRefusal.ELONGATED),
+        ((snr < options.min_snr) | ~np.isfinite(snr), StarRefusal.FAINT),
+        (np.abs(parameters[:, :2]).max(axis=1) > in_place_px, StarRefusal.NOT_DETECTED),
+        (misshapen, StarRefusal.ELONGATED),
     )
-    xy_px = centre + fit.parameters[:, :2]
+    xy_px = centre + parameters[:, :2]
     if model.streak is not None:
         xy_px = xy_px - model.streak.bend_px(xy_px)
     return Centroids(
         xy_px=xy_px,
-        covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
-        flux_dn=fit.parameters[:, 2],
-        snr=fit.snr,
+        covariance_px2=covariance_px2,
+        flux_dn=parameters[:, 2],
+        snr=snr,
         refusal=refusal,
         fit=fit,
+        fitted=fitted,
         psf_sigma_px=stamps.sigma_px,
         noise_dn=windows.noise_dn,
         modelled=modelled,
@@ -235,7 +247,7 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     """Return True if most bright stars have another shape than the model: streaks, or defocus."""
     if measured.fit is None:
         return False
-    change = measured.fit.shape_change[measured.snr > _BRIGHT_SNR]
+    change = measured.fit.shape_change[measured.fit.snr > _BRIGHT_SNR]
     if len(change) < _FEWEST_BRIGHT:
         return False
     return bool(np.abs(np.median(change, axis=0) - model.shape_median).max() > _COMMON_CHANGE)
@@ -244,15 +256,16 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
 def _without_neighbours(
     stamps: psf_fit.Stamps,
     parameters: Floats,
+    done: Mask,
     predicted_px: Floats,
     centre: Indices,
     usable: Mask,
     noise: PixelNoise,
-) -> tuple[psf_fit.Stamps, Floats, Mask]:
+) -> tuple[psf_fit.Stamps, Floats, Mask, Mask]:
     """
     Stamps without the light of the neighbours that can be modelled.
 
-    Also the parameters (n, 4) near the minimum of the fit, and a mask (n,) of the modelled stars.
+    Also what `psf_fit.approach` finds in them, and a mask (n,) of the modelled stars.
     """
     flux, sigma_px = parameters[:, 2], stamps.sigma_px
     streak_px = psf_fit.longest_px(stamps.streak_px)
@@ -263,7 +276,7 @@ def _without_neighbours(
     in_place = np.abs(parameters[:, :2]).max(axis=1) < in_place_px
     modelled = usable & (snr > _MODELLED_SNR) & in_place
     if len(stamps) < 2:
-        return stamps, parameters, modelled
+        return stamps, parameters, done, modelled
     # The wing of a star outside the stamp adds light to it.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px + 0.5 * streak_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
@@ -280,7 +293,7 @@ def _without_neighbours(
     subtracted = modelled[other]
     star, other = star[subtracted], other[subtracted]
     if not len(star):
-        return stamps, parameters, modelled
+        return stamps, parameters, done, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
     separated = stamps
     touched = np.zeros(len(stamps), bool)
@@ -312,9 +325,11 @@ def _without_neighbours(
             stamps.out,
             stamps.streak_px,
         )
-        parameters = parameters.copy()
-        parameters[again] = psf_fit.approach(separated.select(again), parameters[again], noise)
-    return separated, parameters, modelled
+        parameters, done = parameters.copy(), done.copy()
+        parameters[again], done[again] = psf_fit.approach(
+            separated.select(again), parameters[again], noise
+        )
+    return separated, parameters, done, modelled
 
 
 def _single_pixels(
@@ -396,6 +411,7 @@ def _measure_by_moments(
         snr=snr,
         refusal=refusal,
         fit=None,
+        fitted=np.empty(0, np.intp),
         psf_sigma_px=np.zeros(n),
         noise_dn=noise_dn,
         modelled=np.zeros(n, bool),

@@ -19,7 +19,7 @@ from scipy.special import erf, ndtr
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.stars.hot_pixels import CORE_PX, SPILT
-from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
+from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
 
 _FIT_STEPS = 4  # stars converge in two or three; other sources may not
 # After a step s, an error of s / SNR remains for faint stars, of s^2 / sigma_px for bright ones.
@@ -142,16 +142,16 @@ def fit_psf(
     sigma = np.full(len(stamps), sigma_px)
     windows = Stamps(stamps, sigma, noise_dn[:, None] ** 2, streak_px=streak_px)
     guess = first_guess(windows, border_level_dn(stamps))
-    return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
+    return fit_at(windows, approach(windows, guess, pixel_noise)[0], pixel_noise)
 
 
-def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> Floats:
+def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> tuple[Floats, Mask]:
     """
     Parameters (n, 4) one step before the minimum: x, y (px), flux, background (DN).
 
     Gauss-Newton with weights from the model of each step, so that the noise of the data does not
     bias them; a step in position is at most half a pixel.  A star is done when one more step,
-    which `fit_at` takes, reaches the minimum.
+    which `fit_at` takes, reaches the minimum; also a mask (n,) of the stars that are.
     """
     parameters = parameters.copy()
     active = np.arange(len(stamps))
@@ -164,7 +164,28 @@ def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> Flo
         place_sigma_px = 1.0 / np.sqrt(np.einsum('nii->ni', normal)[:, :2])
         limit_px2 = _SETTLED * place_sigma_px * chosen.sigma_px[:, None]
         active = active[(step[:, :2] ** 2 > limit_px2).any(axis=1)]
-    return parameters
+    done = np.ones(len(stamps), bool)
+    done[active] = False
+    return parameters, done
+
+
+def surely_fainter(
+    stamps: Stamps, parameters: Floats, done: Mask, snr: float, pixel_noise: PixelNoise
+) -> Mask:
+    """
+    Mask (n,) of the stars whose fit by `fit_at` will be below a signal-to-noise ratio.
+
+    The arguments are those of `fit_at` and the mask of `approach`.
+    """
+    flux, level = parameters[:, 2], parameters[:, 3]
+    blurred = blurred_px(stamps.sigma_px, longest_px(stamps.streak_px))
+    noise_dn = np.sqrt(stamps.noise2_dn2.min(axis=1))
+    # The background is free, so that the fit has less; its last step is a tenth of a sigma.
+    most = expected_snr(flux, blurred, noise_dn, pixel_noise)
+    # The fit may do without a single pixel.
+    brightest_dn = stamps.flat_dn.max(axis=1) - level
+    even = brightest_dn < (MISFIT_SIGMA - 1.0) * math.sqrt(pixel_noise.background) * noise_dn
+    return np.asarray(done & even & (most < snr - 0.5))
 
 
 def _nearer(

@@ -17,6 +17,7 @@ pytest.importorskip('starcal.msg')
 import rclpy
 
 from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import typestore
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
@@ -73,13 +74,14 @@ def test_a_refusal_has_the_cause_once_it_is_known(observer: StarObserver, tiny_b
     for raw in reader.read_raw([tiny_bag], [of_images, *topics.values()]):
         message = reader.decode(raw)
         if raw.topic == of_images:
-            images.append(message)
+            images.append((raw, message))
         elif hasattr(message, 'quaternion'):
             observer._on_attitude(message)
-    first = images[0]
+    raw, first = images[0]
     pixels = np.asarray(first.data).reshape(first.height, -1, 2)[:, ::-1]
     mirrored = dataclasses.replace(first, data=pixels.ravel())
-    waiting = Waiting(0, first.width, first.height, mirrored, 0.0)
+    view = typestore().serialize_cdr(mirrored, raw.type_name)
+    waiting = Waiting(0, 0, 0, dataclasses.replace(raw, view=memoryview(view)), 0.0)
     observer._measure(waiting)
     assert observer._last_refusal.startswith('no_match: ') and 'chance' in observer._last_refusal
     observer._unmatched._diagnosis = Diagnosis('mirrored', 1, 'The image is mirrored.')

@@ -25,8 +25,10 @@ from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.message_codec import RawMessage
 from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
+    image_of,
     latest_at,
     temperature_from_message,
     velocity_from_message,
@@ -76,7 +78,7 @@ class Telemetry:
         self._newest_ns: dict[str, int] = {}
         self.velocities_left_out = 0  # not plausible; the first is reported
 
-    def add(self, raw: reader.RawMessage) -> bool:
+    def add(self, raw: RawMessage) -> bool:
         """Add a message, or report damage; False if its topic had a later stamp before."""
         try:
             message = reader.decode(raw)
@@ -189,7 +191,7 @@ def read_frames(
     for raw in read_ahead(messages):
         in_order = True
         if raw.topic == topics.image:
-            waiting.append(reader.image_of(raw, options.stamp_offset_s, size, channel))
+            waiting.append(image_of(raw, options.stamp_offset_s, size, channel))
         elif not is_complete:
             in_order = telemetry.add(raw)
         if not is_complete and (not in_order or _is_too_much(waiting)):
@@ -235,7 +237,7 @@ def _report_changed(
         )
 
 
-def read_ahead(messages: Iterator[reader.RawMessage]) -> Iterator[reader.RawMessage]:
+def read_ahead(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
     """The same messages, read by another thread while those before them are in use."""
     with ThreadPoolExecutor(1, 'read-ahead') as thread:
         pending = thread.submit(_batch, messages)
@@ -245,9 +247,9 @@ def read_ahead(messages: Iterator[reader.RawMessage]) -> Iterator[reader.RawMess
                 yield batch.popleft()
 
 
-def _batch(messages: Iterator[reader.RawMessage]) -> deque[reader.RawMessage]:
+def _batch(messages: Iterator[RawMessage]) -> deque[RawMessage]:
     """The next messages, up to a size; none at the end."""
-    batch: deque[reader.RawMessage] = deque()
+    batch: deque[RawMessage] = deque()
     size = 0
     for raw in messages:
         batch.append(raw)

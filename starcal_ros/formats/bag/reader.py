@@ -37,12 +37,12 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import get_chunk_data_stream, StreamReader
 from mcap.summary import Summary
 
-from starcal_ros.errors import BagError, errors_as, ImageRefused, NotABag
+from starcal_ros.errors import BagError, errors_as, NotABag
 from starcal_ros.formats.bag.typestore import typestore_of
-from starcal_ros.formats.messages.message_codec import Message, nearest_stamp_ns
+from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
-from starcal_ros.formats.messages.sensor_messages import image_from_message, refused_from_message
-from starcal_ros.records import Image, refused_image, StarObservations
+from starcal_ros.formats.messages.sensor_messages import image_of
+from starcal_ros.records import Image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import METADATA_BYTES, read_text, regular_file, yaml_value
 
@@ -55,22 +55,6 @@ _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publica
 # Damaged bytes are parsed as an arbitrary record, so the exceptions have no common base class.
 _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
 _LONGEST_NAME = 4096  # Linux has no longer path
-
-
-@dataclass(frozen=True)
-class RawMessage:
-    """One recorded message; ``view`` is serialised CDR with its header, part of a chunk."""
-
-    topic: str
-    type_name: str
-    definition: str
-    log_time_ns: int
-    view: memoryview
-
-    @property
-    def data(self) -> bytes:
-        """A copy of the message as bytes, because middleware does not accept a view."""
-        return bytes(self.view)
 
 
 def read_summary(file: Path) -> Summary | None:
@@ -424,28 +408,6 @@ def read_images(
     """Images of a topic, as `image_of` reads them."""
     for raw in read_raw(paths, [topic], on_damage):
         yield image_of(raw, stamp_offset_s, channel=channel)
-
-
-def image_of(
-    raw: RawMessage,
-    stamp_offset_s: float = 0.0,
-    size: tuple[int, int] | None = None,
-    channel: str = '',
-) -> Image | StarObservations:
-    """
-    Image of a message; refused observations if it cannot be decoded.
-
-    So is a compressed image of another ``size`` (width, height), where one is given.
-    ``channel`` is the colour that is taken of colour images (`image_from_message`).
-    """
-    try:
-        message = decode(raw)
-    except BagError as error:
-        return refused_image(nearest_stamp_ns(raw.log_time_ns), 0, 0, 'bad_layout', str(error))
-    try:
-        return image_from_message(message, stamp_offset_s, size, channel)
-    except ImageRefused as refused:
-        return refused_from_message(message, stamp_offset_s, refused)
 
 
 def read_observations(

@@ -30,6 +30,7 @@ flat numpy arrays of the field's type.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 import math
 from typing import Any, Protocol, TypeVar
 
@@ -61,6 +62,26 @@ T = TypeVar('T')
 NOT_KNOWN = 2  # stands for None in a field of bool or None
 _KNOWN = {0: False, 1: True, NOT_KNOWN: None}
 _ENTRIES = {int: ('ReasonCount', 'reason', 'count'), str: ('KeyValue', 'key', 'value')}
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """
+    A message as recorded or received.
+
+    ``view`` is serialised CDR with its header, ``definition`` that of its type in the bag.
+    """
+
+    topic: str
+    type_name: str
+    definition: str
+    log_time_ns: int
+    view: memoryview
+
+    @property
+    def data(self) -> bytes:
+        """A copy of the message as bytes, because middleware does not accept a view."""
+        return bytes(self.view)
 
 
 class Make(Protocol):

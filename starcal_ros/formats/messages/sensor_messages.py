@@ -7,6 +7,8 @@ import bisect
 from collections.abc import Sequence
 import math
 import operator
+import struct
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -167,6 +169,73 @@ def image_from_message(
     if not hasattr(message, 'encoding'):
         return decode_compressed(message.data, time_ns, size, channel)
     return decode_image(message, time_ns, channel)
+
+
+def view_image(raw: codec.RawMessage) -> codec.Message:
+    """
+    Fields of a serialised sensor_msgs/Image or CompressedImage; ``data`` views its bytes.
+
+    No other copy of the pixels is made, and the types of no middleware are needed: all
+    distributions of ROS 2 have the same two.
+
+    Raises ImageRefused ``bad_layout`` where the bytes are none of both.
+    """
+    order, at = '<' if any(raw.view[1:2]) else '>', 4
+
+    def number(code: str) -> int:
+        nonlocal at
+        size = struct.calcsize(code)
+        at += -at % size
+        (value,) = struct.unpack_from(order + code, raw.view, at)
+        at += size
+        return int(value)
+
+    def sequence() -> memoryview:
+        nonlocal at
+        size = number('I')
+        at += size
+        return raw.view[at - size : at]
+
+    try:
+        stamp = SimpleNamespace(sec=number('i'), nanosec=number('I'))
+        header = SimpleNamespace(stamp=stamp, frame_id=str(sequence()[:-1], 'utf-8', 'replace'))
+        message = SimpleNamespace(header=header)
+        if raw.type_name == codec.IMAGE_TYPE:
+            message.height, message.width = number('I'), number('I')
+            message.encoding = str(sequence()[:-1], 'utf-8', 'replace')
+            message.is_bigendian, message.step = number('B'), number('I')
+        else:
+            sequence()  # the format, which the data state too
+        message.data = sequence()
+    except struct.error:
+        at = len(raw.view) + 1
+    if at > len(raw.view):
+        detail = f'{raw.topic}: {len(raw.view)} bytes are no {raw.type_name}'
+        raise ImageRefused('bad_layout', detail)
+    return message
+
+
+def image_of(
+    raw: codec.RawMessage,
+    stamp_offset_s: float = 0.0,
+    size: tuple[int, int] | None = None,
+    channel: str = '',
+) -> Image | StarObservations:
+    """
+    Image of a serialised message; refused observations if it cannot be decoded.
+
+    So is a compressed image of another ``size`` (width, height), where one is given.
+    ``channel`` is the colour that is taken of colour images (`image_from_message`).
+    """
+    try:
+        message = view_image(raw)
+    except ImageRefused as refused:
+        time_ns = codec.nearest_stamp_ns(raw.log_time_ns)
+        return refused_image(time_ns, 0, 0, refused.reason, refused.detail)
+    try:
+        return image_from_message(message, stamp_offset_s, size, channel)
+    except ImageRefused as refused:
+        return refused_from_message(message, stamp_offset_s, refused)
 
 
 def refused_from_message(

@@ -54,6 +54,7 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
         snr=many + 50.0,
         refusal=np.full(count, StarRefusal.NONE, np.uint8),
         fit=None,
+        fitted=np.empty(0, np.intp),
         psf_sigma_px=many + 0.95,
         noise_dn=many + 2.0,
         modelled=np.zeros(count, bool),

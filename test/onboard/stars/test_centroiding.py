@@ -13,6 +13,7 @@ from starcal_ground.simulation.centroids import centroid_bound
 from starcal_ground.simulation.rendering import expose, star_electrons
 from starcal_ground.simulation.scenario import Detector
 from starcal_ros.records import StarRefusal
+from starcal_ros.stars import psf_fit
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import detect, measure_background, sample_mesh
 from starcal_ros.stars.image_model import (
@@ -547,6 +548,37 @@ def test_the_fit_itself_is_exact_on_its_own_model() -> None:
     np.testing.assert_allclose(fit.parameters, expected, rtol=1e-5, atol=1e-5)
     assert np.abs(fit.residual_dn).max() < 0.1 * 2.0
     assert np.abs(fit.shape_change).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ('seed', 'min_snr', 'detector'),
+    [
+        *((seed, 5.0, dataclasses.replace(QUIET, psf_sigma_px=0.95)) for seed in range(4)),
+        *((4, 5.0, dataclasses.replace(QUIET, psf_sigma_px=width)) for width in (0.5, 0.7, 2.0)),
+        *((5, min_snr, QUIET) for min_snr in (2.0, 30.0)),
+        (6, 5.0, Detector(cosmic_rays=500.0, hot_fraction=1e-2)),
+    ],
+)
+def test_the_fit_that_a_faint_star_is_spared_changes_nothing(
+    seed: int, min_snr: float, detector: Detector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng([seed, 3])
+    xy = rng.uniform((0.0, 0.0), SHAPE[::-1], (2000, 2))  # blends, and stars off the border
+    flux = np.sort(60.0 * 1000.0 ** rng.uniform(size=len(xy)) ** 3)[::-1]
+    pixels, options = exposed(seed, xy, flux, detector), CentroidOptions(min_snr=min_snr)
+    model = modelled(pixels)
+    spared = measure_stars(pixels, xy, model, options)
+    none = np.zeros(len(xy), bool)
+    monkeypatch.setattr(psf_fit, 'surely_fainter', lambda *_: none)
+    whole = measure_stars(pixels, xy, model, options)
+    np.testing.assert_array_equal(spared.refusal, whole.refusal)
+    for name in ('xy_px', 'covariance_px2', 'flux_dn', 'snr'):
+        fitted = (getattr(centroids, name)[spared.fitted] for centroids in (spared, whole))
+        np.testing.assert_array_equal(*fitted)
+    # The shortcut is taken by at least a third of the faint stars.
+    faint = np.count_nonzero(spared.refusal == StarRefusal.FAINT)
+    assert len(whole.fitted) == len(xy) and faint > 100
+    assert len(xy) - len(spared.fitted) > 0.33 * faint
 
 
 @pytest.mark.parametrize('gain', [0.5, 2.0, 8.0])

@@ -18,9 +18,14 @@ from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import image_to_message
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.image_headers import jpeg_header
-from starcal_ros.formats.messages.message_codec import make_header
+from starcal_ros.formats.messages.message_codec import (
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    make_header,
+    RawMessage,
+)
 from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
@@ -29,9 +34,11 @@ from starcal_ros.formats.messages.sensor_messages import (
     decode_compressed,
     decode_image,
     image_from_message,
+    image_of,
     refused_from_message,
+    view_image,
 )
-from starcal_ros.records import Image
+from starcal_ros.records import Image, StarObservations
 
 RAMP = np.arange(12, dtype=np.uint16).reshape(3, 4) * 257 + 3
 
@@ -202,6 +209,42 @@ def test_image_round_trip(make: Any, dtype: Any) -> None:
     assert back.time_ns == TIME_NS - 25_000_000
     assert back.pixels.dtype == dtype
     np.testing.assert_array_equal(back.pixels, image.pixels)
+
+
+def compressed(frame_id: str) -> Any:
+    data = np.frombuffer(png(4, 3), np.uint8)
+    header = make_header(TIME_NS, frame_id, make_message)
+    return make_message(COMPRESSED_TYPE, header=header, format='mono16; png', data=data)
+
+
+@pytest.mark.parametrize('frame_id', ['', 'c', 'ca', 'cam', 'camera', 'Ω'])
+@pytest.mark.parametrize('little', [True, False])
+@pytest.mark.parametrize('type_name', [IMAGE_TYPE, COMPRESSED_TYPE])
+def test_a_serialised_image_is_viewed_as_rosbags_reads_it(
+    type_name: str, little: bool, frame_id: str
+) -> None:
+    kinds = {
+        IMAGE_TYPE: image_to_message(Image(TIME_NS, RAMP), frame_id, make_message),
+        COMPRESSED_TYPE: compressed(frame_id),
+    }
+    whole = bytes(typestore().serialize_cdr(kinds[type_name], type_name, little_endian=little))
+    expected: Any = typestore().deserialize_cdr(whole, type_name)
+    message = view_image(RawMessage('/image', type_name, '', 5, memoryview(whole)))
+    assert vars(message.header.stamp) == {
+        name: getattr(expected.header.stamp, name) for name in ('sec', 'nanosec')
+    }
+    assert message.header.frame_id == frame_id
+    assert message.data.obj is whole and message.data == expected.data.tobytes()
+    for name in ('height', 'width', 'encoding', 'is_bigendian', 'step'):
+        assert getattr(message, name, None) == getattr(expected, name, None)
+    # Truncated anywhere, it is refused with the time of its arrival; more behind it is not read.
+    for size in range(len(whole)):
+        record = image_of(RawMessage('/image', type_name, '', 5, memoryview(whole[:size])))
+        assert isinstance(record, StarObservations)
+        assert (record.refusal, record.time_ns) == ('bad_layout', 5)
+        assert record.detail == f'/image: {size} bytes are no {type_name}'
+    more = image_of(RawMessage('/image', type_name, '', 5, memoryview(whole + bytes(9))))
+    assert isinstance(more, Image) and more.time_ns == TIME_NS
 
 
 def test_bytes_of_fill_hide_no_frame_of_a_jpeg() -> None:
