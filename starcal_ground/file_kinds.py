@@ -14,7 +14,6 @@ from pathlib import Path
 import shlex
 
 from starcal_ros.errors import NotABag, StarcalError
-from starcal_ros.formats.bag.typestore import typestore
 from starcal_ros.formats.image_headers import is_fits
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
@@ -167,8 +166,12 @@ def _instead(file: Path, kind: FileKind) -> str:
 
 def _convertible(source: Path) -> list[str]:
     """Topics that starcal reads of a bag of another kind; none where it cannot be opened."""
-    from rosbags.highlevel import AnyReader  # seldom needed, slow to load
+    try:
+        from rosbags.highlevel import AnyReader  # seldom needed, slow to load
 
+        from starcal_ros.formats.bag.typestore import typestore
+    except ModuleNotFoundError:  # rosbags-convert is of the same package
+        return []
     # The exceptions of a damaged bag have no common base class.
     with contextlib.suppress(Exception), AnyReader([source], default_typestore=typestore()) as bag:
         return sorted(name for name, topic in bag.topics.items() if topic.msgtype in _CONVERTED)

@@ -18,7 +18,6 @@ import tempfile
 
 import numpy as np
 
-from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images.from_stars import (
     count_of_stars,
     from_stars,
@@ -169,6 +168,8 @@ def from_photographs(
 
     Raises NotFromStars when the stars give no camera.
     """
+    from starcal_ground.bag_writer import BagWriter  # bags with attitudes are read without mcap
+
     stars, notes = camera_of_photographs(photographs, values)
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
@@ -297,6 +298,8 @@ def _set_up(
     notes: Sequence[str] = (),
     times_of: str = '',
 ) -> NightSky:
+    from starcal_ground.bag_writer import BagWriter  # as above
+
     attitudes = folder / 'attitudes.mcap'
     with BagWriter(attitudes) as writer:
         for time_ns in sorted(stars.icrf_from_camera):
