@@ -81,8 +81,8 @@ class NightSky:
         lost = refusals(one for one in images if one.time_ns in self.identified_ns)
         notes = [note] if note else []
         notes += [
-            f'{row.count} images are refused as {row.reason} though identified by their stars:'
-            f' {row.detail or row.meaning}'
+            f'{row.count} of {len(images)} images, identified by their stars, refused as'
+            f' {row.reason}: {row.detail or row.meaning}'
             for row in lost
         ]
         return images, '; '.join(notes)

@@ -421,7 +421,7 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
     if not fitting:
         listed = ', '.join(topic.name for topic in there) or 'none'
         raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
-    raise BagError(f'{where}: several topics of type {type_name}, choose one: {listed}')
+    raise BagError(f'{where}: several topics of type {type_name}: {listed}')
 
 
 def read_raw(
