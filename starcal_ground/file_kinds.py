@@ -14,7 +14,6 @@ from pathlib import Path
 import shlex
 
 from starcal_ros.errors import NotABag, StarcalError
-from starcal_ros.formats.bag.typestore import typestore
 from starcal_ros.formats.image_headers import is_fits
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
@@ -28,6 +27,7 @@ _OF_IMAGES = (
     ': starcal calibrate, inspect and diagnose take images alone; starcal import makes a bag of'
     ' image files and attitudes'
 )
+_NOR_IMAGES = ', nor images (FITS, TIFF, PNG, JPEG, camera raw)'
 # Topics of other types may be unknown to the converter, which then stops.
 _CONVERTED = frozenset(
     [
@@ -129,6 +129,7 @@ def explained(error: StarcalError) -> str:
             instead = _instead_of_any(place) if place.is_dir() else _instead(place, kind_of(place))
             if instead:
                 return f'{str(error).partition(" (did")[0]}{instead}'
+            return f'{error}{"" if " (did" in str(error) else _NOR_IMAGES}'
     return str(error)
 
 
@@ -153,9 +154,9 @@ def _instead(file: Path, kind: FileKind) -> str:
             content = opened.read(_YAML_BYTES)
         for word, name, option in _YAML_FILES:
             if word in content:
-                return f' but {name}: {option}{shlex.quote(str(file))} takes it'
+                return f' but {name}: give a bag or images, and {option}{shlex.quote(str(file))}'
     if kind not in (SQLITE_BAG, ROS_1_BAG):
-        return ''
+        return _NOR_IMAGES
     # rosbags converts the folder with its metadata.yaml, not the file in it.
     source = file.parent if kind is SQLITE_BAG else file
     command = ['rosbags-convert', '--src', str(source)]
@@ -167,8 +168,12 @@ def _instead(file: Path, kind: FileKind) -> str:
 
 def _convertible(source: Path) -> list[str]:
     """Topics that starcal reads of a bag of another kind; none where it cannot be opened."""
-    from rosbags.highlevel import AnyReader  # seldom needed, slow to load
+    try:
+        from rosbags.highlevel import AnyReader  # seldom needed, slow to load
 
+        from starcal_ros.formats.bag.typestore import typestore
+    except ModuleNotFoundError:  # rosbags-convert is of the same package
+        return []
     # The exceptions of a damaged bag have no common base class.
     with contextlib.suppress(Exception), AnyReader([source], default_typestore=typestore()) as bag:
         return sorted(name for name, topic in bag.topics.items() if topic.msgtype in _CONVERTED)

@@ -23,6 +23,7 @@ from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
 from starcal_ros.record_fields import json_object, plain_record, read_record
@@ -92,10 +93,21 @@ def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
 def write_observations(
     observations: Iterable[StarObservations], folder: Path, frame_id: str
 ) -> None:
-    """Write the observations of a calibration with the frame of its camera; raises BagError."""
+    """
+    Write the observations of a calibration with the frame of its camera; raises BagError.
+
+    Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
+    """
+    path = folder / OBSERVATIONS_FILE
+    if rosbag2.READS_BAGS:
+        path.unlink(missing_ok=True)  # one that is there is of the products that are replaced
+        from starcal_ros.formats.bag.reader import log_damage
+
+        log_damage(f'{path} is not written: mcap is not installed: {rosbag2.INSTALL}')
+        return
     from starcal_ground.bag_writer import BagWriter  # mcap is not needed for more
 
-    with BagWriter(folder / OBSERVATIONS_FILE) as writer:
+    with BagWriter(path) as writer:
         for record in observations:
             writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
 

@@ -22,6 +22,19 @@ import pytest
 BESIDE = Path(__file__).parents[2] / 'shared' / 'ros2tools' / 'install.sh'
 PROFILE = Path(__file__).parents[1] / 'config' / 'cyclonedds.xml'
 JAZZY_RCLPY = '7.'  # compiled tools serve the ROS they were built against alone
+# rosdep has no key for them, or a vehicle can do without.
+WITHOUT_KEY = ('mcap', 'rosbags', 'threadpoolctl', 'dask', 'distributed')
+# As sitecustomize.py at the start of a Python process: these cannot be imported.
+HIDDEN = f"""
+import sys
+
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in {WITHOUT_KEY}:
+            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name.partition('.')[0])
+
+sys.meta_path.insert(0, Hidden())
+"""
 RUN_S = 100.0  # a command of ros2 takes 2 s; busy cores make that much of it
 
 

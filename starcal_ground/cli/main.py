@@ -11,7 +11,7 @@ stderr; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 import difflib
 import importlib
 import io
@@ -50,6 +50,8 @@ calibration; 2 bad input, named in one line; 130 interrupted."""
 class _Parser(argparse.ArgumentParser):
     """Reports errors in one line and suggests the nearest known word."""
 
+    command = ''  # that the line names
+
     def error(self, message: str) -> NoReturn:
         """Exit with status 2."""
         bad = re.search(r"(?:invalid choice: '?|unrecognized arguments: )([^' ]+)", message)
@@ -58,9 +60,20 @@ class _Parser(argparse.ArgumentParser):
             near = difflib.get_close_matches(word, words, 1)
             if word in words:
                 message += ' (write it after the command)'
+            elif '--set' in words and (name := word.lstrip('-').replace('-', '_')) in _options():
+                message += f' (did you mean --set {name}=VALUE?)'
             elif near:
                 message += f' (did you mean {near[0]}?)'
-        self.exit(arguments.complain(f'{message} (see {self.prog} --help)'))
+        prog = ' '.join(filter(None, [self.prog, self.command]))
+        self.exit(arguments.complain(f'{message} (see {prog} --help)'))
+
+
+def _options() -> Collection[str]:
+    """Names that ``--set`` takes."""
+    from starcal_ros.options import names_of
+    from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
+
+    return names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
 
 
 def _words(parser: argparse.ArgumentParser) -> list[str]:
@@ -100,6 +113,7 @@ def parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     top.add_argument('--version', action='store_true', help='show the version and exit')
     commands = top.add_subparsers(metavar='COMMAND', dest='command', title='commands')
     named = next((word for word in argv if word in COMMANDS), None)
+    top.command = named or ''
     for name in COMMANDS:
         if named not in (None, name):
             commands.add_parser(name)

@@ -166,7 +166,10 @@ def _calibration(received: Received) -> Group | Text:
     last = received.candidate or received.active
     if received.candidate is not None:
         reasons = '; '.join(received.candidate.reasons)
-        parts.append(Line(f'last candidate refused: {reasons}', 'bold red'))
+        is_above = any(reasons in text for _, text in received.health.values())
+        parts.append(
+            Line(f'last candidate refused{"" if is_above else f": {reasons}"}', 'bold red')
+        )
     if last is not None:
         parts.append(_gate(last))
     return Group(*parts)

@@ -136,8 +136,9 @@ def from_stars(
     seen, size, copies = _sources(images)
     if len(seen) < min_images:
         again = f' ({len(copies)} more are copies)' if copies else ''
+        plural = 's' * (len(seen) != 1)
         raise NotFromStars(
-            f'{len(seen)} different images{again}, {min_images} are needed: {ADVICE}'
+            f'{len(seen)} different image{plural}{again}, {min_images} are needed: {ADVICE}'
         )
     rich = [one for one in seen if one.stars >= FEWEST_SOURCES]
     if not rich:

@@ -18,7 +18,6 @@ import tempfile
 
 import numpy as np
 
-from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images.from_stars import (
     count_of_stars,
     from_stars,
@@ -82,8 +81,8 @@ class NightSky:
         lost = refusals(one for one in images if one.time_ns in self.identified_ns)
         notes = [note] if note else []
         notes += [
-            f'{row.count} images are refused as {row.reason} though identified by their stars:'
-            f' {row.detail or row.meaning}'
+            f'{row.count} of {len(images)} images, identified by their stars, refused as'
+            f' {row.reason}: {row.detail or row.meaning}'
             for row in lost
         ]
         return images, '; '.join(notes)
@@ -169,6 +168,8 @@ def from_photographs(
 
     Raises NotFromStars when the stars give no camera.
     """
+    from starcal_ground.bag_writer import BagWriter  # bags with attitudes are read without mcap
+
     stars, notes = camera_of_photographs(photographs, values)
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
@@ -297,6 +298,8 @@ def _set_up(
     notes: Sequence[str] = (),
     times_of: str = '',
 ) -> NightSky:
+    from starcal_ground.bag_writer import BagWriter  # as above
+
     attitudes = folder / 'attitudes.mcap'
     with BagWriter(attitudes) as writer:
         for time_ns in sorted(stars.icrf_from_camera):

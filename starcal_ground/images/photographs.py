@@ -88,9 +88,11 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
     Files of paths, folders and patterns if an image is among them, else none: they are bags.
 
     Files that are no images are in the list too, so that each is read or refused with a reason.
-    A folder with a bag in it is a bag.  Raises IngestError for a pattern that matches nothing.
+    A folder with a bag in it is a bag.  Raises IngestError for a pattern that matches nothing, and
+    for images beside a bag.
     """
     files: list[Path] = []
+    bags: list[Path] = []
     for path in paths:
         if glob.has_magic(str(path)) and not path.exists():
             names = sorted(glob.glob(str(path)))
@@ -101,7 +103,15 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
             files.append(path)
         elif not (any(path.glob('*.mcap*')) or (path / 'metadata.yaml').exists()):
             files += sorted(file for file in path.iterdir() if not file.name.startswith('.'))
-    return files if any(map(_is_image, files)) else []
+        else:
+            bags.append(path)
+    if not any(map(_is_image, files)):
+        return []
+    if bags:
+        raise IngestError(
+            f'{bags[0]}: a bag, and the other paths hold images: give one kind alone'
+        )
+    return files
 
 
 def _is_image(path: Path) -> bool:

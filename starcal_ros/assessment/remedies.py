@@ -44,8 +44,8 @@ REMEDIES: Mapping[str, str] = {
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
     # Causes of the sigma of a line of sight (`SigmaPart.cause`).
     'stars': 'take more images',
-    'velocity': 'record the velocity of the spacecraft on the topic velocity, or state it '
-    '(observer_velocity_m_s, velocity_sigma_m_s)',
+    'velocity': 'state the velocity of the camera: the topic velocity or observer_velocity_m_s; '
+    'of photographs, observer and their times (EXIF, FITS)',
     'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',

@@ -68,8 +68,8 @@ class Requirement:
                 f' parameter{nearest(quantity, _UNITS)}'
             )
         if unit not in _UNITS[quantity]:
-            units = ' or '.join(_UNITS[quantity]) or 'without a unit'
-            raise OptionError(f'{OPTION}: {text}: the sigma of {quantity} is in {units}')
+            written = ' or '.join(f'{quantity}={number}{name}' for name in _UNITS[quantity])
+            raise OptionError(f'{OPTION}: {text}: the unit does not fit: write {written}')
         try:
             limit, share = float(number), float(percent or 100.0) / 100.0
         except ValueError as error:
@@ -77,7 +77,9 @@ class Requirement:
         if percent and quantity not in (LINE_OF_SIGHT, MAP):
             raise OptionError(f'{OPTION}: {text}: only line_of_sight and map are over a share')
         if not (limit > 0.0 and 0.0 < share <= 1.0):
-            raise OptionError(f'{OPTION}: {text}: above 0, over at most 100 % of the detector')
+            raise OptionError(
+                f'{OPTION}: {text}: the sigma must be above 0, and the share at most 100 %'
+            )
         return cls(quantity, limit, unit, share)
 
     @property

@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+from functools import partial
 import os
 from pathlib import Path
+import shutil
 import subprocess
+import sys
 from typing import Any, TYPE_CHECKING
 
 import pytest
@@ -25,8 +28,10 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
+from ros_tools import find_tools, HIDDEN, RosTools  # type: ignore[import-not-found]
+from rosbags.convert import convert
 
+from starcal_ros import calibrate_bag
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Activation, Ensemble
@@ -35,6 +40,7 @@ from starcal_ros.ros.archive import Archive
 pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes of 2 s and more
 
 ROOT = Path(__file__).parents[2]
+TINY = ROOT / 'bags' / 'tiny'
 FAST, CYCLONE = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 ANSWER_S = 30.0  # of a transition, which takes 2 s with the start of the tool
 TRIGGER = 'std_srvs/srv/Trigger'
@@ -321,3 +327,69 @@ SECURITY = ROOT / 'config' / 'security'
 def done(process: subprocess.CompletedProcess[str]) -> str:
     assert process.returncode == 0, process.stderr
     return process.stdout
+
+
+def as_sqlite(folder: Path) -> None:
+    nothing: tuple[()] = ()  # no topics or types are left out, or taken alone
+    convert(
+        *([TINY], folder, 'sqlite3', 9, None, '', None, None, nothing, nothing, nothing, nothing)
+    )
+
+
+def as_damaged(folder: Path) -> None:
+    folder.mkdir()
+    content = bytearray((TINY / 'tiny_0.mcap').read_bytes())
+    content[700_000:700_020] = bytes(20)  # in the first chunk of two
+    (folder / 'bag.mcap').write_bytes(content)
+
+
+def as_cut_off(folder: Path) -> None:
+    folder.mkdir()
+    (folder / 'bag.mcap').write_bytes((TINY / 'tiny_0.mcap').read_bytes()[:900_000])
+
+
+def as_no_database(folder: Path) -> None:
+    folder.mkdir()
+    (folder / 'bag.db3').write_bytes(b'SQLite format 3\0' + bytes(1000))
+
+
+@pytest.mark.parametrize(
+    ('write', 'line'),
+    [
+        (partial(shutil.copytree, TINY), ''),
+        (as_sqlite, ''),
+        (as_damaged, 'damaged, rosbag2 reads only a part: {install}, which reads what is intact'),
+        (as_cut_off, 'rosbag2 finds no message in it: if it is cut off, {install}'),
+        (as_no_database, 'rosbag2 cannot open it (No storage could be initialized'),
+    ],
+    ids=['mcap', 'sqlite', 'damaged', 'cut off', 'no database'],
+)
+def test_without_the_wheels_rosbag2_reads_bags(
+    write: Callable[[Path], object], line: str, make: Make, tmp_path: Path
+) -> None:
+    ros2 = make(FAST)
+    if not has_rosbag2(ros2):
+        pytest.skip('rosbag2 does not load here')
+    write(tmp_path / 'bag')
+    (tmp_path / 'sitecustomize.py').write_text(HIDDEN)
+    path = f'{tmp_path}:{ROOT}:{ros2.environment["PYTHONPATH"]}'
+    words = ('calibrate', 'bag', '--params', str(TINY / 'params.yaml'), '-o', 'out')
+    done = subprocess.run(
+        [sys.executable, '-m', 'starcal_ground.cli.main', *words],
+        env=ros2.environment | {'PYTHONPATH': path},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    install = f'{sys.executable} -m pip install mcap rosbags'
+    if line:
+        assert done.returncode == 2 and line.format(install=install) in done.stderr
+        starts = ('bag/', 'out/', 'starcal: ')  # nothing of rosbag2's own
+        assert all(text.startswith(starts) for text in done.stderr.splitlines()), done.stderr
+        return
+    unwritten = f'out/observations.mcap is not written: mcap is not installed: {install}\n'
+    assert (done.returncode, done.stderr) == (0, unwritten), done.stderr
+    expected = calibrate_bag(TINY, TINY / 'params.yaml')
+    camera = read_calibration(tmp_path / 'out' / CALIBRATION_FILE).geometry.camera
+    assert camera.parameters.tolist() == expected.geometry.camera.parameters.tolist()

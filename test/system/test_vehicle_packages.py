@@ -12,28 +12,17 @@ import sys
 from xml.etree import ElementTree
 
 import pytest
+from ros_tools import HIDDEN  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ROOT / 'bags' / 'tiny'
-WITHOUT_KEY = ('mcap', 'rosbags', 'threadpoolctl', 'dask', 'distributed')
-# At the start of every Python process: these cannot be imported.
-HIDDEN = f"""
-import sys
-
-class Hidden:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition('.')[0] in {WITHOUT_KEY}:
-            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name.partition('.')[0])
-
-sys.meta_path.insert(0, Hidden())
-"""
 
 
 @pytest.fixture
 def vehicle(tmp_path: Path) -> dict[str, str]:
     """Environment of a process without the packages that have no key."""
     (tmp_path / 'sitecustomize.py').write_text(HIDDEN)
-    return os.environ | {'PYTHONPATH': str(tmp_path)}
+    return os.environ | {'PYTHONPATH': f'{tmp_path}:{ROOT}'}
 
 
 def run(environment: dict[str, str], *words: str | Path) -> subprocess.CompletedProcess[str]:

@@ -91,7 +91,7 @@ def _print(comparison: Comparison) -> None:
     ]
     arcsec, sigma_arcsec = difference[-3:] / ARCSECOND_RAD, sigma[-3:] / ARCSECOND_RAD
     rows += [
-        (f'alignment {axis}', '', '', f'{d:+.2f}"', f'{s:.2f}"', _sigmas(d, s))
+        (f'alignment {axis}', '', '', f'{d:+.2f}″', f'{s:.2f}″', _sigmas(d, s))
         for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
     ]
     print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
@@ -102,7 +102,7 @@ def _print(comparison: Comparison) -> None:
             ('common rotation removed', *_map_cells(comparison.after)),
         ],
     )
-    print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}"')
+    print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
     total = comparison.total
     if total.degrees_of_freedom:
         print_text(
@@ -197,7 +197,7 @@ def with_truth(
     angles_off = error_arcsec / sigma_arcsec
     angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True)
     table += [
-        (f'alignment {axis}', f'{b:+.2f}"', f'{e:+.2f}"', f'{s:.2f}"', '0"', f'{o:+.1f} sigma')
+        (f'alignment {axis}', f'{b:+.2f}″', f'{e:+.2f}″', f'{s:.2f}″', '0″', f'{o:+.1f} sigma')
         for axis, b, e, s, o in angles
     ]
     header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')

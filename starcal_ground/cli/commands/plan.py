@@ -2,11 +2,11 @@
 r"""
 Propose the next pointings of the camera.
 
-Calibrates from the images so far. Then it chooses the allowed pointings one by one, each time the
-one that lowers a sigma most, and prints the sigma expected after it.
+Calibrates the images so far, as starcal calibrate does. Then it chooses the allowed pointings one
+by one, each time the one that lowers a sigma most, and prints the sigma expected after it.
 
   # the next ten images, anywhere on the sky
-  starcal plan bags/tiny --params bags/tiny/params.yaml
+  starcal plan bags/tiny
   # five images, within 60 degrees of the zenith of Houston, away from the Sun
   starcal plan bags/tiny --params bags/tiny/params.yaml --images 5 \
       --within 250 30 60 --avoid 83 23 40 -o pointings.csv
@@ -18,6 +18,7 @@ import argparse
 import csv
 import io
 from pathlib import Path
+import tempfile
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
@@ -33,8 +34,7 @@ _COLUMNS = ('ra_deg', 'dec_deg', 'roll_deg')
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    arguments.add_bags(command, f'images or observations so far: {arguments.BAGS}')
-    arguments.add_params(command)
+    arguments.add_inputs(command)
     images = arguments.number(int, 1, 1000)
     what = 'images that may be taken (default: 10)'
     add('--images', type=images, default=10, metavar='N', help=what)
@@ -53,21 +53,21 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     what = 'largest angle between the boresights of an image and the next (default: 180)'
     add('--slew', type=slew, default=180.0, metavar='DEG', help=what)
     arguments.add_output(command, 'FILE', 'write the pointings as CSV too')
-    arguments.add_topics(command)
     arguments.add_json(command)
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.images.first_setup import first_setup
     from starcal_ground.planning.plan import Cone, plan_pointings, Request
     from starcal_ros.formats.bag import reader
     from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.pipeline.campaign import calibrate_bags
-    from starcal_ros.pipeline.setup import files_of, read_setup
+    from starcal_ros.pipeline.campaign import calibrate, observe
 
-    setup = read_setup(args.params)
+    given = arguments.given(args)
+    setup, files = given.checked()
     if args.output:
-        given = [args.params, *files_of(setup.frames).values(), *filter(None, [args.pointings])]
-        arguments.check_file(args.output, [*reader.files_of_bags(args.bags), *given])
+        files += given.photographs or reader.files_of_bags(given.paths)
+        arguments.check_file(args.output, [*files, *filter(None, [args.pointings])])
     request = Request(
         args.images,
         args.minimise,
@@ -76,7 +76,9 @@ def run(args: argparse.Namespace) -> int:
         tuple(Cone(*cone) for cone in args.avoid),
         args.slew,
     )
-    campaign = calibrate_bags(args.bags, setup, arguments.topics(args))
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
+        campaign = calibrate(observe(first.source()))
     arguments.print_notes(campaign.notes)
     plan = plan_pointings(campaign.ensemble, campaign.setup, request)
     if args.output:

@@ -1,6 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-MCAP bags to records, without ROS; a bag may be damaged.
+Bags to records; a bag may be damaged.
+
+MCAP is read without ROS.  Where the wheels for that are absent, rosbag2 of ROS reads MCAP and
+SQLite (`rosbag2`), up to the damage.
 
 One chunk of the file is in memory at a time.  A chunk with a wrong checksum is skipped.  If the
 bytes between chunks are damaged, reading continues at the next chunk listed in the summary; if the
@@ -28,17 +31,8 @@ import struct
 from typing import Any, IO
 import zlib
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
-from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, DataEnd, McapRecord, MessageIndex, Schema
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import get_chunk_data_stream, StreamReader
-from mcap.summary import Summary
-
 from starcal_ros.errors import BagError, errors_as, NotABag
-from starcal_ros.formats.bag.typestore import typestore_of
+from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of
@@ -46,14 +40,28 @@ from starcal_ros.records import Image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import METADATA_BYTES, read_text, regular_file, yaml_value
 
+if not rosbag2.READS_BAGS:
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
+    from mcap.opcode import Opcode
+    from mcap.reader import make_reader
+    from mcap.records import Channel, Chunk, DataEnd, McapRecord, MessageIndex, Schema
+    from mcap.records import Message as McapMessage
+    from mcap.stream_reader import get_chunk_data_stream, StreamReader
+    from mcap.summary import Summary
+
+    from starcal_ros.formats.bag.typestore import typestore_of
+
 Damage = Callable[[str], None]
 
 MAGIC = b'\x89MCAP0\r\n'
+_MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
+_SUFFIXES = ('.mcap', '.db3') if rosbag2.READS_BAGS else ('.mcap',)
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
 # Damaged bytes are parsed as an arbitrary record, so the exceptions have no common base class.
-_DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
+_DAMAGE_ERRORS = (ValueError, struct.error, KeyError, OverflowError, MemoryError)
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
@@ -82,6 +90,11 @@ def read_messages(
     file: Path, wanted: frozenset[str] | None, on_damage: Damage
 ) -> Iterator[RawMessage]:
     """Intact messages of the wanted topics (None: all), in file order."""
+    if rosbag2.READS_BAGS:
+        types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
+        for topic, data, log_time_ns in rosbag2.read_messages(file, wanted, on_damage):
+            yield RawMessage(topic, types[topic], '', log_time_ns, memoryview(data))
+        return
     summary = read_summary(file)
     known = summary or Summary()
     schemas: dict[int, Schema] = dict(known.schemas)
@@ -195,7 +208,7 @@ class _Pieces:
                     self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
             self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')
-        except _DAMAGE_ERRORS as error:
+        except (McapError, *_DAMAGE_ERRORS) as error:
             following = self._start_after(read_to)
             if following is None and not self._reported:
                 at_end = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
@@ -305,8 +318,8 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for file in files:
         # Opening a pipe would wait for its writer.
         with errors_as(BagError, file), regular_file(file) as stream:
-            is_mcap = stream.read(len(MAGIC)) == MAGIC
-        if not is_mcap:
+            is_bag = stream.read(max(map(len, _MAGICS))).startswith(_MAGICS)
+        if not is_bag:
             raise NotABag(f'{file}: not an MCAP bag', file)
     # A shell sorts rec_10 before rec_2.
     return sorted(dict.fromkeys(files), key=_first_ns)
@@ -314,8 +327,7 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
 
 def _first_ns(file: Path) -> int:
     """Time of recording of the first message of a file; 0 for an empty one."""
-    status = file.stat()
-    return _listed(file, status.st_size, status.st_mtime_ns)[2]
+    return _listed_now(file)[2]
 
 
 def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
@@ -329,8 +341,7 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     types: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
-        status = file.stat()
-        listed, damage, _ = _listed(file, status.st_size, status.st_mtime_ns)
+        listed, damage, _ = _listed_now(file)
         for text in damage:
             on_damage(text)
         for topic in listed:
@@ -339,9 +350,17 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
 
 
+def _listed_now(file: Path) -> tuple[list[Topic], list[str], int]:
+    status = file.stat()
+    return _listed(file, status.st_size, status.st_mtime_ns)
+
+
 @functools.lru_cache(maxsize=256)
 def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str], int]:
     """Topics of a file, its damage, and the time of its first message."""
+    if rosbag2.READS_BAGS:
+        there, first_ns = rosbag2.topics(file)
+        return [Topic(*topic) for topic in there], [], first_ns
     summary = read_summary(file)
     damage: list[str] = []
     if summary is not None and summary.statistics is not None and (listed := _summary(summary)):
@@ -386,7 +405,7 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
     if not fitting:
         listed = ', '.join(topic.name for topic in there) or 'none'
         raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
-    raise BagError(f'{where}: several topics of type {type_name}, choose one: {listed}')
+    raise BagError(f'{where}: several topics of type {type_name}: {listed}')
 
 
 def read_raw(
@@ -428,6 +447,8 @@ def read_observations(
 def decode(raw: RawMessage) -> Message:
     """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
     try:
+        if rosbag2.READS_BAGS:
+            return rosbag2.decode(raw.view, raw.type_name)
         store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.view, raw.type_name)
     # The exceptions of wrong bytes depend on the field and have no common base class.
@@ -450,7 +471,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
     listed = [folder / name for name in names if (folder / name).is_file()]
-    files = listed or [path for path in here if path.suffix == '.mcap' and path.is_file()]
+    files = listed or [path for path in here if path.suffix in _SUFFIXES and path.is_file()]
     if not files:
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside else ''

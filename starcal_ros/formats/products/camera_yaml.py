@@ -94,6 +94,8 @@ def _camera_info_values(text: str) -> Mapping[str, Any]:
     content = yaml_value(text)
     if not isinstance(content, dict):
         raise ValueError('not a camera YAML (no keys)')
+    if any(isinstance(body, dict) and 'ros__parameters' in body for body in content.values()):
+        raise ValueError('a parameter file, not a camera file: give it as --params')
     if 'cam1' in content:
         raise ValueError('several cameras of kalibr: keep cam0, of this camera, alone')
     if isinstance(kalibr := content.get('cam0'), dict):

@@ -194,8 +194,10 @@ def of_colour(path: Path, images: list[Image]) -> None:
 STATED = f'--params {TINY}/params.yaml -o out'
 WRONG = [
     ('calibrate {bag}', ['-o/--output DIR: not given', '-o out']),
-    ('calibrate params.yaml -o out', ['parameters: --params params.yaml takes it']),
-    ('calibrate camera.yaml -o out', ['a camera file: --set camera_info_url=camera.yaml']),
+    ('calibrate params.yaml -o out',
+     ['parameters: give a bag or images, and --params params.yaml']),
+    ('calibrate camera.yaml -o out',
+     ['a camera file: give a bag or images, and --set camera_info_url=camera.yaml']),
     ('calibrate {bag} --params camera.yaml -o out',
      ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
     ('calibrate {bag} -o out --set camera_info_url=none.yaml',
@@ -205,7 +207,17 @@ WRONG = [
     ('calibrate {bag} -o out --set obsrver=ground', ['--set obsrver', 'did you mean observer?']),
     ('calibrate {bag} -o out --set observer', ['--set', 'not of the form NAME=VALUE']),
     ('calibrate {bag} -o out --require line=5arcsec', ['requirements: line is not']),
-    ('calibrate {bag} -o out --require map=5', ['the sigma of map is in arcsec or px']),
+    ('calibrate {bag} -o out --require map=5', ['unit', 'write map=5arcsec or map=5px']),
+    ('calibrate {bag} -o out --require map=5px@150%', ['the share at most 100 %']),
+    ('calibrate {bag} -o out --observer ground',
+     ['did you mean --set observer=VALUE?', 'starcal calibrate --help']),
+    ('calibrate {bag} -o out --set camera_info_url=params.yaml',
+     ['params.yaml: a parameter file, not a camera file: give it as --params']),
+    ('calibrate night {bag} -o out', [': a bag, and the other paths hold images']),
+    ('calibrate nothing -o out', ['nothing: no .mcap files in the folder, nor images']),
+    ('calibrate nothing/notes.txt -o out', ['notes.txt: not an MCAP bag, nor images']),
+    ('plan nothing', ['nothing: no .mcap files in the folder, nor images']),
+    ('plan night --set star_tracker_slow_arcsec=5', ['--camera-alone']),
     ('calibrate {bag} -o out --focal-length-mm 50', ['--pixel-size-um: bags need both']),
     ('calibrate {bag} {stated} --focal-length-mm 50', ['a camera_info_url has them already']),
     ('calibrate {bag} -o out --json --quiet', ['--quiet: not allowed with argument --json']),
@@ -229,6 +241,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, tiny_images: list[Image]) -
     for name in ('params.yaml', 'camera.yaml'):
         shutil.copy(TINY / name, folder)
     write_pngs(folder / 'night', tiny_images[:3])
+    (folder / 'nothing').mkdir()
+    (folder / 'nothing' / 'notes.txt').write_text('notes')
     with BagWriter(folder / 'night.mcap') as writer:
         for image in tiny_images[:3]:
             writer.write_image(IMAGES, image, 'camera')

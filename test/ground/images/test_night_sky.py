@@ -153,7 +153,7 @@ def test_two_images_are_too_few(tmp_path: Path) -> None:
 def test_one_frame_many_times_is_too_few(tmp_path: Path) -> None:
     pixels = tiny_images()[0].pixels
     folder = write_pngs([pixels] * 4, tmp_path / 'night')
-    said = r'1 different images \(3 more are copies\), 3 are needed: take 20 frames'
+    said = r'1 different image \(3 more are copies\), 3 are needed: take 20 frames'
     with pytest.raises(NotFromStars, match=said):
         calibrate_images(folder)
 
@@ -308,7 +308,7 @@ def test_copies_that_were_compressed_again_are_one_image(tmp_path: Path) -> None
     pixels = (tiny_images()[0].pixels + 200.0 + noise).clip(0).astype(np.uint16)
     copies = [jpeg(pixels, quality) for quality in (95, 90, 80, 70)]
     folder = write_pngs(copies, tmp_path / 'night')
-    with pytest.raises(NotFromStars, match=r'1 different images \(3 more are copies\)'):
+    with pytest.raises(NotFromStars, match=r'1 different image \(3 more are copies\)'):
         calibrate_images(folder)
 
 
@@ -361,5 +361,5 @@ def test_images_identified_and_then_refused_are_counted_with_the_reason() -> Non
     detail = 'stars match in one part of the image only'
     images = [refused_image(time_ns, 640, 512, 'no_match', detail) for time_ns in (1, 2, 3)]
     _, note = sky.through_air(images)
-    assert note == (f'2 images are refused as no_match though identified by their stars: {detail}')
+    assert note == (f'2 of 3 images, identified by their stars, refused as no_match: {detail}')
     assert sky.through_air(images[2:])[1] == ''

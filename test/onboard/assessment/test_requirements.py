@@ -85,13 +85,13 @@ def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
         ('5arcsec', 'is not of the form line_of_sight=5arcsec@98%'),
         ('line_of_sight=5arcsec@98', 'is not of the form'),
         ('line_of_site=5arcsec', 'did you mean line_of_sight?'),
-        ('line_of_sight=5px', 'the sigma of line_of_sight is in arcsec'),
-        ('map=5', 'in arcsec or px'),
-        ('k1=1px', 'without a unit'),
+        ('line_of_sight=5px', 'write line_of_sight=5arcsec'),
+        ('map=5', 'write map=5arcsec or map=5px'),
+        ('k1=1px', 'write k1=1'),
         ('f=0.1.2px', 'not a number'),
         ('f=0.1px@98%', 'only line_of_sight and map are over a share'),
-        ('map=0px', 'above 0, over at most 100 %'),
-        ('map=1px@101%', 'above 0, over at most 100 %'),
+        ('map=0px', 'above 0, and the share at most 100 %'),
+        ('map=1px@101%', 'above 0, and the share at most 100 %'),
     ],
 )
 def test_what_is_not_understood_is_named(text: str, words: str) -> None:
