@@ -370,12 +370,11 @@ def _find(
         return matched_px, near, streak
     except ImageRefused:
         pass
-    sources = detect(pixels, background)
+    sources, streak = without_streaks(pixels, background, detect(pixels, background), camera)
     if len(sources.snr) < _MIN_STARS:
         raise ImageRefused(
             'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
         )
-    sources, streak = without_streaks(pixels, background, sources, camera)
     tilt_rad, roll_rad = search.reach_rad(camera)
     reach_px = tilt_rad * float(camera.parameters[0])
     return acquire(prediction, sources, geometry, reach_px, roll_rad), sources, streak
