@@ -182,8 +182,10 @@ def measure_predicted(
     ``instrument`` is the PSF and gain of earlier images, None at the first image.  With too few
     measured stars the observations have the refusal ``too_few_stars``.
 
+    Streaks that the instrument does not have are measured, and leave it unchanged.
+
     Raises ImageRefused ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses
-    contradict the catalog, or where stars are streaks that the instrument does not have.
+    contradict the catalog, ``smeared`` where streaks are too long.
     """
     catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
@@ -194,9 +196,15 @@ def measure_predicted(
     measured = measure_stars(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
+    own_streak = None
     if instrument is not None and shape_changed(measured, model):
         looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
-        _refuse_streaks(exposure.image, looked_at, measured, model)
+        model = _with_streaks(exposure.image, looked_at, measured, model, search.centroid)
+        if own_streak := model.streak:
+            measured = measure_stars(
+                *(exposure.image.pixels, shown.xy_px[:count], model),
+                *(search.centroid, exposure.hot_pixels),
+            )
     # Faint stars are refused, but their light may pull the centroids of the others.
     faint = with_faint(measured, shown.xy_px)
     deeper = deeper_stars(
@@ -230,7 +238,7 @@ def measure_predicted(
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(exposure, shown, catalog, centroids, model)
-    if observations.refusal or measured.fit is None:
+    if observations.refusal or measured.fit is None or own_streak is not None:
         return observations, instrument
     fitted = measured.fitted
     stars = MeasuredStars(
@@ -244,16 +252,21 @@ def measure_predicted(
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
 
 
-def _refuse_streaks(
-    image: Image, shown: Prediction, measured: Centroids, model: ImageModel
-) -> None:
-    """Leave streaks to the search; the focus may drift from image to image without."""
+def _with_streaks(
+    image: Image,
+    shown: Prediction,
+    measured: Centroids,
+    model: ImageModel,
+    options: CentroidOptions,
+) -> ImageModel:
+    """Model of an image whose stars are streaks; unchanged without: the focus may have drifted."""
     snr = np.nan_to_num(measured.snr)
     order = np.argsort(-snr, kind='stable')
     sources = Sources(shown.xy_px[order], snr[order], float(image.pixels.size))
-    _, streak = without_streaks(image.pixels, model.background, sources, shown.camera)
-    if streak is not None:
-        raise ImageRefused('no_match', 'the stars are streaks, in the images before not')
+    sources, streak = without_streaks(image.pixels, model.background, sources, shown.camera)
+    if streak is None:
+        return model
+    return model_image(image.pixels, model.background, sources, options, streak)
 
 
 def _observations(
@@ -371,12 +384,11 @@ def _find(
         return matched_px, near, streak
     except ImageRefused:
         pass
-    sources = detect(pixels, background)
+    sources, streak = without_streaks(pixels, background, detect(pixels, background), camera)
     if len(sources.snr) < _MIN_STARS:
         raise ImageRefused(
             'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
         )
-    sources, streak = without_streaks(pixels, background, sources, camera)
     tilt_rad, roll_rad = search.reach_rad(camera)
     reach_px = tilt_rad * float(camera.parameters[0])
     return acquire(prediction, sources, geometry, reach_px, roll_rad), sources, streak

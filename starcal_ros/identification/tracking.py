@@ -94,8 +94,8 @@ def track_stars(
     """
     Observations of the next image, and the updated track.
 
-    Raises ImageRefused ``no_match`` if the track is lost or its PSF is another one, as where the
-    camera turned during the exposure; ``too_few_stars`` or ``incomplete``.
+    Raises ImageRefused ``no_match`` if the track is lost; ``too_few_stars``, ``incomplete`` or
+    ``smeared``.
     """
     pixels = exposure.image.pixels
     prediction = _predict(exposure, before, search)

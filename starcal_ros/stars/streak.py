@@ -36,6 +36,9 @@ _LEVEL = 0.3  # pixels above this part of the peak, joined to it, are the source
 _NOISE = 3.0  # and this many sigma above the background
 _SHORTEST = 0.35  # s^2 / 12 over the variance of the PSF: what shape_median allows without streaks
 _EXPLAINED = 0.5  # part of the elongation that a turn of the camera may leave
+# Shares of a window that a source fills: a core that may be of a body, as of a planet or its limb,
+# and a window that is; a streak from rim to rim fills a fifth.
+_LARGE, _BODY = 0.75, 0.4
 _STEPS = 8
 _APART_PX = 4.0  # sources nearer than this, or half a streak, are parts of one
 
@@ -79,6 +82,8 @@ def without_streaks(
     """
     Sources at the middle of their streaks, each streak once, and the turn; None if they are sharp.
 
+    Sources that are parts of a body larger than a star are left out.
+
     Raises ImageRefused ``smeared`` where the streaks are longer than `LONGEST_PX`.
     """
     bright = sources.xy_px[sources.snr > _BRIGHT_SNR][:_MOST]
@@ -86,11 +91,16 @@ def without_streaks(
         return sources, None
     # Most images are sharp, which the cores of the brightest show.
     tested = bright[: min(_TESTED, np.count_nonzero(sources.snr > _TESTED_SNR))]
-    if len(tested) >= _FEWEST and not _elongated(
-        _extents(pixels, background, tested, _CORE_PX)[1]
-    ):
-        return sources, None
-    middle_px, moments_px2 = _extents(pixels, background, bright, _HALF_PX)
+    if len(tested) >= _FEWEST:
+        _, moments_px2, lit = _extents(pixels, background, tested, _CORE_PX)
+        if not _elongated(moments_px2) and lit.max() < _LARGE:
+            return sources, None
+    middle_px, moments_px2, lit = _extents(pixels, background, bright, _HALF_PX)
+    if lit.max() > _BODY:
+        # The limb of a body outshines the stars, and its sources are as long as streaks.
+        is_star = _extents(pixels, background, sources.xy_px, _HALF_PX)[2] <= _BODY
+        stars = Sources(sources.xy_px[is_star], sources.snr[is_star], sources.searched_px2)
+        return without_streaks(pixels, background, stars, camera)
     apart = _apart(middle_px, _APART_PX)
     middle_px, moments_px2 = middle_px[apart], moments_px2[apart]
     streak = _turn(camera, middle_px, moments_px2)
@@ -102,7 +112,7 @@ def without_streaks(
             'smeared',
             f'the stars are streaks of {length_px:.0f} px, up to {LONGEST_PX:g} can be measured',
         )
-    middle_px, _ = _extents(pixels, background, sources.xy_px, _HALF_PX)
+    middle_px = _extents(pixels, background, sources.xy_px, _HALF_PX)[0]
     apart = _apart(middle_px, max(_APART_PX, 0.5 * length_px))
     return Sources(middle_px[apart], sources.snr[apart], sources.searched_px2), streak
 
@@ -133,8 +143,12 @@ def _elongation(moments_px2: Floats) -> tuple[Floats, float]:
 
 def _extents(
     pixels: Pixels, background: Background, xy_px: Floats, half_px: int
-) -> tuple[Floats, Floats]:
-    """Centres of light (n, 2) and second moments (n, 3) uu, vv, uv of the sources at (n, 2)."""
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Centres of light (n, 2) and second moments (n, 3) uu, vv, uv of the sources at (n, 2).
+
+    Also the share (n,) of its window that each fills.
+    """
     centre = np.rint(xy_px).astype(np.int64)
     stamps, outside = stamps_at_edges(pixels, centre, half_px)
     stamps -= background.level_at(centre)[:, None, None]
@@ -149,7 +163,8 @@ def _extents(
     joins[1] = True
     part, _ = label(lit, joins)
     own = part[:, half_px, half_px]
-    light = np.where((part == own[:, None, None]) & (own > 0)[:, None, None], stamps, 0.0)
+    is_own = (part == own[:, None, None]) & (own > 0)[:, None, None]
+    light = np.where(is_own, stamps, 0.0)
     reach = np.arange(-half_px, half_px + 1.0)
     across, down = light.sum(axis=1), light.sum(axis=2)
     flux = np.maximum(across.sum(axis=1), 1e-9)
@@ -157,7 +172,7 @@ def _extents(
     uu, vv = across @ reach**2 / flux - u * u, down @ reach**2 / flux - v * v
     uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
     moments_px2 = np.stack([uu - 1.0, vv - 1.0, uv], axis=-1)  # the filter adds its variance
-    return centre + np.stack([u, v], axis=-1), moments_px2
+    return centre + np.stack([u, v], axis=-1), moments_px2, is_own.mean(axis=(1, 2))
 
 
 def _turn(camera: CameraModel, xy_px: Floats, moments_px2: Floats) -> Streak | None:

@@ -34,6 +34,7 @@ _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
 _ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
 _PAIRS = np.array(list(itertools.combinations(range(4), 2)))
 _OTHERS = np.array([[k for k in range(4) if k not in pair] for pair in _PAIRS])
+_AT_ONCE = 30_000  # patterns
 _CELL = 0.04  # about twice the tolerance: two cells along each place, and a table of a few MB
 
 
@@ -78,27 +79,41 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
         centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
     else:
         centres = _occupied(stars, _SPACING * radius_rad)
-    members = brightest_within(cKDTree(stars), centres, radius_rad, of_disc)
+    tree = cKDTree(stars)
+    # Outside the region of a deep table nearly all discs are without a pattern.
+    chord = 2 * math.sin(radius_rad / 2)
+    held = tree.query_ball_point(centres, chord, return_length=True)
+    members = brightest_within(tree, centres[held >= 4], radius_rad, of_disc)
     chosen = np.array(list(itertools.combinations(range(of_disc), 4)))
-    quads = np.sort(members[:, chosen].reshape(-1, 4), axis=1)
-    quads = quads[quads[:, 0] >= 0]  # -1 fills up a disc with fewer stars
+    # Rows ascend within a disc, and -1 fills up one with fewer stars.
+    quads: Indices = members[:, chosen].reshape(-1, 4)
+    quads = quads[quads[:, 3] >= 0]
     first, second = quads[:, 0] << 32 | quads[:, 1], quads[:, 2] << 32 | quads[:, 3]
     by_pattern = np.lexsort([second, first])
     first, second = first[by_pattern], second[by_pattern]
     differs = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
     quads = quads[by_pattern[differs]]
-    order, shape = shapes(stars[quads])
+    order, shape = _in_parts(stars, quads)
     rows, grid = shape_grid(shape)
     return PatternIndex(radius_rad, np.take_along_axis(quads, order, axis=1)[rows], grid)
 
 
+def _in_parts(stars: Floats, quads: Indices) -> tuple[Indices, Floats]:
+    """`shapes` of rows (n, 4) of stars; the arrays of all at once would not fit into a cache."""
+    parts = np.array_split(quads, len(quads) // _AT_ONCE + 1)
+    orders, found = zip(*(shapes(stars[part]) for part in parts), strict=True)
+    return np.concatenate(orders), np.concatenate(found)
+
+
 def _occupied(stars: Floats, side_rad: float) -> Floats:
     """Middles (p, 3) of the cells of about this side that hold some of the stars (n, 3)."""
-    dec = (np.floor(np.arcsin(np.clip(stars[:, 2], -1.0, 1.0)) / side_rad) + 0.5) * side_rad
-    around = np.maximum(np.floor(2 * math.pi * np.cos(dec) / side_rad), 1.0)
+    band = np.floor(np.arcsin(np.clip(stars[:, 2], -1.0, 1.0)) / side_rad)
+    around = np.maximum(np.floor(2 * math.pi * np.cos((band + 0.5) * side_rad) / side_rad), 1.0)
     turn = np.arctan2(stars[:, 1], stars[:, 0]) / (2 * math.pi) % 1.0
-    ra = (np.floor(turn * around) + 0.5) / around * (2 * math.pi)
-    dec, ra = np.unique(np.stack([dec, ra]), axis=1)
+    cell = band.astype(np.int64) << 32 | np.floor(turn * around).astype(np.int64)
+    _, first = np.unique(cell, return_index=True)
+    dec = (band[first] + 0.5) * side_rad
+    ra = (np.floor(turn * around)[first] + 0.5) / around[first] * (2 * math.pi)
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 
 

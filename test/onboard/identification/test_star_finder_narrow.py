@@ -113,6 +113,31 @@ def test_fewer_than_five_stars_are_refused_with_the_reason() -> None:
         observed(0.3, 1, 0.01, 0.01, 3)
 
 
+@pytest.mark.parametrize(
+    ('middle_px', 'radius_px'),
+    [((400.0, 320.0), 60.0), ((650.0, 500.0), 150.0), ((0.0, 0.0), 300.0)],
+    ids=['disc', 'large disc', 'limb'],
+)
+@pytest.mark.parametrize('off_deg', [0.002, 0.3], ids=['near', 'searched'])
+def test_the_limb_of_a_body_is_no_streak(
+    middle_px: tuple[float, float],
+    radius_px: float,
+    off_deg: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, image = shown(0.5, 4)
+    v, u = np.indices(image.pixels.shape)
+    lit = np.hypot(u - middle_px[0], v - middle_px[1]) < radius_px
+    # Its light has the noise of photons, which makes sources all over it.
+    noise = np.random.default_rng(1).normal(size=lit.shape)
+    pixels = np.where(lit, 9000.0 + 95.0 * noise, image.pixels).astype(np.uint16)
+    monkeypatch.setattr(f'{__name__}.shown', lambda *_: (one, Image(image.time_ns, pixels)))
+    found = observed(0.5, 4, off_deg, 0.2)
+    assert not found.refusal, found.detail
+    assert len(found.catalog_id) >= 8
+    assert wrong(found, one) == 0
+
+
 def test_a_catalog_of_another_region_is_said_to_be() -> None:
     one, image = shown(0.3, 1)
     exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)

@@ -73,11 +73,11 @@ def test_streaks_are_measured_at_their_middle(turn_rad: np.ndarray, tracked: boo
     if tracked:
         track = start_tracking(SCENARIO.prior, before, instrument)
         assert track is not None
-        # The track is sharp: it leaves the image to the search, as any other that it cannot fit.
-        with pytest.raises(ImageRefused, match='streaks|match'):
-            track_stars(image, track, SEARCH)
-        return
-    observations, _ = observe_stars(image, SCENARIO.prior, SEARCH)
+        observations, after = track_stars(image, track, SEARCH)
+        # The next image may be sharp again.
+        assert after.instrument is track.instrument
+    else:
+        observations, _ = observe_stars(image, SCENARIO.prior, SEARCH)
     assert len(observations) > LEAST * len(before)
     error = errors_sigma(shown, observations)
     assert 0.85 < np.sqrt(np.mean(error**2)) < 1.15
