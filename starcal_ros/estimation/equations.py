@@ -181,8 +181,8 @@ def _predicted_px(chunk: Chunk, residual: Floats) -> Floats:
 def star_sums(linear: Linearisation) -> StarSums:
     """Return the sums over the stars at a state."""
     layout, measurements = linear.layout, linear.measurements
-    functions = layout['field'].functions if 'field' in layout else None
-    t = len(layout['field']) // 2 if functions is not None else 0
+    field = next((entry for entry in layout.entries if entry.functions is not None), None)
+    t = len(field) // 2 if field is not None else 0
     blocks: Floats = np.empty((0, 0, 0))
     cross = blocks
     uu, uv, vv = np.zeros((3, t, t))
@@ -194,9 +194,11 @@ def star_sums(linear: Linearisation) -> StarSums:
             cross = np.zeros((measurements.image_count, 2 * t, c))
         by_image = Z.reshape(2, c, m, n).transpose(0, 2, 1, 3)
         blocks[chunk.image] = (by_image @ by_image.transpose(0, 1, 3, 2)).sum(axis=0)
-        if functions is None:
+        if field is None:
             continue
-        phi = functions(linear.predicted_px[chunk.row].T)
+        assert field.functions is not None and field.products is not None
+        predicted_px = linear.predicted_px[chunk.row].T
+        phi = field.functions(predicted_px)
         wuu, wuv, wvv = chunk.whitener
         of_image = phi.reshape(t, m, n).transpose(1, 0, 2)
         for part, columns in (
@@ -204,13 +206,10 @@ def star_sums(linear: Linearisation) -> StarSums:
             (slice(t, 2 * t), wuv * Z[0] + wvv * Z[1]),
         ):
             cross[chunk.image, part] = of_image @ columns.reshape(c, m, n).transpose(1, 2, 0)
-        of_u, of_v = phi * wuu, phi * wvv
-        uu += of_u @ of_u.T
-        vv += of_v @ of_v.T
-        if wuv.any():
-            mixed = phi * wuv
-            uv += of_u @ mixed.T
-            vv += mixed @ mixed.T
+        weights = [wuu * wuu, wvv * wvv + wuv * wuv, wuu * wuv][: 3 if wuv.any() else 2]
+        products = field.products(predicted_px, np.stack(weights))
+        for total, part in zip((uu, vv, uv), products, strict=False):
+            total += part
     information = np.block([[uu, uv], [uv.T, vv]])
     return _chained(blocks, information, cross, linear.problem, layout)
 

@@ -6,10 +6,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from random_pointings import HEIGHT, WIDTH  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.camera import detector_field
 from starcal_ros.camera.detector_field import basis, cosine_terms, DetectorField, term_count
 
 
@@ -29,6 +31,20 @@ def test_an_octave_of_cosines_ends_at_half_its_longest_wave() -> None:
         assert length_px[octave == k].min() >= 0.5**k * WIDTH * (1 - 1e-12)
     for k in (1, 2):
         assert length_px[octave == k].max() < 0.5 ** (k - 1) * WIDTH
+
+
+@pytest.mark.parametrize(('width', 'height', 'octaves'), [(640, 512, 3), (300, 900, 2), (8, 8, 1)])
+def test_products_of_the_cosines_are_those_of_their_values(
+    width: int, height: int, octaves: int
+) -> None:
+    """Sums and differences of angles give the weighted Gram matrix to rounding."""
+    generator = np.random.default_rng(3)
+    pixels = generator.uniform(-0.5, [width - 0.5, height - 0.5], (500, 2))
+    weights = generator.normal(1.0, 1.0, (3, 500))
+    phi = basis(pixels, width, height, octaves)
+    products = detector_field.basis_products(pixels, weights, width, height, octaves)
+    for row, found in zip(weights, products, strict=True):
+        np.testing.assert_allclose(found, (phi.T * row) @ phi, rtol=0, atol=1e-10)
 
 
 def test_a_camera_with_a_field_projects_what_it_sees() -> None:
