@@ -36,7 +36,7 @@ from starcal_ros.estimation.equations import (
     Equations,
     Linearisation,
     seen_by_stars,
-    star_rows,
+    star_rows_by,
     StarSums,
     tracker_turns,
 )
@@ -458,15 +458,10 @@ def _of_observations(
     )
     if not groups.own_px2.any():  # the errors are those of the working weights
         return groups.own, {}
-    to_images = found.back @ root
-    for chunk, shared, own, _ in star_rows(linear):
-        m, _, n = chunk.direction_icrf.shape
-        X = (shared @ root - own @ to_images[chunk.image]).reshape(m, 2, n, r)
-        u, v = X.transpose(1, 0, 2, 3).reshape(2, m * n, r)
-        wuu, wuv, wvv = (one[:, None] for one in chunk.whitener)
-        Y = np.stack([wuu * u, wuv * u + wvv * v], axis=1)
+    for chunk, (u, v) in star_rows_by(linear, root, -found.back @ root):
+        wuu, wuv, wvv = chunk.whitener[..., None]
         real = chunk.whitener[0] > 0
-        groups.add(chunk.row[real], Y[real])
+        groups.add(chunk.row[real], np.stack([wuu * u, wuv * u + wvv * v], axis=1)[real])
     whole = groups.whole()
     return sum(whole.values(), -groups.own), whole
 
