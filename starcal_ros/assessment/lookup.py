@@ -150,18 +150,23 @@ class Derivatives:
         return np.asarray(sum(parts))
 
 
-def common_rotation(camera: CameraModel) -> Floats:
+def grid_derivatives(camera: CameraModel) -> Derivatives:
+    """Return those of a grid of pixels over the detector."""
+    return Derivatives.at(camera, pixel_grid(camera, GRID, GRID))
+
+
+def common_rotation(camera: CameraModel, grid: Derivatives | None = None) -> Floats:
     """
     Least-squares rotation (3, k) common to a grid of pixels, by the k numbers of `Derivatives`.
 
-    Zero for the alignment.
+    Zero for the alignment.  ``grid``: the `grid_derivatives`, where they are at hand.
     """
-    p = len(camera.parameters)
-    grid = Derivatives.at(camera, pixel_grid(camera, GRID, GRID))
+    p, grid = len(camera.parameters), grid or grid_derivatives(camera)
     seen = np.isfinite(grid.directions[:, 0])
-    grid.J[:, :, p : p + 3] = 0.0
     to_rotation = np.linalg.pinv(_rotations(grid.directions[seen]).reshape(-1, 3))
-    return np.asarray(to_rotation @ grid.J[seen].reshape(-1, grid.J.shape[-1]))
+    common = to_rotation @ grid.J[seen].reshape(-1, grid.J.shape[-1])
+    common[:, p : p + 3] = 0.0
+    return np.asarray(common)
 
 
 def _rotations(directions: Floats) -> Floats:

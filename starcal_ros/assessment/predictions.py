@@ -129,8 +129,10 @@ def _images(
         m, _, n = chunk.direction_icrf.shape
         real = chunk.whitener[0].reshape(m, n) > 0
         for i, rows in enumerate(chunk.row.reshape(m, n)):
-            used = np.tile(real[i], 2)
-            yield rows[real[i]], shared[i, used][:, part], own[i, used], left[i, used]
+            used = np.flatnonzero(np.tile(real[i], 2))
+            # The rows lie star by star: whole columns are copied.
+            columns = shared[i].T[np.ix_(part, used)].T
+            yield rows[real[i]], columns, own[i, used], left[i, used]
 
 
 def _predicted(
@@ -153,7 +155,7 @@ def _predicted(
     n = len(r) // 2
     try:
         factor = cho_factor(K.T @ K + own_prior, lower=True)
-        GJ = J - K @ cho_solve(factor, K.T @ J)
+        GJ = J - (cho_solve(factor, K.T @ J).T @ K.T).T
         Gr = r - K @ cho_solve(factor, K.T @ r)
         without = cho_factor(information - J.T @ GJ)
     except np.linalg.LinAlgError:
@@ -165,7 +167,7 @@ def _predicted(
     leverage, beyond = (back * K).sum(axis=1), V - 1.0
     variance = 1.0 - leverage + beyond * (1.0 - 2.0 * leverage)
     variance += ((back @ ((K.T * beyond) @ K)) * back).sum(axis=1)
-    variance += ((GJ @ (cho_solve(without, np.eye(J.shape[1])) + excess)) * GJ).sum(axis=1)
+    variance += (((cho_solve(without, np.eye(J.shape[1])) + excess) @ GJ.T) * GJ.T).sum(axis=0)
     return (Gr**2).reshape(2, n).sum(axis=0), variance.reshape(2, n).sum(axis=0)
 
 

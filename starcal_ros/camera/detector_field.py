@@ -48,19 +48,46 @@ def basis(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
     """Return the functions (n, t) of a field at pixels (n, 2)."""
     pixels = np.asarray(pixels, np.float64)
     terms, _ = cosine_terms(width, height, octaves)
-    along = []
-    for axis, size in enumerate((width, height)):
-        x = ((pixels[:, axis] + 0.5) / size - 0.5) / COSINE_DOMAIN + 0.5
-        waves = np.ones((max(int(terms[:, axis].max()) + 1, 2), len(x)))
-        np.cos(np.pi * x, out=waves[1])
-        for k in range(2, len(waves)):  # Chebyshev's recursion: a tenth of the time of cosines
-            waves[k] = 2.0 * waves[1] * waves[k - 1] - waves[k - 2]
+    along = _waves(pixels, (width, height), terms.max(axis=0))
+    for waves in along:
         waves[1:] *= math.sqrt(2.0)
-        along.append(waves)
     values = np.empty((len(terms), len(pixels)))
     for (i, j), row in zip(terms.tolist(), values, strict=True):
         np.multiply(along[0][i], along[1][j], out=row)
     return values.T
+
+
+def basis_products(
+    pixels: Floats, weights: Floats, width: int, height: int, octaves: int
+) -> Floats:
+    """
+    Return the products ``phi' diag(w) phi`` (k, t, t) of `basis` at pixels (n, 2).
+
+    For each row w of the weights (k, n).  A product of cosines is half of those of the sum and the
+    difference of their angles, so that few sums over the pixels give all: a twelfth of the time.
+    """
+    terms, _ = cosine_terms(width, height, octaves)
+    along = _waves(pixels, (width, height), 2 * terms.max(axis=0))
+    table = np.stack([(along[0] * row) @ along[1].T for row in weights])
+    (i, j), size = terms.T, np.where(terms > 0, math.sqrt(2.0), 1.0).prod(axis=1)
+    products = np.zeros((len(weights), len(terms), len(terms)))
+    for by_u in (np.add.outer(i, i), np.abs(np.subtract.outer(i, i))):
+        for by_v in (np.add.outer(j, j), np.abs(np.subtract.outer(j, j))):
+            products += table[:, by_u, by_v]
+    return np.asarray(0.25 * np.outer(size, size) * products)
+
+
+def _waves(pixels: Floats, sizes: tuple[int, int], most: Indices) -> list[Floats]:
+    """Return the cosines (k, n) of 0 to at least ``most`` (2,) half waves along u and along v."""
+    along: list[Floats] = []
+    for axis, size in enumerate(sizes):
+        x = ((pixels[:, axis] + 0.5) / size - 0.5) / COSINE_DOMAIN + 0.5
+        waves = np.ones((max(int(most[axis]) + 1, 2), len(x)))
+        np.cos(np.pi * x, out=waves[1])
+        for k in range(2, len(waves)):  # Chebyshev's recursion: a tenth of the time of cosines
+            waves[k] = 2.0 * waves[1] * waves[k - 1] - waves[k - 2]
+        along.append(waves)
+    return along
 
 
 def term_count(width: int, height: int, octaves: int) -> int:

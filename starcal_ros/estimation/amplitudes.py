@@ -167,7 +167,9 @@ def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
     if failed:
         raise np.linalg.LinAlgError('the information on the field is not positive definite')
     below, _ = dpotri(lower, lower=True)
-    return lower, below + np.tril(below, -1).T
+    inverse = below + below.T
+    inverse[np.diag_indices(len(inverse))] *= 0.5
+    return lower, inverse
 
 
 def averaged_field(
@@ -268,6 +270,7 @@ _CORRELATIONS: tuple[tuple[float, Callable[[Floats], Floats]], ...] = (
 _STEP_S = 100.0  # over which heat loses a tenth
 _MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
 _AT_ONCE = 8192  # images times amplitudes
+_AHEAD = 1024  # images times amplitudes that are tried before the one before them is settled
 _SHAPE_STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
 _SHAPE_SHIFTS = np.linspace(-8.0, 6.0, 43)
 _LOG_SHAPE = np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70)
@@ -294,7 +297,8 @@ class Shapes:
 def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
     """Return the amplitudes of the shapes; ``near``: those of the round before."""
     likelihood = _shape_likelihood(sums)
-    best, value = _climb(likelihood, sums.gradient.shape[1], near)
+    m, count = sums.gradient.shape
+    best, value = _climb(likelihood, count, max(_AHEAD // max(m, 1), 1), near)
     none = np.full(len(best), NO_AMPLITUDE)
     prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
     ratio = 2.0 * (value - float(likelihood(none[None])[0])) + float(prior)
@@ -385,7 +389,7 @@ def _inverse(matrices: Floats) -> tuple[Floats, Floats]:
 
 
 def _climb(
-    likelihood: Callable[[Floats], Floats], count: int, near: Amplitudes | None
+    likelihood: Callable[[Floats], Floats], count: int, ahead: int, near: Amplitudes | None
 ) -> tuple[Floats, float]:
     """
     Return the log amplitudes (count,) of the largest posterior, and its logarithm.
@@ -398,18 +402,23 @@ def _climb(
     values = likelihood(starts)
     best, value = starts[np.argmax(values)], float(values.max())
     for step in (0.0, 1.0, 0.3, 0.1):
-        improved = True
-        while improved:
-            improved = False
-            for k in range(count):
-                there = best[k] + step * np.array([-1.0, 1.0]) if step else coarse
-                there = there[(there > NO_AMPLITUDE) & (there < math.log(LARGEST_SHAPE_PX))]
-                trials = np.tile(best, (len(there), 1))
-                trials[:, k] = there
-                values = likelihood(trials)
-                if values.max(initial=-np.inf) > value + _SETTLED:
-                    best, value = trials[np.argmax(values)], float(values.max())
-                    improved = True
+        k = settled = 0  # the next amplitude, and how many before it did not improve
+        while settled < count:
+            at = np.arange(k, k + min(ahead, count - settled)) % count
+            there = np.tile(coarse, (len(at), 1))
+            if step:
+                there = best[at, None] + step * np.array([-1.0, 1.0])
+            trials = np.tile(best, (*there.shape, 1))
+            trials[np.arange(len(at)), :, at] = there
+            values = likelihood(trials.reshape(-1, count)).reshape(there.shape)
+            values[(there <= NO_AMPLITUDE) | (there >= math.log(LARGEST_SHAPE_PX))] = -np.inf
+            better = np.flatnonzero(values.max(axis=1) > value + _SETTLED)
+            k, settled = k + len(at), settled + len(at)
+            if len(better):
+                first = better[0]
+                at_best = values[first].argmax()
+                best, value = trials[first, at_best], float(values[first, at_best])
+                k, settled = int(at[first]) + 1, 0
     return best, value
 
 

@@ -14,6 +14,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve
 from scipy.sparse import csr_array
 
 from starcal_ros.arrays import Floats, Indices
@@ -35,7 +36,7 @@ from starcal_ros.estimation.equations import (
     Equations,
     Linearisation,
     seen_by_stars,
-    star_rows,
+    star_rows_by,
     StarSums,
     tracker_turns,
 )
@@ -155,11 +156,10 @@ def posterior(
     normal = arrow(sums, linear.problem, linear.state, layout)
     start = eliminated(normal, layout, before)
     solver = _Solver(layout)
-    base = solver.amplitudes(start, near.field if near else None)
+    base, field_px = solver.likely(start, near.field if near else None)
     none = Amplitudes(np.full(len(before), NO_AMPLITUDE), 0.0)
     found, last = Shapes(before, none, np.zeros(len(before))), start
     if len(sums.blocks) > 1:
-        field_px = solver.solve(start, base)[0][layout.places['field']]
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
         last = eliminated(normal, layout, found.sigma_px)
@@ -260,10 +260,14 @@ class _Solver:
         left = arrow.gradient[self.field] * self.unit - back.T @ gradient
         return 0.5 * (information + information.T), left, free, gradient, back
 
-    def amplitudes(self, arrow: Equations, near: Amplitudes | None) -> Amplitudes:
-        """Return the amplitudes of the octaves of the field."""
+    def likely(self, arrow: Equations, near: Amplitudes | None) -> tuple[Amplitudes, Floats]:
+        """Return the amplitudes of the octaves of the field, and its coefficients (q,) at them."""
         information, gradient, *_ = self._of_field(arrow)
-        return field_amplitudes(information, gradient, self.octave, near, self.first)
+        amplitudes = field_amplitudes(information, gradient, self.octave, near, self.first)
+        s = np.exp(amplitudes.log_px)[self.octave]
+        scaled = information * np.outer(s, s)
+        scaled[np.diag_indices(len(s))] += 1.0
+        return amplitudes, self.unit * s * solve(scaled, s * gradient, assume_a='pos')
 
     def solve(
         self, arrow: Equations, amplitudes: Amplitudes
@@ -454,15 +458,10 @@ def _of_observations(
     )
     if not groups.own_px2.any():  # the errors are those of the working weights
         return groups.own, {}
-    to_images = found.back @ root
-    for chunk, shared, own, _ in star_rows(linear):
-        m, _, n = chunk.direction_icrf.shape
-        X = (shared @ root - own @ to_images[chunk.image]).reshape(m, 2, n, r)
-        u, v = X.transpose(1, 0, 2, 3).reshape(2, m * n, r)
-        wuu, wuv, wvv = (one[:, None] for one in chunk.whitener)
-        Y = np.stack([wuu * u, wuv * u + wvv * v], axis=1)
+    for chunk, (u, v) in star_rows_by(linear, root, -found.back @ root):
+        wuu, wuv, wvv = chunk.whitener[..., None]
         real = chunk.whitener[0] > 0
-        groups.add(chunk.row[real], Y[real])
+        groups.add(chunk.row[real], np.stack([wuu * u, wuv * u + wvv * v], axis=1)[real])
     whole = groups.whole()
     return sum(whole.values(), -groups.own), whole
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import functools
 import math
 
 import numpy as np
@@ -317,6 +318,12 @@ def _next_octave(log_px: Floats) -> Floats:
     return np.asarray((1.0 - _OF_ONE_LENGTH) * kernel + _OF_ONE_LENGTH * alone / alone.sum())
 
 
+@functools.cache
+def _transition() -> Floats:
+    """Weights (240, 240) of an octave after one at each place of the grid."""
+    return _next_octave(_LOG_GRID)
+
+
 def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[float]:
     """
     Return the posterior mean variance, px^2, of errors in a chain, the first with its prior.
@@ -331,7 +338,7 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
     moments : sequence of (estimate, 1-sigma), px^2
         From `pair_moment`.
     """
-    transition = _next_octave(_LOG_GRID)
+    transition = _transition()
     forward = first
     likelihoods, before = [], []
     for estimate, sigma in moments:

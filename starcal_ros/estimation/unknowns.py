@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera.detector_field import basis, cosine_terms
+from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.amplitudes import UNSTATED
 from starcal_ros.estimation.problem import (
@@ -94,6 +94,8 @@ class Unknown:
     turn : Turn or None
     functions : Scalars or None
         q is twice their number: those of u, then those of v.
+    products : callable or None
+        Sums (k, t, t) of their products over pixels (2, n) with weights (k, n).
     octave : (q,) or None
         Octave of each coefficient of those functions.
     log_px : float, float
@@ -116,6 +118,7 @@ class Unknown:
     camera: Floats | None = None
     turn: Turn | None = None
     functions: Scalars | None = None
+    products: Callable[[Floats, Floats], Floats] | None = None
     octave: Indices | None = None
     log_px: tuple[float, float] = UNSTATED
     term: Floats | None = None
@@ -486,13 +489,25 @@ def _field(width: int, height: int) -> Unknown:
     def functions(pixels: Floats) -> Floats:
         return basis(pixels.T, width, height, FIELD_OCTAVES).T
 
+    def products(pixels: Floats, weights: Floats) -> Floats:
+        return basis_products(pixels.T, weights, width, height, FIELD_OCTAVES)
+
     labels = tuple(f'field_{i}_{j}_{axis}_px' for axis in 'uv' for i, j in terms)
     sigma = 1.0 / np.sqrt(np.bincount(octave)[octave])
     sigma = np.concatenate([sigma, sigma])
     octave = np.concatenate([octave, octave])
     value = np.zeros(len(labels))
     term = _next_lens_term(width, height)
-    return Unknown('field', labels, sigma, value, functions=functions, octave=octave, term=term)
+    return Unknown(
+        'field',
+        labels,
+        sigma,
+        value,
+        functions=functions,
+        products=products,
+        octave=octave,
+        term=term,
+    )
 
 
 @functools.lru_cache(maxsize=16)

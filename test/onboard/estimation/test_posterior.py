@@ -230,9 +230,9 @@ def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied
 
 
 def test_shapes_are_sought_beside_the_field_of_the_amplitudes_before(varied: Varied) -> None:
-    made, mode_px = varied.made, varied.found.field.log_px
-    shifts = varied.found.last_octave[0] - mode_px[-1]
-    mean, covariance, _ = mixture(made, varied.truth, mode_px, shifts, SHAPE)
+    made, octaves_px = varied.made, np.exp(varied.found.field.log_px)
+    precision = prior_precision(made, SHAPE, octaves_px)
+    mean, covariance, _ = solution(varied.truth, precision, prior_offset(made))
     field = made.layout.of(['field'])
     sigma = np.sqrt(np.diag(covariance)[field])
     assert np.abs((varied.field_px - mean[field]) / sigma).max() < 1e-5

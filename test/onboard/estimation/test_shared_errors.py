@@ -123,6 +123,7 @@ def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
 ) -> None:
     grid = np.linspace(math.log(1e-6), math.log(0.5), 40)
     monkeypatch.setattr(module, '_LOG_GRID', grid)
+    monkeypatch.setattr(module, '_transition', lambda: module._next_octave(grid))
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     moments = [(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)]
     found = chain_means(last[1] @ module._next_octave(last[0]), moments)
