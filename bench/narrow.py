@@ -27,8 +27,10 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import earth_velocity_m_s, load_set_up, observed, render_frame
 from bench.night_sky import off_arcsec
+from bench.peers import scamp
+from bench.peers.campaigns import Campaign
 from bench.table import Table
-from bench.trials import in_processes, rms
+from bench.trials import in_processes, rms, shape_errors_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
 from starcal_ground.mission.ingest.deep_catalog import catalog_file, integer_columns
@@ -38,7 +40,8 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.deep_sky import deep_sky, disc, log10_density
 from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import Inertial, Scenario
-from starcal_ros.camera import CameraModel
+from starcal_ros.assessment.lookup import GRID
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline import solve
@@ -61,7 +64,7 @@ _LEAST_ELECTRONS = 200.0  # of the faintest star that is measured
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """One line for each field, with attitudes, without, and with trails; two hours or a minute."""
+    """One line for each field, with attitudes, without, with trails; half an hour or a minute."""
     kinds = [
         *((field_deg, blind, 0.0) for field_deg in FIELDS_DEG for blind in (False, True)),
         *((field_deg, False, 0.0) for field_deg in WIDE_DEG),
@@ -87,6 +90,36 @@ def run(quick: bool) -> Iterator[Table]:
         )
         print(*table.rows[-1], flush=True)
     yield table
+    if scamp.INSTALLED:
+        yield _peer(seeds)
+
+
+def _peer(seeds: int) -> Table:
+    """Errors of SCAMP with the images and attitudes of `_with_attitudes`."""
+    columns = ('field deg', 'error / bound', 'median', 'images', 'stars', 's an image')
+    table = Table('Source Extractor and SCAMP, given attitudes', columns)
+    for field_deg in FIELDS_DEG:
+        trials = in_processes(by_scamp, range(seeds), [field_deg] * seeds)
+        error, *means = np.array(trials).T
+        table.add(field_deg, rms(error), float(np.median(error)), *np.mean(means, axis=1).tolist())
+        print(*table.rows[-1], flush=True)
+    return table
+
+
+def by_scamp(seed: int, field_deg: float) -> tuple[float, float, float, float]:
+    """Error over bound of SCAMP, its images and stars, and processor time of an image."""
+    given = scenario_of(field_deg, seed)
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        setup = load_set_up(given, **_write_catalog(given, Path(name)))
+    frames = tuple(render_frame(given, index) for index in range(IMAGES))
+    camera = given.truth.camera
+    pixels = pixel_grid(camera, GRID, GRID)
+    true = line_of_sight(camera, pixels)
+    campaign = Campaign('narrow', given, setup, Ensemble(), pixels, true, frames)
+    result = scamp.whole(campaign, 3.0 * mounting_sigma_rad(seed))
+    error_rad = rms(shape_errors_arcsec(true, result.directions)) * ARCSECOND_RAD
+    error = error_rad * float(camera.parameters[0]) / bound_px(given)
+    return error, float(result.frames), float(result.stars), result.processor_s / IMAGES
 
 
 @dataclasses.dataclass(frozen=True)

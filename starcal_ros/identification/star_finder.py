@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Pixels
@@ -57,6 +58,7 @@ _CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
 _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
 _DEEPER_SIGMA = 4.0  # distance from which a star that is not measured pulls no centroid
+_ON_STAR_PX = 2.0  # largest distance of the prediction of a source that shows the PSF
 _MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
 _FEWEST_IN_FIELD = 2.0  # catalog stars in an image, on average over the window of the search
 _NEAREST = 200  # brightest predictions, searched in windows first
@@ -159,7 +161,10 @@ def observe_stars(
     )
     _check_catalog(prediction, exposure, geometry, search)
     predicted_px, sources, streak = _find(image.pixels, background, prediction, geometry, search)
-    model = model_image(image.pixels, background, sources, search.centroid, streak)
+    # Cosmic rays and hot pixels may be brighter than the stars, and are sharper.
+    off_px, _ = cKDTree(np.nan_to_num(predicted_px, nan=-1e6)).query(sources.xy_px)
+    stars = sources.select(off_px < _ON_STAR_PX)
+    model = model_image(image.pixels, background, stars, search.centroid, streak)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
         sources = detect(image.pixels, background)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property, lru_cache
 import hashlib
+import itertools
 import math
 from pathlib import Path
 
@@ -159,8 +160,7 @@ class StarCatalog:
         """Rows (m,), ascending, of the stars near any of some directions (n, 3), as `cone`."""
         chord = 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
         rows = self._tree.query_ball_point(direction_icrs, chord)
-        indices = np.concatenate([np.empty(0, np.intp), *rows]).astype(np.intp)
-        return np.asarray(np.unique(indices))
+        return np.unique(np.fromiter(itertools.chain.from_iterable(rows), np.intp))
 
     def select(self, rows: Mask | Indices | NDArray[np.intp] | slice) -> StarCatalog:
         """Return the stars selected by a mask (n,), row numbers or a slice, in that order."""

@@ -80,7 +80,11 @@ class Sources:
 
     def brightest(self, count: int) -> Sources:
         """Return the brightest ``count`` sources of the same area."""
-        return Sources(self.xy_px[:count], self.snr[:count], self.searched_px2)
+        return self.select(slice(count))
+
+    def select(self, rows: Mask | slice) -> Sources:
+        """Return some of the sources, of the same area."""
+        return Sources(self.xy_px[rows], self.snr[rows], self.searched_px2)
 
 
 def measure_background(pixels: Pixels) -> Background:

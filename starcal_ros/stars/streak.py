@@ -9,6 +9,7 @@ the PSF fits find.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import functools
 import math
@@ -98,8 +99,8 @@ def without_streaks(
     middle_px, moments_px2, lit = _extents(pixels, background, bright, _HALF_PX)
     if lit.max() > _BODY:
         # The limb of a body outshines the stars, and its sources are as long as streaks.
-        is_star = _extents(pixels, background, sources.xy_px, _HALF_PX)[2] <= _BODY
-        stars = Sources(sources.xy_px[is_star], sources.snr[is_star], sources.searched_px2)
+        lit = _extents(pixels, background, sources.xy_px, _HALF_PX)[2]
+        stars = sources.select(lit <= _BODY)
         return without_streaks(pixels, background, stars, camera)
     apart = _apart(middle_px, _APART_PX)
     middle_px, moments_px2 = middle_px[apart], moments_px2[apart]
@@ -114,7 +115,7 @@ def without_streaks(
         )
     middle_px = _extents(pixels, background, sources.xy_px, _HALF_PX)[0]
     apart = _apart(middle_px, max(_APART_PX, 0.5 * length_px))
-    return Sources(middle_px[apart], sources.snr[apart], sources.searched_px2), streak
+    return dataclasses.replace(sources, xy_px=middle_px).select(apart), streak
 
 
 def _apart(xy_px: Floats, least_px: float) -> Mask:

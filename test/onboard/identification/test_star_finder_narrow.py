@@ -138,6 +138,22 @@ def test_the_limb_of_a_body_is_no_streak(
     assert wrong(found, one) == 0
 
 
+@pytest.mark.parametrize('rays', [0, 60])
+def test_the_psf_is_that_of_stars_not_of_cosmic_rays(
+    rays: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, image = shown(0.5, 4)
+    pixels, rng = image.pixels.copy(), np.random.default_rng(2)
+    v, u = rng.integers([5, 5], np.array(pixels.shape) - 5, (rays, 2)).T
+    for part, (down, across) in ((1.0, (0, 0)), (0.6, (0, 1)), (0.3, (1, 0))):
+        pixels[v + down, u + across] += np.uint16(part * 900)
+    monkeypatch.setattr(f'{__name__}.shown', lambda *_: (one, Image(image.time_ns, pixels)))
+    found = observed(0.5, 4, 0.002, 0.02)
+    assert found.psf_sigma_px == pytest.approx(given(0.5).detector.psf_sigma_px, rel=0.1)
+    assert len(found) >= 14
+    assert wrong(found, one) == 0
+
+
 def test_a_catalog_of_another_region_is_said_to_be() -> None:
     one, image = shown(0.3, 1)
     exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
