@@ -460,7 +460,9 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
         K = kernel(steps)
         ratio[j] = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
         for k in range(len(sigma_px)):  # the shapes in units of their noise
-            values, vectors = np.linalg.eigh(K * np.outer(root[:, k], root[:, k]))
+            values, vectors = information[used, k], np.eye(len(used))
+            if j:  # all but the first, without a correlation
+                values, vectors = np.linalg.eigh(K * np.outer(root[:, k], root[:, k]))
             ones, along = root[:, k] @ vectors, (left[:, k] / root[:, k]) @ vectors
             inverse = 1.0 / (1.0 + variance[:, None] * np.maximum(values, 0.0))
             of_ones, mean = inverse @ ones**2, inverse @ (ones * along)

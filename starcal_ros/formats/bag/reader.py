@@ -5,10 +5,10 @@ Bags to records; a bag may be damaged.
 MCAP is read without ROS.  Where the wheels for that are absent, rosbag2 of ROS reads MCAP and
 SQLite (`rosbag2`), up to the damage.
 
-One chunk of the file is in memory at a time.  A chunk with a wrong checksum is skipped.  If the
-bytes between chunks are damaged, reading continues at the next chunk listed in the summary; if the
-first chunk with the topic names is lost, the names come from the summary.  A truncated file has no
-summary and is read up to its end.
+Two chunks of the file are in memory at a time: one in use, one that another thread decompresses.
+A chunk with a wrong checksum is skipped.  If the bytes between chunks are damaged, reading
+continues at the next chunk listed in the summary; if the first chunk with the topic names is lost,
+the names come from the summary.  A truncated file has no summary and is read up to its end.
 
 The place of the damage and the lost messages are reported once, to ``on_damage``.  The lost are
 counted from the summary or, without one, from the indexes after each chunk.
@@ -17,8 +17,9 @@ counted from the summary or, without one, from the indexes after each chunk.
 from __future__ import annotations
 
 import bisect
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 import functools
 import io
@@ -185,16 +186,16 @@ class _Pieces:
         )
         read_to, chunk_is_sound = start, True
         try:
-            for record in reader.records:
+            for record, end, data in _decompressed(reader.records, stream):
                 passed = self._start_after(read_to)
-                if passed is not None and passed < stream.tell():
+                if passed is not None and passed < end:
                     # A wrong length or an unknown opcode has skipped the start of a chunk.
                     self.report(f'damaged after byte {read_to} of {size}')
                     return passed
-                read_to = stream.tell()
-                if isinstance(record, Chunk):
+                read_to = end
+                if data is not None:
                     self._has_chunks = True
-                    chunk_is_sound = yield from self._of_chunk(record, read_to)
+                    chunk_is_sound = yield from self._of_chunk(data, read_to)
                 elif isinstance(record, MessageIndex):
                     if not chunk_is_sound:
                         self.lost[record.channel_id] += len(record.records)
@@ -227,15 +228,50 @@ class _Pieces:
         k = bisect.bisect_right(self._starts, offset)
         return self._starts[k] if k < len(self._starts) else None
 
-    def _of_chunk(self, chunk: Chunk, end: int) -> Any:
+    def _of_chunk(self, data: Future[bytes], end: int) -> Any:
         """Records of a chunk; returns False if its checksum or compression is invalid."""
         try:
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+            content = data.result()
         except Exception as error:
             self.report(f'skipped the damaged chunk that ends at byte {end}: {error}')
             return False
-        yield from _inside(stream.read(length))
+        yield from _inside(content)
         return True
+
+
+def _decompressed(
+    records: Iterator[McapRecord], stream: IO[bytes]
+) -> Iterator[tuple[McapRecord, int, Future[bytes] | None]]:
+    """
+    Yield records, the offset after each, and the data of a chunk.
+
+    Another thread decompresses a chunk while the records of that before it are in use.  Damage is
+    raised after the records before it.
+    """
+    waiting: deque[tuple[McapRecord, int, Future[bytes] | None]] = deque()
+    chunks, record, damage = 0, None, None
+    with ThreadPoolExecutor(1, 'decompress') as thread:
+        while not isinstance(record, DataEnd):
+            try:
+                record = next(records)
+            except (StopIteration, *_DAMAGE_ERRORS) as error:
+                damage = error
+                break
+            data = thread.submit(_data_of, record) if isinstance(record, Chunk) else None
+            waiting.append((record, stream.tell(), data))
+            chunks += data is not None
+            while chunks > 1 or (waiting and not chunks):
+                chunks -= waiting[0][2] is not None
+                yield waiting.popleft()
+        while waiting:
+            yield waiting.popleft()
+    if damage is not None and not isinstance(damage, StopIteration):
+        raise damage
+
+
+def _data_of(chunk: Chunk) -> bytes:
+    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+    return stream.read(length)
 
 
 def _inside(data: bytes) -> Iterator[McapRecord]:

@@ -7,12 +7,13 @@ from pathlib import Path
 import re
 import subprocess
 import sys
+import threading
 from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import Footer
+from mcap.records import Chunk, Footer
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 import numpy as np
@@ -303,6 +304,26 @@ def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(writer_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
     return next(folder.glob('*.mcap'))
+
+
+def test_a_chunk_is_decompressed_while_the_one_before_it_is_in_use(
+    small_chunks: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One chunk ahead, not all of them: the memory is that of two."""
+    started, threads = threading.Semaphore(0), []
+    data_of = bag_reader._data_of
+
+    def recorded(chunk: Chunk) -> bytes:
+        threads.append(threading.current_thread())
+        started.release()
+        return data_of(chunk)
+
+    monkeypatch.setattr(bag_reader, '_data_of', recorded)
+    messages = bag_reader.read_messages(small_chunks, None, pytest.fail)
+    next(messages)
+    assert started.acquire(timeout=60.0) and started.acquire(timeout=60.0)
+    assert len(threads) == 2 and threading.current_thread() not in threads
+    messages.close()  # type: ignore[attr-defined]
 
 
 def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) -> None:
