@@ -64,14 +64,14 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     pixel_arcsec = 1.0 / calibration.geometry.camera.parameters[0] / ARCSECOND_RAD
     in_arcsec = f'{rms_px * pixel_arcsec:.2f}″ at {pixel_arcsec:.1f}″ per pixel'
     refused = _none(sum(calibration.images_refused.values()))
-    misfits = _none(len(calibration.misfit_images_ns))
+    misfits = f'; attitude misfits among those used: {_none(len(calibration.misfit_images_ns))}'
     outliers = _none(calibration.stars_rejected)
     results = [
         ('Residual', f'{rms_px:.3f} px', f'rms per axis; {in_arcsec}'),
         (
             'Images',
             f'{calibration.images_used:,}',
-            f'used; {refused} refused; attitude misfits among those used: {misfits}',
+            f'used; {refused} refused{misfits if calibration.has_alignment else ""}',
         ),
         ('Stars', f'{calibration.stars_used:,}', f'used; outliers left out: {outliers}'),
     ]

@@ -238,15 +238,15 @@ def print_calibration(
     print_text(f'lens model {camera.model}, {camera.width} x {camera.height} px\n')
     rows = verdict.parameter_rows(calibration, prior)
     angles = verdict.alignment_rows(calibration, prior)
-    print_table(
-        ('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas'),
-        [
-            (f'{kind}{row.name}', row.value, unit, row.sigma, row.change, row.change_sigmas)
-            for kind, of_kind in (('', rows), ('alignment ', angles))
-            for row in of_kind
-            for unit in [row.unit.replace('arcsec', '″')]
-        ],
-    )
+    table = [
+        (f'{kind}{row.name}', row.value, unit, row.sigma, row.change, row.change_sigmas)
+        for kind, of_kind in (('', rows), ('alignment ', angles))
+        for row in of_kind
+        for unit in [row.unit.replace('arcsec', '″')]
+    ]
+    columns = 6 if any(row.change for row in (*rows, *angles)) else 4  # the stars have no prior
+    header = ('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas')
+    print_table(header[:columns], [row[:columns] for row in table])
     refused = ', '.join(f'{n} {reason}' for reason, n in calibration.images_refused.items())
     lines = [
         ('images', f'{calibration.images_used} used, refused: {refused or "none"}'),

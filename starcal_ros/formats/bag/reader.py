@@ -53,6 +53,9 @@ if not rosbag2.READS_BAGS:
 
     from starcal_ros.formats.bag.typestore import typestore_of
 
+    # Damaged bytes are parsed as an arbitrary record: the exceptions have no common base class.
+    _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
+
 Damage = Callable[[str], None]
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -61,8 +64,6 @@ _SUFFIXES = ('.mcap', '.db3') if rosbag2.READS_BAGS else ('.mcap',)
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
-# Damaged bytes are parsed as an arbitrary record, so the exceptions have no common base class.
-_DAMAGE_ERRORS = (ValueError, struct.error, KeyError, OverflowError, MemoryError)
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
@@ -209,7 +210,7 @@ class _Pieces:
                     self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
             self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')
-        except (McapError, *_DAMAGE_ERRORS) as error:
+        except _DAMAGE_ERRORS as error:
             following = self._start_after(read_to)
             if following is None and not self._reported:
                 at_end = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
