@@ -192,8 +192,8 @@ def shared_errors(
         pair_moment(residual_px, weight, kind.group, kind.of_one_star) for kind in groups[1:]
     ]
     # What a star shows at one place of the detector may be of the star or of the detector.
-    together = _pairs(working * np.sqrt(groups[0].together), star)
-    share = together / max(_pairs(working, star), 1e-300)
+    together = max(_pairs(working * np.sqrt(groups[0].together), star), 0.0)
+    share = together / max(_pairs(working, star), together, 1e-300)
     octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
     variances = chain_means(longest * _beside_stars(of_places, share), moments[:octaves])
     # Strips of rows and of columns are chains of their own, from the coarser to the finer.
