@@ -115,7 +115,8 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     """
     Return the groups of observations at pixels (n, 2) of stars (n,) on a detector of a width, px.
 
-    The stars, the cells of the fine octaves, from the coarsest, and strips of rows and columns.
+    The stars, the cells of the fine octaves, from the coarsest of a 24th of the width, and strips
+    of rows and columns.
     """
     found = [Groups('star places', star, None, _together(pixels, star, width))]
     for wave in _FINE_OCTAVES:
@@ -132,16 +133,11 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
 
 def _together(pixels: Floats, star: Indices, width: int) -> Floats:
     """Return `Groups.together` (n,), as of a wave: by the scatter of a star over the detector."""
-    count = np.maximum(np.bincount(star), 1)
-    middle = np.stack([np.bincount(star, axis) / count for axis in pixels.T], axis=1)
-    spread_px2 = np.bincount(star, ((pixels - middle[star]) ** 2).sum(axis=1)) / count
+    sightings = np.bincount(star)[star]
+    off = [pixel - np.bincount(star, pixel)[star] / sightings for pixel in pixels.T]
+    spread_px2 = np.bincount(star, off[0] ** 2 + off[1] ** 2)[star] / sightings
     usual_px = _FINE_OCTAVES[0] * width / (2.0 * math.pi * math.sqrt(2.0))
-    return np.asarray(np.exp(-spread_px2 / usual_px**2)[star])
-
-
-def coarsest_cells(groups: Sequence[Groups]) -> Groups:
-    """Return the cells of the first of the fine octaves: of a 24th of the width."""
-    return groups[1]
+    return np.asarray(np.exp(-spread_px2 / usual_px**2))
 
 
 def pairs_of(group: Indices, star: Indices) -> Indices:
@@ -255,10 +251,9 @@ def _of_stars(
 
 def _beside_stars(of_places: Floats, share: float) -> Floats:
     """
-    Return the likelihood (240,) of structure of the detector that stars show, by that of c (240,).
+    Return the likelihood (240,) of structure s of the detector, by that of c (240,).
 
-    With structure s and the correlation ``share`` of it between the sightings of a star, these
-    share ``c^2 + share s^2``: either explains it, and a large c is as unlikely as a large s.
+    Sightings of a star share ``c^2 + share s^2``, with the correlation of the structure.
     """
     x = np.exp(2.0 * _LOG_GRID)
     likelihood = np.interp(0.5 * np.log(x[:, None] + share * x), _LOG_GRID, of_places)
@@ -381,14 +376,14 @@ def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
     return sum(error.variance_px2 for error in errors if not error.of_star)
 
 
-def star_variance_px2(errors: Sequence[SharedError]) -> Floats | float:
-    """Variance (n,) per axis that sightings of a star share; 0 where it changes no precision."""
-    return sum((error.share_px2 for error in errors if error.of_star and error.matters), 0.0)
+def star_shares_px2(errors: Sequence[SharedError]) -> tuple[Floats | float, Floats | float]:
+    """
+    Variance (n,) per axis that sightings of a star share; 0 where it changes no precision.
 
-
-def star_beyond_px2(errors: Sequence[SharedError]) -> Floats | float:
-    """Part (n,) of it by which a star differs from others of its brightness."""
-    return sum((error.beyond_px2 for error in errors if error.of_star and error.matters), 0.0)
+    And the part (n,) of it by which a star differs from others of its brightness.
+    """
+    shares = [(one.share_px2, one.beyond_px2) for one in errors if one.of_star and one.matters]
+    return shares[0] if shares else (0.0, 0.0)
 
 
 class GroupSums:

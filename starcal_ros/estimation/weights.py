@@ -43,13 +43,11 @@ from starcal_ros.estimation.problem import (
 )
 from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import (
-    coarsest_cells,
     Groups,
     pixel_variance_px2,
     shared_errors,
     SharedError,
-    star_beyond_px2,
-    star_variance_px2,
+    star_shares_px2,
 )
 from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
@@ -236,7 +234,7 @@ class Judged:
     def covariance_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) of the observations."""
         covariance_px2 = self.variance.of(table.covariance_px2, table.magnitude)
-        beyond_px2 = np.broadcast_to(star_beyond_px2(self.errors), len(table))
+        beyond_px2 = np.broadcast_to(star_shares_px2(self.errors)[1], len(table))
         return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
 
     def inflation_px2(self, table: StarTable) -> Floats:
@@ -246,7 +244,7 @@ class Judged:
         With it, k images of a star weigh as the mean of theirs does.
         """
         sightings = np.bincount(table.star, self.kept, int(table.star.max()) + 1)[table.star]
-        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_variance_px2(self.errors))
+        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_shares_px2(self.errors)[0])
 
     def working_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) whose inverses are the weights."""
@@ -479,13 +477,13 @@ def judge(
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()
     # Without what is beyond others: whether a star is left out must not follow from its own size.
-    usual_px2 = star_variance_px2(before.errors) - star_beyond_px2(before.errors)
+    share_px2, beyond_px2 = star_shares_px2(before.errors)
     kept = fitting_stars(
         residual_px,
         covariance_px2,
-        usual_px2,
+        share_px2 - beyond_px2,
         table,
-        coarsest_cells(data.groups),
+        data.groups[1],
         options.outlier_sigma,
     )
     if not kept.any():

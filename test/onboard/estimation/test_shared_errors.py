@@ -21,8 +21,7 @@ from starcal_ros.estimation.shared_errors import (
     pixel_variance_px2,
     shared_errors,
     SharedError,
-    star_beyond_px2,
-    star_variance_px2,
+    star_shares_px2,
 )
 
 DRAWS = 400
@@ -188,10 +187,11 @@ def test_the_errors_have_their_names_and_groups() -> None:
     ]
     assert [e.of_star for e in found] == [True] + [False] * 7
     assert pixel_variance_px2(found) == pytest.approx(sum(e.variance_px2 for e in found[1:]))
-    assert not found[0].matters and star_variance_px2(found) == star_beyond_px2(found) == 0.0
+    assert not found[0].matters and star_shares_px2(found) == (0.0, 0.0)
     found = campaign(rng, place_px=0.05)
-    assert np.array_equal(star_variance_px2(found), found[0].share_px2)
-    assert np.array_equal(star_beyond_px2(found), found[0].beyond_px2)
+    share_px2, beyond_px2 = star_shares_px2(found)
+    assert np.array_equal(share_px2, found[0].share_px2)
+    assert np.array_equal(beyond_px2, found[0].beyond_px2)
 
 
 def test_each_error_has_its_likelihood_ratio_and_its_effect() -> None:
