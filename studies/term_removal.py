@@ -19,7 +19,7 @@ from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.levenberg_marquardt import covariance, NotObservable
 from starcal_ros.estimation.problem import image_parameters, Problem, State
-from starcal_ros.estimation.search import minimise, Minimum, without_parameter
+from starcal_ros.estimation.search import minimise, Minimum
 from starcal_ros.estimation.star_equations import arrange, residuals_px
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, moved
 
@@ -89,8 +89,10 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     while sigmas:
         least = min(sigmas, key=lambda name: abs(sigmas[name]))
         k = names.index(least)
+        problem = dataclasses.replace(problem, free=problem.free[problem.free != k])
+        state = dataclasses.replace(solution.state, parameters=solution.state.parameters.copy())
+        state.parameters[k] = _held_at(names, k, problem)
         try:
-            problem, state = without_parameter(problem, solution, k, _held_at(names, k, problem))
             solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
         except NotObservable:
             break

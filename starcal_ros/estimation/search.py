@@ -25,7 +25,6 @@ from starcal_ros.estimation.levenberg_marquardt import (
     levenberg_marquardt,
     NormalEquations,
     Solution,
-    solve_arrow,
 )
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
@@ -76,43 +75,6 @@ def minimise(
         return moved(problem, state, layout, step, blocks)
 
     return levenberg_marquardt(start, evaluate, move, least_gain)
-
-
-def without_parameter(
-    problem: Problem, minimum: Minimum, k: int, value: float
-) -> tuple[Problem, State]:
-    """
-    Return the problem with the k-th camera parameter held at a value, and a start of its search.
-
-    That is where the normal equations of the minimum have the least cost under that condition.
-
-    Raises
-    ------
-    NotObservable
-        When the stars do not determine all other unknowns.
-    """
-    state, normal = minimum.state, minimum.normal
-    layout = unknowns_in_state(problem, state)
-    kept = estimated(layout)
-    at = int(np.flatnonzero(kept == layout.places['camera'].start + k)[0])
-    others = np.delete(np.arange(len(kept)), at)
-    step = value - float(state.parameters[k])
-    left, blocks = solve_arrow(
-        NormalEquations(
-            normal.cost,
-            normal.A[np.ix_(others, others)],
-            normal.a[others] - normal.A[others, at] * step,
-            normal.B[:, :, others],
-            normal.C,
-            normal.c - normal.B[:, :, at] * step,
-        ),
-        0.0,
-    )
-    shared = np.zeros(layout.count)
-    shared[kept] = np.insert(left, at, step)
-    after = moved(problem, state, layout, shared, blocks)
-    after.parameters[k] = value  # to the last digit
-    return dataclasses.replace(problem, free=problem.free[problem.free != k]), after
 
 
 def estimated(layout: Layout) -> Indices:

@@ -103,20 +103,23 @@ class Groups:
 
     ``group`` (n,): the number of the group of each; ``of_one_star`` (n,): a number for the members
     of a group that are of one star, whose common error is of the star; None if all are.
+    ``together`` (n,): correlation of the first of the fine octaves between sightings of the star.
     """
 
     name: str
     group: Indices
     of_one_star: Indices | None
+    together: Floats | float = 0.0
 
 
 def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Groups, ...]:
     """
     Return the groups of observations at pixels (n, 2) of stars (n,) on a detector of a width, px.
 
-    The stars, the cells of the fine octaves, from the coarsest, and strips of rows and columns.
+    The stars, the cells of the fine octaves, from the coarsest of a 24th of the width, and strips
+    of rows and columns.
     """
-    found = [Groups('star places', star, None)]
+    found = [Groups('star places', star, None, _together(pixels, star, width))]
     for wave in _FINE_OCTAVES:
         cells = _cells(pixels, wave * width / _CELLS_PER_WAVE, (0, 1))
         name = f'field at 1/{round(1 / wave)} of the width'
@@ -129,9 +132,13 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     return tuple(found)
 
 
-def coarsest_cells(groups: Sequence[Groups]) -> Groups:
-    """Return the cells of the first of the fine octaves: of a 24th of the width."""
-    return groups[1]
+def _together(pixels: Floats, star: Indices, width: int) -> Floats:
+    """Return `Groups.together` (n,), as of a wave: by the scatter of a star over the detector."""
+    sightings = np.bincount(star)[star]
+    off = [pixel - np.bincount(star, pixel)[star] / sightings for pixel in pixels.T]
+    spread_px2 = np.bincount(star, off[0] ** 2 + off[1] ** 2)[star] / sightings
+    usual_px = _FINE_OCTAVES[0] * width / (2.0 * math.pi * math.sqrt(2.0))
+    return np.asarray(np.exp(-spread_px2 / usual_px**2))
 
 
 def pairs_of(group: Indices, star: Indices) -> Indices:
@@ -169,10 +176,8 @@ def shared_errors(
     on_sky = np.einsum('nba,nb->na', from_sky, residual_px)
     usual_px2: Floats = np.zeros(len(star))
     for _ in range(2):  # all sightings of a star weigh less, the more they share
-        working_px2 = variance_px2 + (sightings - 1.0) * usual_px2
-        place_px2, rho, of_stars = _of_stars(
-            on_sky, np.where(used, 1.0 / working_px2, 0.0), variance_px2, star
-        )
+        working = np.where(used, 1.0 / (variance_px2 + (sightings - 1.0) * usual_px2), 0.0)
+        place_px2, rho, of_stars, of_places = _of_stars(on_sky, working, variance_px2, star)
         usual_px2 = np.minimum(place_px2 + rho * variance_px2, variance_px2)
     weight = np.where(used, 1.0 / variance_px2, 0.0)
     share_px2 = usual_px2 * _factors(on_sky, weight, usual_px2, star)
@@ -183,8 +188,11 @@ def shared_errors(
     moments = [
         pair_moment(residual_px, weight, kind.group, kind.of_one_star) for kind in groups[1:]
     ]
-    octaves = len(_FINE_OCTAVES)
-    variances = chain_means(last_octave[1] @ _next_octave(last_octave[0]), moments[:octaves])
+    # What a star shows at one place of the detector may be of the star or of the detector.
+    together = max(_pairs(working * np.sqrt(groups[0].together), star), 0.0)
+    share = together / max(_pairs(working, star), together, 1e-300)
+    octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
+    variances = chain_means(longest * _beside_stars(of_places, share), moments[:octaves])
     # Strips of rows and of columns are chains of their own, from the coarser to the finer.
     for first in range(octaves, len(moments), len(_STRIPS)):
         variances += chain_means(_PRIOR, moments[first : first + len(_STRIPS)])
@@ -207,12 +215,12 @@ def _error(
 
 def _of_stars(
     on_sky: Floats, weight: Floats, variance_px2: Floats, star: Indices
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, Floats]:
     """
     Return ``c^2``, px^2, and rho of the sightings of stars, and twice their log likelihood ratio.
 
-    Posterior means: products of pairs of residuals on the sky are fitted by 1 and by the product
-    of their sigmas over that of a usual star.
+    And the likelihood (240,) of c.  Posterior means: products of pairs of residuals on the sky are
+    fitted by 1 and by the product of their sigmas over that of a usual star.
     """
     usual_px2 = float(np.median(variance_px2[weight > 0]))
     root = weight * np.sqrt(variance_px2 / usual_px2)
@@ -231,13 +239,26 @@ def _of_stars(
         log_likelihood += by_relative * x - 0.5 * relative * x**2
     log_likelihood[:, x > usual_px2] = -np.inf  # sightings share no more than their variance
     most = float(log_likelihood.max())
-    likely = np.exp(log_likelihood - most) * np.outer(_PRIOR, _PRIOR)
-    likely /= likely.sum()
+    likely = np.exp(log_likelihood - most) * _PRIOR
+    of_places = likely.sum(axis=1)
+    likely = likely * _PRIOR[:, None] / (_PRIOR @ of_places)
     return (
         float(likely.sum(axis=1) @ x),
         float(likely.sum(axis=0) @ x) / usual_px2,
         max(2.0 * most, 0.0),
+        of_places,
     )
+
+
+def _beside_stars(of_places: Floats, share: float) -> Floats:
+    """
+    Return the likelihood (240,) of structure s of the detector, by that of c (240,).
+
+    Sightings of a star share ``c^2 + share s^2``, with the correlation of the structure.
+    """
+    x = np.exp(2.0 * _LOG_GRID)
+    likelihood = np.interp(0.5 * np.log(x[:, None] + share * x), _LOG_GRID, of_places)
+    return np.asarray(_PRIOR @ likelihood / (_PRIOR @ of_places))
 
 
 def _pairs(value: Floats, group: Indices) -> float:
@@ -362,14 +383,14 @@ def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
     return sum(error.variance_px2 for error in errors if not error.of_star)
 
 
-def star_variance_px2(errors: Sequence[SharedError]) -> Floats | float:
-    """Variance (n,) per axis that sightings of a star share; 0 where it changes no precision."""
-    return sum((error.share_px2 for error in errors if error.of_star and error.matters), 0.0)
+def star_shares_px2(errors: Sequence[SharedError]) -> tuple[Floats | float, Floats | float]:
+    """
+    Variance (n,) per axis that sightings of a star share; 0 where it changes no precision.
 
-
-def star_beyond_px2(errors: Sequence[SharedError]) -> Floats | float:
-    """Part (n,) of it by which a star differs from others of its brightness."""
-    return sum((error.beyond_px2 for error in errors if error.of_star and error.matters), 0.0)
+    And the part (n,) of it by which a star differs from others of its brightness.
+    """
+    shares = [(one.share_px2, one.beyond_px2) for one in errors if one.of_star and one.matters]
+    return shares[0] if shares else (0.0, 0.0)
 
 
 class GroupSums:

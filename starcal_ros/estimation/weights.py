@@ -43,13 +43,11 @@ from starcal_ros.estimation.problem import (
 )
 from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import (
-    coarsest_cells,
     Groups,
     pixel_variance_px2,
     shared_errors,
     SharedError,
-    star_beyond_px2,
-    star_variance_px2,
+    star_shares_px2,
 )
 from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
@@ -125,8 +123,8 @@ def estimate_variance(
     Notes
     -----
     Scale and floor are found by scoring: weighted least squares of the squared residuals on the
-    measured variance and one, with the variance of a square as weight.  Residuals beyond 4.5
-    sigma are left out.
+    measured variance and one, with the variance of a square as weight, less of it beyond 4.5 sigma
+    (`_part`).
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
     squared = (residual_px[used] ** 2).sum(axis=1) / np.maximum(freedom[used], _LEAST_FREEDOM)
@@ -135,8 +133,7 @@ def estimate_variance(
     for _ in range(_ROUNDS):
         before = scale, floor_px2
         expected = scale * own + floor_px2
-        near = squared < 0.5 * _CLIP_SIGMA**2 * expected
-        scale, floor_px2 = _line(own[near], squared[near], expected[near])
+        scale, floor_px2 = _line(own, squared, _part(squared / expected) / expected**2)
         if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
             break
     ratio = squared / (scale * own + floor_px2)
@@ -144,9 +141,17 @@ def estimate_variance(
     return CentroidVariance(scale, floor_px2, nodes, factors)
 
 
-def _line(own: Floats, squared: Floats, expected: Floats) -> tuple[float, float]:
+def _part(ratio: Floats) -> Floats:
+    """
+    Return the part of squared residuals over variance (n,) that counts: none beyond 5.2 sigma.
+
+    One beyond 4.5 sigma that counted or not at all would do so in turns, and the estimate with it.
+    """
+    return np.asarray(np.clip(4.0 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
+
+
+def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
     """Return scale and floor of ``squared = scale own + floor``, neither negative."""
-    weight = 1.0 / (expected * expected)
     weighted = weight * own
     by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
@@ -176,9 +181,8 @@ def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tu
     nodes = np.unique(np.quantile(magnitude, np.linspace(0.0, 1.0, count)))
     if len(nodes) < 2:
         return (), ()
-    near = ratio < 0.5 * _CLIP_SIGMA**2
-    place = np.rint((magnitude[near] - nodes[0]) / np.ptp(nodes) * _BINS).astype(np.int64)
-    stars, summed = np.bincount(place), np.bincount(place, ratio[near])
+    place = np.rint((magnitude - nodes[0]) / np.ptp(nodes) * _BINS).astype(np.int64)
+    stars, summed = (np.bincount(place, _part(ratio) * one) for one in (1.0, ratio))
     bins = nodes[0] + np.ptp(nodes) / _BINS * np.arange(len(stars))
     basis = np.stack([np.interp(bins, nodes, row) for row in np.eye(len(nodes))], axis=1)
     log_factor = np.zeros(len(nodes))
@@ -236,7 +240,7 @@ class Judged:
     def covariance_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) of the observations."""
         covariance_px2 = self.variance.of(table.covariance_px2, table.magnitude)
-        beyond_px2 = np.broadcast_to(star_beyond_px2(self.errors), len(table))
+        beyond_px2 = np.broadcast_to(star_shares_px2(self.errors)[1], len(table))
         return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
 
     def inflation_px2(self, table: StarTable) -> Floats:
@@ -246,7 +250,7 @@ class Judged:
         With it, k images of a star weigh as the mean of theirs does.
         """
         sightings = np.bincount(table.star, self.kept, int(table.star.max()) + 1)[table.star]
-        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_variance_px2(self.errors))
+        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_shares_px2(self.errors)[0])
 
     def working_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) whose inverses are the weights."""
@@ -479,13 +483,13 @@ def judge(
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()
     # Without what is beyond others: whether a star is left out must not follow from its own size.
-    usual_px2 = star_variance_px2(before.errors) - star_beyond_px2(before.errors)
+    share_px2, beyond_px2 = star_shares_px2(before.errors)
     kept = fitting_stars(
         residual_px,
         covariance_px2,
-        usual_px2,
+        share_px2 - beyond_px2,
         table,
-        coarsest_cells(data.groups),
+        data.groups[1],
         options.outlier_sigma,
     )
     if not kept.any():

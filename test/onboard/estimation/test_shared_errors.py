@@ -21,8 +21,7 @@ from starcal_ros.estimation.shared_errors import (
     pixel_variance_px2,
     shared_errors,
     SharedError,
-    star_beyond_px2,
-    star_variance_px2,
+    star_shares_px2,
 )
 
 DRAWS = 400
@@ -189,10 +188,11 @@ def test_the_errors_have_their_names_and_groups() -> None:
     ]
     assert [e.of_star for e in found] == [True] + [False] * 7
     assert pixel_variance_px2(found) == pytest.approx(sum(e.variance_px2 for e in found[1:]))
-    assert not found[0].matters and star_variance_px2(found) == star_beyond_px2(found) == 0.0
+    assert not found[0].matters and star_shares_px2(found) == (0.0, 0.0)
     found = campaign(rng, place_px=0.05)
-    assert np.array_equal(star_variance_px2(found), found[0].share_px2)
-    assert np.array_equal(star_beyond_px2(found), found[0].beyond_px2)
+    share_px2, beyond_px2 = star_shares_px2(found)
+    assert np.array_equal(share_px2, found[0].share_px2)
+    assert np.array_equal(beyond_px2, found[0].beyond_px2)
 
 
 def test_each_error_has_its_likelihood_ratio_and_its_effect() -> None:
@@ -326,6 +326,31 @@ def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(
     # 30 stars of a class in 12 campaigns leave 6 % of their variance.
     for part in (slice(0, 30), slice(35, 65), slice(70, 100)):
         assert share[part].mean() == pytest.approx(planted[part].mean(), rel=0.2, abs=0.002)
+
+
+@pytest.mark.parametrize('of_star', [True, False])
+def test_what_stars_of_one_field_share_may_be_structure_of_the_detector(of_star: bool) -> None:
+    """Each star comes to one place of the detector: neighbours tell its error from a wave."""
+    m, n, size_px, variances = 25, 150, 0.07, []
+    star = np.tile(np.arange(n), m)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        pixels = rng.uniform(0.0, 1199.0, (n, 2))[star] + 5.0 * rng.normal(size=(m * n, 2))
+        phase = rng.uniform(0.0, 2.0 * np.pi, (2, 2))
+        wave = np.sin(2.0 * np.pi / 270.0 * pixels[:, None, :] + phase).prod(axis=2)
+        moved = rng.normal(size=(n, 2))[star] if of_star else 2.0 * wave
+        found = shared_errors(
+            size_px * moved + 0.2 * rng.normal(size=(m * n, 2)),
+            np.full(m * n, 0.2**2 + size_px**2),
+            np.ones(m * n, bool),
+            observation_groups(pixels, star, WIDTH),
+            np.tile(np.eye(2), (m * n, 1, 1)),
+            (np.log([1e-6, 1e-5, 1e-4]), np.full(3, 1.0 / 3.0)),
+        )
+        assert found[0].variance_px2 == pytest.approx(size_px**2, rel=0.4)
+        variances.append(pixel_variance_px2(found))
+    share = float(np.mean(variances)) / size_px**2
+    assert share < 0.02 if of_star else 0.5 < share < 1.5
 
 
 def test_a_blended_star_has_a_share_of_its_own_and_leaves_that_of_the_others() -> None:
