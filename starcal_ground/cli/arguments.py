@@ -7,6 +7,7 @@ import argparse
 from collections.abc import Callable, Sequence
 import contextlib
 import dataclasses
+from datetime import datetime, timezone
 import json
 import math
 from pathlib import Path
@@ -15,6 +16,7 @@ from types import FrameType
 from typing import Any, NoReturn, TYPE_CHECKING, TypeVar
 
 from starcal_ground.cli.terminal import print_text, print_wrapped
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.text import printable
 
 if TYPE_CHECKING:
@@ -205,3 +207,70 @@ def check_file(output: Path, inputs: Sequence[Path]) -> None:
 
     beside = [file.with_name(name) for file in inputs for name in PRODUCT_FILES]
     check_outputs([output], [*inputs, *beside])
+
+
+@dataclasses.dataclass(frozen=True)
+class Time:
+    """Value of a time option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
+
+    seconds: float
+    since_first_image: bool
+
+
+def parse_time(text: str) -> Time:
+    """
+    A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
+
+    Raises argparse.ArgumentTypeError for another text.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(
+                f'{text!r} is not a time: give 2026-05-15T07:20:00, seconds since 1970, or'
+                ' +seconds after the first image'
+            ) from error
+        with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
+        return Time(with_zone.timestamp(), False)
+    if not math.isfinite(seconds):
+        raise argparse.ArgumentTypeError(f'{text!r} is not a finite number of seconds')
+    return Time(seconds, text.strip().startswith('+'))
+
+
+@dataclasses.dataclass
+class Selection:
+    """
+    Selection of the images between two times, both included, queried in the order of the bag.
+
+    None: from the first image, to the last one.
+    """
+
+    start: Time | None
+    end: Time | None
+    _first_ns: int | None = None
+    _last_ns: int = 0
+
+    def __call__(self, time_ns: int) -> bool:
+        """True if the image of a stamp is taken."""
+        if self._first_ns is None:
+            self._first_ns = time_ns
+        self._last_ns = max(self._last_ns, time_ns)
+        is_before = self.start is not None and time_ns < self._ns(self.start)
+        return not (is_before or (self.end is not None and time_ns > self._ns(self.end)))
+
+    def without_images(self) -> str:
+        """Error message for a selection without images."""
+        if self._first_ns is None:
+            return '--from, --to: the bag has no images'
+        first, last = (utc_text(time_ns) for time_ns in (self._first_ns, self._last_ns))
+        return (
+            f'--from, --to: no image is between these times: the images span {first} to {last},'
+            f' +0 to +{(self._last_ns - self._first_ns) / NANOSECONDS_PER_SECOND:g} s'
+        )
+
+    def _ns(self, time: Time) -> int:
+        origin_ns = (self._first_ns or 0) if time.since_first_image else 0
+        return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)

@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 from pathlib import Path
 import threading
-from typing import TYPE_CHECKING
 
 from starcal_ground import outputs, products
 from starcal_ground.cli import arguments
@@ -25,9 +24,6 @@ from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import campaign
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-
-if TYPE_CHECKING:
-    from starcal_ground.cli.commands.calibrate import Selection
 
 
 def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
@@ -72,7 +68,7 @@ def calibrate_into(
     folder: Path,
     source: campaign.Source,
     inputs: Callable[[], Mapping[str, str]],
-    selection: Selection | None = None,
+    selection: arguments.Selection | None = None,
     with_report: bool = False,
 ) -> tuple[campaign.Campaign, str]:
     """

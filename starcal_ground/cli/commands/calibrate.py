@@ -26,16 +26,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import datetime, timezone
-import math
+from dataclasses import replace
 from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict, print_wrapped
-from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import NotFromStars, OptionError
 from starcal_ros.files import same_as_one_of
 from starcal_ros.text import significant
@@ -65,7 +62,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
     for name, what in (('from', f'use images from T on: {when}'), ('to', 'use images up to T')):
         command.add_argument(
-            f'--{name}', dest=f'{name}_time', type=parse_time, metavar='T', help=what
+            f'--{name}', dest=f'{name}_time', type=arguments.parse_time, metavar='T', help=what
         )
     shown = command.add_mutually_exclusive_group()
     arguments.add_json(shown)
@@ -87,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         with into_folder.digests(first.files) as inputs:
             selection = None
             if args.from_time or args.to_time:
-                selection = Selection(args.from_time, args.to_time)
+                selection = arguments.Selection(args.from_time, args.to_time)
             made, report = into_folder.calibrate_into(
                 args.output, source, inputs, selection, not args.no_report
             )
@@ -139,73 +136,6 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
     if not given.states_camera:
         first.write(args.output, source.topics)
     return first, source
-
-
-@dataclass(frozen=True)
-class Time:
-    """Value of a time option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
-
-    seconds: float
-    since_first_image: bool
-
-
-def parse_time(text: str) -> Time:
-    """
-    A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
-
-    Raises argparse.ArgumentTypeError for another text.
-    """
-    try:
-        seconds = float(text)
-    except ValueError:
-        try:
-            read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(
-                f'{text!r} is not a time: give 2026-05-15T07:20:00, seconds since 1970, or'
-                ' +seconds after the first image'
-            ) from error
-        with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
-        return Time(with_zone.timestamp(), False)
-    if not math.isfinite(seconds):
-        raise argparse.ArgumentTypeError(f'{text!r} is not a finite number of seconds')
-    return Time(seconds, text.strip().startswith('+'))
-
-
-@dataclass
-class Selection:
-    """
-    Selection of the images between two times, both included, queried in the order of the bag.
-
-    None: from the first image, to the last one.
-    """
-
-    start: Time | None
-    end: Time | None
-    _first_ns: int | None = None
-    _last_ns: int = 0
-
-    def __call__(self, time_ns: int) -> bool:
-        """True if the image of a stamp is taken."""
-        if self._first_ns is None:
-            self._first_ns = time_ns
-        self._last_ns = max(self._last_ns, time_ns)
-        is_before = self.start is not None and time_ns < self._ns(self.start)
-        return not (is_before or (self.end is not None and time_ns > self._ns(self.end)))
-
-    def without_images(self) -> str:
-        """Error message for a selection without images."""
-        if self._first_ns is None:
-            return '--from, --to: the bag has no images'
-        first, last = (utc_text(time_ns) for time_ns in (self._first_ns, self._last_ns))
-        return (
-            f'--from, --to: no image is between these times: the images span {first} to {last},'
-            f' +0 to +{(self._last_ns - self._first_ns) / NANOSECONDS_PER_SECOND:g} s'
-        )
-
-    def _ns(self, time: Time) -> int:
-        origin_ns = (self._first_ns or 0) if time.since_first_image else 0
-        return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
 
 
 def answer_of(

@@ -7,7 +7,7 @@ import argparse
 
 import pytest
 
-from starcal_ground.cli.commands.calibrate import parse_time, Selection
+from starcal_ground.cli.arguments import parse_time, Selection
 
 STAMPS_NS = [(1_778_829_600 + 10 * k) * 1_000_000_000 for k in range(12)]
 
