@@ -50,6 +50,7 @@ from starcal_ros.pipeline.topics import (
     Topics,
     without_attitudes,
 )
+from starcal_ros.records import Ensemble
 from starcal_ros.text import printable
 
 PARAMETER_FILE, CAMERA_FILE = 'params.yaml', 'camera.yaml'
@@ -170,17 +171,29 @@ class FirstSetup:
         to_state = ''.join(f'# {name}: {what}\n' for name, what in self.assumed(topics))
         return f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
 
-    def assumed(self, topics: Topics) -> list[tuple[str, str]]:
-        """Options that nobody has stated, each with what is assumed; ``topics`` are those read."""
+    def assumed(self, topics: Topics, ensemble: Ensemble | None = None) -> list[tuple[str, str]]:
+        """
+        Options that nobody has stated, each with what is assumed; ``topics`` are those read.
+
+        ``ensemble``: the images, where they are at hand.
+        """
         options, stated = self.setup.calibration, self.given.options
         has_tracker = self.through_air is None
         has_velocity = bool(topics.velocity or topics.observations)
+        images = ensemble.images if ensemble is not None else ()
+        # The read-out is estimated by the rates of the images.
+        is_still = bool(images) and not any(
+            np.isfinite(image.star_tracker_rate_rad_s).all() for image in images
+        )
         rows = [
             ('star_tracker_sigma_arcsec', 'from the scatter of the images',
              has_tracker and not tracker_sigma_is_given(options)),
             ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
             ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
-            ('shutter', 'unknown, read out within 20 ms', has_tracker),
+            ('shutter',
+             'unknown, and no image has an angular rate: as if the camera did not turn; state it,'
+             ' or the rates' if is_still else 'unknown, read out within 20 ms',
+             has_tracker),
             ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
              not (has_velocity or self.setup.site.observer == 'ground'
                   or 'observer_velocity_m_s' in stated)),

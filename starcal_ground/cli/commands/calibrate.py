@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         arguments.print_json(answer_of(made, first, source, args.output))
     elif not args.quiet:
         print_calibration(made.calibration, made.setup.prior, args.verbose)
-        _print_assumed(first.assumed(source.topics), made.calibration)
+        _print_assumed(first.assumed(source.topics, made.ensemble), made.calibration)
         print_text(f'\nproducts written to {args.output}' + (f'\n{report}' if report else ''))
         _print_verdict(made.calibration)
     accepted = made.calibration.accepted
@@ -151,7 +151,7 @@ def answer_of(
         'requirements': [check for check in calibration.gate if check.option == OPTION],
         'lens_model': calibration.geometry.camera.model,
         'found': made.notes,
-        'assumed': dict(first.assumed(source.topics)),
+        'assumed': dict(first.assumed(source.topics, made.ensemble)),
         'precision': verdict.precision_sentences(calibration),
         'next_step': verdict.next_step(calibration),
         'folder': str(folder),

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 import shutil
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -145,6 +147,22 @@ def test_alignment_and_tracker_sigma_are_found_and_said(
         camera['camera_name'] == yaml.safe_load((TINY / 'camera.yaml').read_text())['camera_name']
     )
     assert camera['camera_name'] != 'camera'
+
+
+@pytest.mark.parametrize('rate', [0.0, np.nan])
+def test_rates_that_no_image_has_are_said(
+    rate: float, tmp_path: Path, tiny_products: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC)
+    rates = np.full(3, rate)
+    images = [dataclasses.replace(image, star_tracker_rate_rad_s=rates) for image in recorded]
+    write_observations(images, tmp_path, 'camera')
+    out, params = str(tmp_path / 'out'), params_with(tmp_path, shutter=None)
+    bag = str(tmp_path / OBSERVATIONS_FILE)
+    assert main.main(['calibrate', bag, '--params', params, '-o', out, '--no-report']) == 0
+    said = ' '.join(capsys.readouterr().out.split())
+    assert ('as if the camera did not turn' in said) == np.isnan(rate)
+    assert ('read out within 20 ms' in said) != np.isnan(rate)
 
 
 @pytest.mark.slow
