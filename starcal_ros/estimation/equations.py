@@ -293,7 +293,8 @@ def eliminated(
     root = (np.linalg.cholesky(covariance).transpose(0, 2, 1) @ normal.B).reshape(m * b, P)
     own = np.einsum('mij,mj->mi', covariance, normal.c)
     gradient = normal.a - normal.B.reshape(m * b, P).T @ own.ravel()
-    return Equations(normal.A - root.T @ root, gradient, back, own, covariance)
+    information = normal.A - root.T @ root
+    return Equations(0.5 * (information + information.T), gradient, back, own, covariance)
 
 
 def information_of_images(
