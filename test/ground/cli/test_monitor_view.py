@@ -76,6 +76,9 @@ def test_a_refused_candidate_shows_the_failed_check_first() -> None:
     # Then the requirements, then the others by their share of the limit.
     assert text.index('██████████') < text.index('1-sigma of fx') < text.index('█████████·')
     assert 'calibrator: error x' in text
+    told = {'calibrator': (1, 'refused by the gate: residual over the limit')}
+    text = shown(Received(active=calibration(), candidate=candidate, health=told))
+    assert text.count('residual over the limit') == 1
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_of_a_state_folder_the_last_calibration_and_its_images(
 
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
-    assert '✓ Accepted' in page
+    assert '✓ Accepted' in page and '″, at most 300″ required: met.' in page  # one sign
     fx, sigma = calibration.geometry.camera.parameters[0], calibration.sigma[0]
     assert f'<td>{fx:.3f}</td>' in page  # to a hundredth of the sigma of 0.05 px
     assert f'<td>{sigma:.2g}</td>' in page
@@ -218,6 +218,7 @@ def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
     text = page_of(tmp_path)
     assert '<script>alert' not in text and '<img src=x' not in text
+    assert '<th scope="col">prior</th>' not in text  # not known: no empty columns
 
 
 def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:

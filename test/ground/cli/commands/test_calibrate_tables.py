@@ -56,3 +56,5 @@ def test_a_lens_that_the_prior_did_not_have_has_no_changes(
     print_calibration(record, prior)
     said = capsys.readouterr().out
     assert re.search(r'^k6 +\S+ +held, \S+ *$', said, re.MULTILINE)
+    print_calibration(dataclasses.replace(record, parent_frame=''), prior)  # no alignment either
+    assert 'from prior' in said and 'from prior' not in capsys.readouterr().out

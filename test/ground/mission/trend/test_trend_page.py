@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import dataclasses
+from pathlib import Path
 
 import pytest
 from trend_rows import made  # type: ignore[import-not-found]
 
 from starcal_ground.mission.trend.series import Active, Change, overview_of
-from starcal_ground.mission.trend.trend_page import verdict_of
+from starcal_ground.mission.trend.trend_page import verdict_of, write_page
 
 # Days of calibrations, which one is active, change of each later one (px); then the verdict.
 VERDICTS: Mapping[str, tuple[Sequence[int], int | None, Sequence[float], bool | None, str]] = {
@@ -38,3 +40,9 @@ def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
 def test_steps_are_looked_for_in_many() -> None:
     rows = [made(day) for day in range(1, 8)]
     assert verdict_of(rows, rows, [], [], [])[1][1] == 'No step or drift was found.'
+
+
+def test_without_an_active_calibration_there_is_no_table_of_them(tmp_path: Path) -> None:
+    for is_accepted in (False, True):
+        write_page([[dataclasses.replace(made(1), accepted=is_accepted)]], 1, tmp_path, 'fleet')
+        assert ('Active calibrations' in (tmp_path / 'trend.html').read_text()) is is_accepted
