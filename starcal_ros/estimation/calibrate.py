@@ -95,6 +95,7 @@ _ROUNDS = 16  # three or four are usual; principal points that stars hardly show
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
 _FIRST_SHAPE_PX = 1e-4
+_IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')
 _SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
 _USUAL_M_S = 8000.0  # of orbits about the Earth
 _UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
@@ -331,8 +332,11 @@ def _round(
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
     found = posterior(sums, linear, shape_px, before.posterior if before else None)
-    own = share * found.of_images[:, IMAGE_ROTATION]
-    after = moved(problem, state, layout, share * found.mean, own)
+    # What is not in the state, as a velocity, is at its mean: the images follow both.
+    shared = found.mean.copy()
+    shared[layout.of(_IN_STATE)] *= share
+    own = found.own - found.back @ shared
+    after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
     left_px = _residuals_px(problem, after, table, layout, found, camera)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
@@ -372,7 +376,7 @@ def _refraction(ensemble: Ensemble) -> Refraction | None:
 
 def _step_sigma(layout: Layout, found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
-    in_state = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
+    in_state = layout.of(_IN_STATE)
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
     steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
     return np.asarray(steps)
@@ -452,7 +456,7 @@ def _result(
     covariance = _considered(found, problem, layout)
     basic = layout.of(['camera', 'alignment'])
     joint = layout.of(['camera', 'alignment', 'field'])
-    shared = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
+    shared = layout.of(_IN_STATE)
     names = tuple(layout.labels[k] for k in shared)
     asked = np.intersect1d(shared, found.estimated)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()

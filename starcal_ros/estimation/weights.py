@@ -123,7 +123,7 @@ def estimate_variance(
     Notes
     -----
     Scale and floor are found by scoring: weighted least squares of the squared residuals on the
-    measured variance and one, with the variance of a square as weight, less of it beyond 4.5 sigma
+    measured variance and one, with the variance of a square as weight, less of it near 4.5 sigma
     (`_part`).
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
@@ -143,11 +143,12 @@ def estimate_variance(
 
 def _part(ratio: Floats) -> Floats:
     """
-    Return the part of squared residuals over variance (n,) that counts: none beyond 5.2 sigma.
+    Return the part of squared residuals over variance (n,) that counts.
 
-    One beyond 4.5 sigma that counted or not at all would do so in turns, and the estimate with it.
+    Half at 4.5 sigma, all to 4.1 and none from 4.9.
+    One at an edge of 4.5 sigma would count and not count in turns, and the estimate with it.
     """
-    return np.asarray(np.clip(4.0 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
+    return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
 
 
 def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:

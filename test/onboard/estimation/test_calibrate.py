@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from starcal_ros.arrays import Indices, Mask
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation import weights
+from starcal_ros.estimation import calibrate, weights
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
 from starcal_ros.estimation.problem import METHODS
@@ -29,6 +31,7 @@ from starcal_ros.estimation.shared_errors import SharedError
 from starcal_ros.estimation.star_equations import star_table
 from starcal_ros.estimation.weights import CentroidVariance
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
+from studies import worlds
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
@@ -465,3 +468,26 @@ def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
     assert weights.agree(judged(4e-6, once.star), judged(2e-6, once.star), once)
     often = dataclasses.replace(table, star=np.zeros(len(table), np.int64))
     assert not weights.agree(judged(4e-6, often.star), judged(2e-6, often.star), often)
+
+
+def test_images_follow_a_velocity_in_a_partial_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A velocity is not in the state: it is at its mean though the state moves by a quarter."""
+    whole: Callable[..., Any] = calibrate._round
+    off_px: list[float] = []
+
+    def partial(*arguments: Any) -> Any:
+        last = whole(*arguments[:-1], 0.25)
+        data, kept = arguments[0], arguments[3].kept
+        image, residual_px = data.table.image[kept], last.residual_px[kept]
+        means = [np.bincount(image, one) / np.bincount(image) for one in residual_px.T]
+        off_px.append(float(np.abs(means).max()))
+        return last
+
+    monkeypatch.setattr(calibrate, '_round', partial)
+    monkeypatch.setattr(calibrate, '_ROUNDS', 3)
+    bright: dict[str, Any] = {'magnitude_limit': 6.0, 'zero_point_dn': 1.2e7}
+    world = worlds.World(6, 'side_level', velocity_m_s=30000.0, **bright)
+    made = worlds.simulate(world, 1)
+    options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0,) * 3, shutter='global')
+    estimate_calibration(made.ensemble, made.scenario.prior, options)
+    assert len(off_px) == 3 and max(off_px) < 0.01
