@@ -19,6 +19,7 @@ from collections.abc import Iterator
 import dataclasses
 import math
 from pathlib import Path
+import subprocess
 import tempfile
 import time
 
@@ -92,22 +93,29 @@ def run(quick: bool) -> Iterator[Table]:
     yield table
     if scamp.INSTALLED:
         yield _peer(seeds)
+    else:
+        print('Source Extractor and SCAMP are not installed: left out')
 
 
 def _peer(seeds: int) -> Table:
     """Errors of SCAMP with the images and attitudes of `_with_attitudes`."""
-    columns = ('field deg', 'error / bound', 'median', 'images', 'stars', 's an image')
+    columns = ('field deg', 'solved', 'error / bound', 'median', 'heads', 'sources', 's an image')
     table = Table('Source Extractor and SCAMP, given attitudes', columns)
     for field_deg in FIELDS_DEG:
         trials = in_processes(by_scamp, range(seeds), [field_deg] * seeds)
-        error, *means = np.array(trials).T
-        table.add(field_deg, rms(error), float(np.median(error)), *np.mean(means, axis=1).tolist())
+        solved = np.array([row for row in trials if math.isfinite(row[0])]).reshape(-1, 4)
+        if len(solved):
+            means = np.mean(solved[:, 1:], axis=0).tolist()
+            error = solved[:, 0]
+            table.add(field_deg, len(solved), rms(error), float(np.median(error)), *means)
+        else:
+            table.add(field_deg, 0, *[math.nan] * 5)
         print(*table.rows[-1], flush=True)
     return table
 
 
 def by_scamp(seed: int, field_deg: float) -> tuple[float, float, float, float]:
-    """Error over bound of SCAMP, its images and stars, and processor time of an image."""
+    """Error over bound of SCAMP (NaN: it failed), its images, sources and s an image."""
     given = scenario_of(field_deg, seed)
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         setup = load_set_up(given, **_write_catalog(given, Path(name)))
@@ -116,7 +124,10 @@ def by_scamp(seed: int, field_deg: float) -> tuple[float, float, float, float]:
     pixels = pixel_grid(camera, GRID, GRID)
     true = line_of_sight(camera, pixels)
     campaign = Campaign('narrow', given, setup, Ensemble(), pixels, true, frames)
-    result = scamp.whole(campaign, 3.0 * mounting_sigma_rad(seed))
+    try:
+        result = scamp.whole(campaign, 3.0 * mounting_sigma_rad(seed))
+    except subprocess.SubprocessError:
+        return math.nan, 0.0, 0.0, math.nan
     error_rad = rms(shape_errors_arcsec(true, result.directions)) * ARCSECOND_RAD
     error = error_rad * float(camera.parameters[0]) / bound_px(given)
     return error, float(result.frames), float(result.stars), result.processor_s / IMAGES

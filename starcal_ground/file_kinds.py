@@ -24,10 +24,10 @@ _YAML_FILES = (
     (b'camera_matrix', 'a camera file', '--set camera_info_url='),
 )
 _OF_IMAGES = (
-    ': starcal calibrate, inspect and diagnose take images alone; starcal import makes a bag of'
-    ' image files and attitudes'
+    ': starcal calibrate, inspect, diagnose and plan take images alone; starcal import makes a bag'
+    ' of image files and attitudes'
 )
-_NOR_IMAGES = ', nor images (FITS, TIFF, PNG, JPEG, camera raw)'
+_NOR_IMAGES = ', nor images (FITS, TIFF, PNG, JPEG, camera raw), which calibrate takes'
 # Topics of other types may be unknown to the converter, which then stops.
 _CONVERTED = frozenset(
     [

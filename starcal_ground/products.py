@@ -103,7 +103,7 @@ def write_observations(
         path.unlink(missing_ok=True)  # one that is there is of the products that are replaced
         from starcal_ros.formats.bag.reader import log_damage
 
-        log_damage(f'{path} is not written: mcap is not installed: {rosbag2.INSTALL}')
+        log_damage(f'{path} is not written: mcap or rosbags is not installed: {rosbag2.INSTALL}')
         return
     from starcal_ground.bag_writer import BagWriter  # mcap is not needed for more
 

@@ -1,5 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Source Extractor and SCAMP: one solution for each image, whose median is the camera."""
+"""
+Source Extractor and SCAMP: one distortion of degree 3 and linear terms of each image.
+
+The median over the images is the camera.  The settings are not tuned.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +14,6 @@ import shutil
 import subprocess
 import tempfile
 
-from astropy.io import fits
-from astropy.wcs import WCS
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -41,7 +43,11 @@ _STAR_SIGMA_DEG = 1e-3 / 3600.0
 
 
 def whole(campaign: Campaign, off_rad: float) -> Result:
-    """From images with attitudes off by up to an angle to lines of sight."""
+    """
+    From images with attitudes off by up to an angle to lines of sight.
+
+    Raises subprocess.SubprocessError where it fails or does not end.
+    """
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         folder = Path(name)
         _write_stars(campaign, folder / 'stars.ldac')
@@ -51,7 +57,11 @@ def whole(campaign: Campaign, off_rad: float) -> Result:
         pixel_arcsec = 1.0 / float(campaign.scenario.prior.camera.parameters[0]) / ARCSECOND_RAD
         off_arcmin = max(off_rad / ARCSECOND_RAD, _OFF_PX * pixel_arcsec) / 60.0
         # With its own choice of the resolution, 0, the match of some fields does not end.
-        reach = [f'-POSITION_MAXERR {off_arcmin:.3f}', f'-MATCH_RESOL {2.0 * pixel_arcsec:.3f}']
+        reach = [
+            f'-POSITION_MAXERR {off_arcmin:.3f}',
+            f'-MATCH_RESOL {2.0 * pixel_arcsec:.3f}',
+            f'-CROSSID_RADIUS {3.0 * pixel_arcsec:.3f}',
+        ]
         start_s = _children_s()
         _run(folder, len(campaign.frames), ' '.join(reach))
         took_s = _children_s() - start_s
@@ -63,6 +73,8 @@ def whole(campaign: Campaign, off_rad: float) -> Result:
 
 def _write_stars(campaign: Campaign, path: Path) -> None:
     """Reference catalog of apparent places at the first image, as FITS LDAC."""
+    from astropy.io import fits
+
     catalog, time_ns = campaign.setup.catalog, campaign.frames[0][0].time_ns
     place = apparent_directions(catalog, time_ns, earth_velocity_m_s(time_ns))
     count = len(catalog)
@@ -88,6 +100,8 @@ def _write_image(
     campaign: Campaign, image: Image, icrf_from_star_tracker: Rotation, path: Path
 ) -> None:
     """Image with the tangent plane of the prior camera and the attitude."""
+    from astropy.io import fits
+
     prior = campaign.scenario.prior
     axes = (icrf_from_star_tracker * prior.star_tracker_from_camera).as_matrix()
     fx, _, fy, cx, cy = prior.camera.parameters[:5].tolist()
@@ -103,7 +117,7 @@ def _write_image(
 
 
 def _run(folder: Path, images: int, reach: str) -> None:
-    """Sources of the images, and SCAMP's solution of each; quiet."""
+    """Sources of the images, and SCAMP's solution of them; quiet."""
     (folder / 'columns').write_text('\n'.join(_COLUMNS.split()))
     (folder / 'empty').write_text('')
     for k in range(images):
@@ -124,7 +138,10 @@ def _call(command: list[str], folder: Path) -> None:
 
 
 def _lines_of_sight(campaign: Campaign, folder: Path) -> tuple[list[Floats], int]:
-    """Lines of sight (n, 3) by each solution, turned to those of the prior; stars measured."""
+    """Lines of sight (n, 3) by each solution, turned to those of the prior; sources."""
+    from astropy.io import fits
+    from astropy.wcs import WCS
+
     nominal = line_of_sight(campaign.scenario.prior.camera, campaign.pixels)
     directions, stars = [], 0
     for path in sorted(folder.glob('*.head')):

@@ -113,7 +113,7 @@ def parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     top.add_argument('--version', action='store_true', help='show the version and exit')
     commands = top.add_subparsers(metavar='COMMAND', dest='command', title='commands')
     named = next((word for word in argv if word in COMMANDS), None)
-    top.command = named or ''
+    top.command = named if named and argv[0] == named else ''
     for name in COMMANDS:
         if named not in (None, name):
             commands.add_parser(name)

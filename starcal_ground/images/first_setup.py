@@ -191,8 +191,9 @@ class FirstSetup:
             ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
             ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
             ('shutter',
-             'unknown, and no image has an angular rate: as if the camera did not turn; state it,'
-             ' or the rates' if is_still else 'unknown, read out within 20 ms',
+             'unknown, and taken as if the camera did not turn, since no image has an angular'
+             ' rate: state it, or record attitudes more often' if is_still
+             else 'unknown, read out within 20 ms' if images else 'unknown',
              has_tracker),
             ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
              not (has_velocity or self.setup.site.observer == 'ground'

@@ -116,7 +116,10 @@ def with_air(
         velocity_m_s = SPACE_M_S
         # A zenith found by chance would be trusted: only the change of the focal length is left.
         zenith = np.array([one.boresight for one in images])
-        text = 'observer: ground or space: the stars do not tell; state it: --set observer=space'
+        text = (
+            'observer: ground or space: the stars do not tell; state it: --set observer=ground or'
+            ' --set observer=space'
+        )
     speed_m_s = _speed_m_s(images)
     if site.gain < _TELLING and speed_m_s > _FASTEST_M_S:
         text = (

@@ -164,7 +164,7 @@ def observe_stars(
     # Cosmic rays and hot pixels may be brighter than the stars, and are sharper.
     off_px, _ = cKDTree(np.nan_to_num(predicted_px, nan=-1e6)).query(sources.xy_px)
     stars = sources.select(off_px < _ON_STAR_PX)
-    model = model_image(image.pixels, background, stars, search.centroid, streak)
+    model = model_image(image.pixels, background, stars, search.centroid, streak, sources)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
         sources = detect(image.pixels, background)
@@ -190,7 +190,7 @@ def measure_predicted(
     Streaks that the instrument does not have are measured, and leave it unchanged.
 
     Raises ImageRefused ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses
-    contradict the catalog, ``smeared`` where streaks are too long.
+    contradict the catalog or too few streaks are alone, ``smeared`` where they are too long.
     """
     catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
@@ -271,7 +271,10 @@ def _with_streaks(
     sources, streak = without_streaks(image.pixels, model.background, sources, shown.camera)
     if streak is None:
         return model
-    return model_image(image.pixels, model.background, sources, options, streak)
+    streaked = model_image(image.pixels, model.background, sources, options, streak)
+    if streaked.psf is None:
+        raise ImageRefused('no_match', 'the stars are streaks, and too few of them are alone')
+    return streaked
 
 
 def _observations(

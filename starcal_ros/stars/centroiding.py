@@ -43,8 +43,9 @@ class Centroids:
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
     ``refusal`` (n,) uint8 codes of `StarRefusal`, 0 where the star is good.
-    ``fit`` is that of the stars ``fitted`` (k,), all that are not faint, and None for moments;
-    ``psf_sigma_px``, ``noise_dn`` (n,) are PSF width and noise of the fit; ``modelled`` (n,) masks
+    ``fit`` is that of the stars ``fitted`` (k,), and None for moments; the others are surely
+    faint, with an SNR of 0 and without covariance.  ``psf_sigma_px``, ``noise_dn`` (n,) are PSF
+    width and noise of the fit; ``modelled`` (n,) masks
     the stars whose light was subtracted from their neighbours.
     """
 

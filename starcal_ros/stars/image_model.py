@@ -122,6 +122,7 @@ def model_image(
     sources: detection.Sources,
     options: CentroidOptions,
     streak: Streak | None = None,
+    neighbours: detection.Sources | None = None,
 ) -> ImageModel:
     """
     PSF width, pixel noise and saturation of an image from its own brighter sources.
@@ -129,6 +130,7 @@ def model_image(
     The width is the median over up to 80 bright, unsaturated, isolated sources; gain and PSF
     error are a robust regression of the squared residuals of their pixels on their signal.
     Streaks are fitted with the width, from the ``streak`` that the second moments gave.
+    ``neighbours``: all sources, where those to be fitted are some of them.
     """
     saturation_dn = saturation_level(pixels, options) or np.inf
     gain = options.gain_e_per_dn
@@ -136,12 +138,15 @@ def model_image(
         background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
     least_snr = 15.0 if streak is None else 8.0  # the peak of a streak is lower than its light
-    bright = sources.xy_px[sources.snr > least_snr][:400]
-    nearest = np.rint(bright).astype(np.int64)
-    bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
-    apart_px = _ISOLATED_PX + (streak.longest_px if streak else 0.0)
-    isolated = cKDTree(bright).query_ball_point(bright, apart_px, return_length=True) == 1
-    xy = bright[isolated][:80]
+
+    def bright(of: detection.Sources) -> Floats:
+        xy_px = of.xy_px[of.snr > least_snr]
+        nearest = np.rint(xy_px).astype(np.int64)
+        return xy_px[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
+
+    apart_px, xy = _ISOLATED_PX + (streak.longest_px if streak else 0.0), bright(sources)[:400]
+    crowd = cKDTree(bright(neighbours or sources))
+    xy = xy[crowd.query_ball_point(xy, apart_px, return_length=True) == 1][:80]
     sigma = 1.2
     if len(xy) < 5:
         return unknown

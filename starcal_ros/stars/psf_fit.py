@@ -178,7 +178,8 @@ def surely_fainter(
     The arguments are those of `fit_at` and the mask of `approach`.
     """
     flux, level = parameters[:, 2], parameters[:, 3]
-    blurred = blurred_px(stamps.sigma_px, longest_px(stamps.streak_px))
+    path_px = 0.0 if stamps.streak_px is None else np.hypot(*stamps.streak_px.T)
+    blurred = blurred_px(stamps.sigma_px, path_px)
     noise_dn = np.sqrt(stamps.noise2_dn2.min(axis=1))
     # The background is free, so that the fit has less; its last step is a tenth of a sigma.
     most = expected_snr(flux, blurred, noise_dn, pixel_noise)

@@ -83,7 +83,8 @@ def without_streaks(
     """
     Sources at the middle of their streaks, each streak once, and the turn; None if they are sharp.
 
-    Sources that are parts of a body larger than a star are left out.
+    Where the brightest are not round, sources that are parts of a body larger than a star are left
+    out.
 
     Raises ImageRefused ``smeared`` where the streaks are longer than `LONGEST_PX`.
     """
@@ -101,7 +102,8 @@ def without_streaks(
         # The limb of a body outshines the stars, and its sources are as long as streaks.
         lit = _extents(pixels, background, sources.xy_px, _HALF_PX)[2]
         stars = sources.select(lit <= _BODY)
-        return without_streaks(pixels, background, stars, camera)
+        if len(stars.snr) < len(sources.snr):
+            return without_streaks(pixels, background, stars, camera)
     apart = _apart(middle_px, _APART_PX)
     middle_px, moments_px2 = middle_px[apart], moments_px2[apart]
     streak = _turn(camera, middle_px, moments_px2)

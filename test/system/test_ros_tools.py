@@ -388,7 +388,9 @@ def test_without_the_wheels_rosbag2_reads_bags(
         starts = ('bag/', 'out/', 'starcal: ')  # nothing of rosbag2's own
         assert all(text.startswith(starts) for text in done.stderr.splitlines()), done.stderr
         return
-    unwritten = f'out/observations.mcap is not written: mcap is not installed: {install}\n'
+    unwritten = (
+        f'out/observations.mcap is not written: mcap or rosbags is not installed: {install}\n'
+    )
     assert (done.returncode, done.stderr) == (0, unwritten), done.stderr
     expected = calibrate_bag(TINY, TINY / 'params.yaml')
     camera = read_calibration(tmp_path / 'out' / CALIBRATION_FILE).geometry.camera

@@ -91,7 +91,7 @@ def read_summary(file: Path) -> Summary | None:
 def read_messages(
     file: Path, wanted: frozenset[str] | None, on_damage: Damage
 ) -> Iterator[RawMessage]:
-    """Intact messages of the wanted topics (None: all), in file order."""
+    """Intact messages of the wanted topics (None: all), in file order (rosbag2: in its own)."""
     if rosbag2.READS_BAGS:
         types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
         for topic, data, log_time_ns in rosbag2.read_messages(file, wanted, on_damage):
@@ -246,8 +246,8 @@ def _decompressed(
     """
     Yield records, the offset after each, and the data of a chunk.
 
-    Another thread decompresses a chunk while the records of that before it are in use.  Damage is
-    raised after the records before it.
+    Another thread decompresses a chunk while the records of that before it are in use, where only
+    indexes are between them.  Damage is raised after the records before it.
     """
     waiting: deque[tuple[McapRecord, int, Future[bytes] | None]] = deque()
     chunks, record, damage = 0, None, None
@@ -261,7 +261,8 @@ def _decompressed(
             data = thread.submit(_data_of, record) if isinstance(record, Chunk) else None
             waiting.append((record, stream.tell(), data))
             chunks += data is not None
-            while chunks > 1 or (waiting and not chunks):
+            ahead = chunks and isinstance(record, (Chunk, MessageIndex))
+            while chunks > 1 or (waiting and not ahead):
                 chunks -= waiting[0][2] is not None
                 yield waiting.popleft()
         while waiting:

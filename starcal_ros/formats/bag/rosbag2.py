@@ -58,7 +58,7 @@ def read_messages(
     reader = _opened(file)
     reader.set_filter(StorageFilter(topics=list(counts)))
     missing = sum(counts.values())
-    with contextlib.suppress(RuntimeError):  # the exception of each of its errors
+    with contextlib.suppress(RuntimeError, MemoryError, LookupError, ValueError):  # of C++
         while reader.has_next():
             yield reader.read_next()
             missing -= 1
@@ -68,9 +68,11 @@ def read_messages(
 
 def decode(data: memoryview, type_name: str) -> Any:
     """Message of the workspace's own type; raises an error of any class for wrong bytes."""
+    package, folder, name = type_name.split('/')
+    if folder != 'msg':
+        raise ValueError(f'{type_name} is no type of a message')
     from rclpy.serialization import deserialize_message
 
-    package, folder, name = type_name.split('/')
     kind = getattr(importlib.import_module(f'{package}.{folder}'), name)
     return deserialize_message(bytes(data), kind)
 

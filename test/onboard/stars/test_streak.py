@@ -10,8 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.stars.detection import measure_background, Sources
 from starcal_ros.stars.psf_fit import light_in_stamps, stamp_radius_px
-from starcal_ros.stars.streak import refined, Streak
+from starcal_ros.stars.streak import refined, Streak, without_streaks
 
 CAMERA = CameraModel(
     800, 640, np.array([500.0, 0.0, 500.0, 399.5, 319.5, -0.05, 0.01, 0.0, 0.0, 0.0])
@@ -69,3 +70,19 @@ def test_a_source_without_a_line_of_sight_hides_no_turn() -> None:
     # Without noise: what is left is the last step of the fit, and the pull of the outlier.
     np.testing.assert_allclose(turn.turn_rad[:2], streak.turn_rad[:2], rtol=0.01)
     assert abs(variance_px2 - 1.0) < 0.01
+
+
+def test_a_source_at_the_limit_of_a_body_ends_the_search() -> None:
+    """Windows carry light to the next one, so the last of a batch may be a body there alone."""
+    v, u = np.mgrid[:600, :600]
+    pixels = np.full((600, 600), 100.0)
+    pixels[294:316, 292:309] = 1100.0
+    pixels[313:316, 292:309] = 360.0
+    xy_px = [(50, 500), (150, 520), (450, 80), (520, 520), (300, 300), (100, 100)]
+    for x, y in xy_px[:4]:
+        pixels += 3000.0 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2.0 * 1.5**2))
+    snr = np.array([15.0, 14.0, 13.0, 12.0, 10.0, 5.0])
+    sources = Sources(np.array(xy_px, np.float64), snr, 600.0**2)
+    camera = CameraModel(600, 600, np.array([1000.0, 0.0, 1000.0, 299.5, 299.5, *np.zeros(5)]))
+    found, streak = without_streaks(pixels, measure_background(pixels), sources, camera)
+    assert streak is None and len(found.snr) == len(sources.snr)

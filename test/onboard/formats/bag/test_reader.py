@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
+import io
 from pathlib import Path
 import re
 import subprocess
@@ -13,7 +16,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import Chunk, Footer
+from mcap.records import Chunk, DataEnd, Footer, McapRecord, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 import numpy as np
@@ -324,6 +327,24 @@ def test_a_chunk_is_decompressed_while_the_one_before_it_is_in_use(
     assert started.acquire(timeout=60.0) and started.acquire(timeout=60.0)
     assert len(threads) == 2 and threading.current_thread() not in threads
     messages.close()  # type: ignore[attr-defined]
+
+
+def test_what_follows_a_chunk_is_not_held_for_the_next(small_chunks: Path) -> None:
+    """Attachments and messages outside chunks may be gigabytes."""
+    with small_chunks.open('rb') as stream:
+        records = list(StreamReader(stream, emit_chunks=True).records)
+    end = next(record for record in records if isinstance(record, DataEnd))
+    chunk = next(record for record in records if isinstance(record, Chunk))
+    taken = []
+
+    def file() -> Iterator[McapRecord]:
+        for record in (chunk, *[Metadata('name', {})] * 100, end):
+            taken.append(record)
+            yield record
+
+    with contextlib.closing(bag_reader._decompressed(file(), io.BytesIO())) as pieces:
+        next(pieces)
+    assert len(taken) == 2
 
 
 def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) -> None:
