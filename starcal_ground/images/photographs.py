@@ -109,7 +109,7 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
         return []
     if bags:
         raise IngestError(
-            f'{bags[0]}: a bag, and the other paths hold images: give one kind alone'
+            f'{bags[0]}: a bag, and the other paths hold images: give only one of the two'
         )
     return files
 

@@ -32,7 +32,8 @@ from starcal_ros.record_fields import (
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
     'bad_layout': (
-        'size, row step and data length of the image message are inconsistent, or it is truncated'
+        'size, row step and data length of the image message are inconsistent, or the message is'
+        ' truncated'
     ),
     'wrong_size': 'the image is not of the size of the prior camera',
     'bad_attitude': 'the attitude near the image is not finite or not of unit length',

@@ -2,7 +2,7 @@
 """
 The nodes and launch files with the real ROS 2 tools, on Fast DDS and on Cyclone DDS.
 
-Run with ``-s``, each test prints a row of the table in docs/reliability.md.
+Run with ``-s``, most tests print a row of the table in docs/reliability.md.
 """
 
 from __future__ import annotations
