@@ -68,8 +68,8 @@ class Requirement:
                 f' parameter{nearest(quantity, _UNITS)}'
             )
         if unit not in _UNITS[quantity]:
-            share = f'@{percent}%' if percent and quantity in (LINE_OF_SIGHT, MAP) else ''
-            written = ' or '.join(f'{quantity}={number}{name}{share}' for name in _UNITS[quantity])
+            over = f'@{percent}%' if percent and quantity in (LINE_OF_SIGHT, MAP) else ''
+            written = ' or '.join(f'{quantity}={number}{name}{over}' for name in _UNITS[quantity])
             raise OptionError(f'{OPTION}: {text}: the unit does not fit: write {written}')
         try:
             limit, share = float(number), float(percent or 100.0) / 100.0

@@ -120,7 +120,7 @@ def test_a_posterior_mean_has_its_limits() -> None:
 def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    grid = np.linspace(math.log(1e-6), math.log(0.5), 40)
+    grid = np.linspace(math.log(1e-6), math.log(0.5), 40).astype(np.float64)
     monkeypatch.setattr(module, '_LOG_GRID', grid)
     monkeypatch.setattr(module, '_transition', lambda: module._next_octave(grid))
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
