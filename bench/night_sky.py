@@ -39,7 +39,7 @@ _COLUMNS = ('camera', 'model', 'field deg', 'outcome', 'error arcsec', 'over sig
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """One line for each camera, and their sum; an hour, or some minutes."""
+    """One line for each camera, and their sum; twenty minutes, or one."""
     count = 4 if quick else CAMERAS
     table = Table('Cameras calibrated from images alone', _COLUMNS)
     ratios: list[float] = []
