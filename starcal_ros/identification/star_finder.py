@@ -59,6 +59,7 @@ _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
 _DEEPER_SIGMA = 4.0  # distance from which a star that is not measured pulls no centroid
 _ON_STAR_PX = 2.0  # largest distance of the prediction of a source that shows the PSF
+_SHOW_PSF = 80  # the brightest sources do
 _MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
 _FEWEST_IN_FIELD = 2.0  # catalog stars in an image, on average over the window of the search
 _NEAREST = 200  # brightest predictions, searched in windows first
@@ -161,9 +162,13 @@ def observe_stars(
     )
     _check_catalog(prediction, exposure, geometry, search)
     predicted_px, sources, streak = _find(image.pixels, background, prediction, geometry, search)
-    # Cosmic rays and hot pixels may be brighter than the stars, and are sharper.
+    # Cosmic rays and hot pixels may be brighter than the stars, and are sharper: the median of the
+    # sources bears some, not most.
     off_px, _ = cKDTree(np.nan_to_num(predicted_px, nan=-1e6)).query(sources.xy_px)
-    stars = sources.select(off_px < _ON_STAR_PX)
+    is_star = off_px < _ON_STAR_PX
+    of_brightest = is_star[:_SHOW_PSF]
+    are_most = 2 * np.count_nonzero(of_brightest) > len(of_brightest)
+    stars = sources if are_most else sources.select(is_star)
     model = model_image(image.pixels, background, stars, search.centroid, streak, sources)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
