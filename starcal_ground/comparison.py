@@ -62,7 +62,8 @@ class Comparison:
     before, after : DifferenceMap
         Of the lines of sight in the star tracker frame, and with the common rotation removed.
     total : ChiSquared
-        Of all differences together; no degrees of freedom where nothing was estimated.
+        Of all differences together, without the alignment if not `is_aligned`; no degrees of
+        freedom where nothing was estimated.
     notes : tuple of str
         Limitations of the sigmas.
 
@@ -86,6 +87,11 @@ class Comparison:
     after: DifferenceMap
     total: agreement.ChiSquared
     notes: tuple[str, ...]
+
+    @property
+    def is_aligned(self) -> bool:
+        """True if both have an alignment: else only their cameras are compared."""
+        return self.a.has_alignment and self.b.has_alignment
 
     @property
     def sigmas(self) -> Floats:
@@ -125,6 +131,8 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     )
     sight_sigma_rad = np.hypot(of_a.sigma_arcsec, of_b.sigma_arcsec) * ARCSECOND_RAD
     shape_sigma_rad = np.hypot(of_a.shape_sigma_arcsec, of_b.shape_sigma_arcsec) * ARCSECOND_RAD
+    compared = len(sigma) - 3 * (not (a.has_alignment and b.has_alignment))
+    covariance = (a.covariance + b.covariance)[:compared, :compared]
     return Comparison(
         a=a,
         b=b,
@@ -133,7 +141,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         rotation_rad=float(rotation.magnitude()),
         before=_map(new - old, a.geometry, sight_sigma_rad),
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
-        total=agreement.chi_squared(difference, a.covariance + b.covariance),
+        total=agreement.chi_squared(difference[:compared], covariance),
         notes=_notes(a, b, difference, sigma),
     )
 
@@ -198,7 +206,7 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
 
 
 def content(comparison: Comparison) -> dict[str, object]:
-    """A comparison as a JSON object; a number that is not finite is null."""
+    """A comparison as a JSON object; what is not finite, or of no alignment, is null."""
 
     def of_map(moved: DifferenceMap) -> dict[str, object]:
         names = ('worst_px', 'rms_px', 'worst_sigmas', 'rms_sigmas')
@@ -206,7 +214,7 @@ def content(comparison: Comparison) -> dict[str, object]:
         lengths = dict(zip(names, numbers, strict=True))
         return {**lengths, 'difference_px': moved.difference_px, 'sigmas': moved.sigmas}
 
-    total = comparison.total
+    total, aligned = comparison.total, comparison.is_aligned
     values = {
         'parameter_names': comparison.a.parameter_names,
         'a': comparison.a.geometry.camera.parameters,
@@ -214,9 +222,9 @@ def content(comparison: Comparison) -> dict[str, object]:
         'difference': comparison.difference,
         'sigma': comparison.sigma,
         'sigmas': comparison.sigmas,
-        'alignment_arcsec': comparison.difference[-3:] / ARCSECOND_RAD,
-        'common_rotation_arcsec': comparison.rotation_rad / ARCSECOND_RAD,
-        'lines_of_sight': of_map(comparison.before),
+        'alignment_arcsec': comparison.difference[-3:] / ARCSECOND_RAD if aligned else None,
+        'common_rotation_arcsec': comparison.rotation_rad / ARCSECOND_RAD if aligned else None,
+        'lines_of_sight': of_map(comparison.before) if aligned else None,
         'without_common_rotation': of_map(comparison.after),
         'chi2': total.value if total.degrees_of_freedom else None,
         'degrees_of_freedom': total.degrees_of_freedom,

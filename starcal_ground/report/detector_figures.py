@@ -451,7 +451,7 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
     maps = [
         _difference(camera, comparison.before, 'lines of sight, B minus A'),
         _difference(camera, comparison.after, 'common rotation removed'),
-    ]
+    ][not comparison.is_aligned :]
     write_atomically(path, svg.sheet([maps]).document())
 
 

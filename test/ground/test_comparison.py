@@ -186,6 +186,27 @@ def test_notes_say_what_weakens_the_sigmas(tiny: Calibration) -> None:
     assert not any('the same stars' in note for note in notes)
 
 
+def test_cameras_alone_are_compared_without_an_alignment(
+    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their alignment is of the prior camera: 82 arcsec of sigma, and no fit of any size."""
+    alone = dataclasses.replace(tiny, parent_frame='')
+    turned = dataclasses.replace(moved(tiny, (1e-2, 0.0, 0.0), fx=0.01), parent_frame='')
+    found = compare(alone, turned)
+    assert found.total.degrees_of_freedom == 10 and found.total.p_value > 0.99
+    for name, calibration in (('a', alone), ('b', turned)):
+        write_calibration(calibration, tmp_path / f'{name}.json')
+    command = ['compare', str(tmp_path / 'a.json'), str(tmp_path / 'b.json')]
+    assert main.main([*command, '-o', str(tmp_path / 'map.svg')]) == 0
+    said = capsys.readouterr().out
+    assert 'alignment x' not in said and 'as calibrated' not in said
+    assert 'the cameras alone are compared' in said and '10 degrees of freedom' in said
+    assert 'B minus A' not in (tmp_path / 'map.svg').read_text()
+    assert main.main([*command, '--json']) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content['alignment_arcsec'] is content['lines_of_sight'] is None
+
+
 def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
     camera = tiny.geometry.camera
     bigger = dataclasses.replace(

@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
-from docs import make_gallery, make_images, make_nodes, make_phase, make_trend
+from docs import make_gallery, make_images, make_nodes, make_phase, make_real_sky, make_trend
 from starcal_ground.simulation import scenario
+from starcal_ros.formats.bag.reader import read_images
+from starcal_ros.records import Image
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
@@ -27,6 +29,7 @@ BY_COMMAND = {
     'make_images': {'star_field', 'focal_plane', 'report'},
     'make_gallery': {name for name in SHOWN if name.startswith('gallery_')},
     'make_nodes': {'nodes'},
+    'make_real_sky': {'real_sky'},
     'make_phase': {'pixel_phase'},
     'make_trend': {'trend'},
     # `python -m studies paper`: test/studies/test_paper.py draws them from a few images.
@@ -68,6 +71,16 @@ def small_phase(patch: pytest.MonkeyPatch, folder: Path) -> None:
     make_phase.main()
 
 
+def small_real_sky(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    photographs = folder / 'photographs'
+    photographs.mkdir()
+    for k, image in enumerate(read_images([ROOT / 'bags' / 'tiny'], '/opnav/image_raw')):
+        assert isinstance(image, Image)
+        cv2.imwrite(str(photographs / f'{k}.png'), image.pixels)
+    patch.setattr(sys, 'argv', ['make_real_sky', str(photographs), str(folder)])
+    make_real_sky.main()
+
+
 def small_trend(patch: pytest.MonkeyPatch, folder: Path) -> None:
     write = functools.partial(make_trend.write_mission, months=3)
     patch.setattr(make_trend, 'write_mission', write)
@@ -77,7 +90,9 @@ def small_trend(patch: pytest.MonkeyPatch, folder: Path) -> None:
     assert make_trend.main() == 0
 
 
-@pytest.mark.parametrize('draw', [small_images, small_gallery, small_phase, small_trend])
+@pytest.mark.parametrize(
+    'draw', [small_images, small_gallery, small_phase, small_real_sky, small_trend]
+)
 def test_a_command_draws_its_pictures(
     draw: Callable[[pytest.MonkeyPatch, Path], None],
     monkeypatch: pytest.MonkeyPatch,

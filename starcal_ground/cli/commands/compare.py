@@ -93,16 +93,20 @@ def _print(comparison: Comparison) -> None:
     rows += [
         (f'alignment {axis}', '', '', f'{d:+.2f}″', f'{s:.2f}″', _sigmas(d, s))
         for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
+        if comparison.is_aligned
     ]
     print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
     print_table(
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [
-            ('as calibrated', *_map_cells(comparison.before)),
+            *[('as calibrated', *_map_cells(comparison.before))] * comparison.is_aligned,
             ('common rotation removed', *_map_cells(comparison.after)),
         ],
     )
-    print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
+    if comparison.is_aligned:
+        print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
+    else:
+        print_text('alignment: none in both, so the cameras alone are compared')
     total = comparison.total
     if total.degrees_of_freedom:
         print_text(
@@ -194,8 +198,8 @@ def with_truth(
     prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
     error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
     sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
-    angles_off = error_arcsec / sigma_arcsec
-    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True)
+    angles_off = (error_arcsec / sigma_arcsec)[: 3 * calibration.has_alignment]
+    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=False)
     table += [
         (f'alignment {axis}', f'{b:+.2f}″', f'{e:+.2f}″', f'{s:.2f}″', '0″', f'{o:+.1f} sigma')
         for axis, b, e, s, o in angles
