@@ -128,11 +128,11 @@ OTHERS: Mapping[str, tuple[bytes, str]] = {
     'rec.mcap.zstd': (b'(\xb5/\xfd' + bytes(40), 'a file compressed by zstd: zstd -d {file}'),
     'rec.mcap.gz': (b'\x1f\x8b\x08' + bytes(40), 'a file compressed by gzip: gunzip -k {file}'),
     'rec.zip': (b'PK\x03\x04' + bytes(40), 'a zip archive: unzip {file} -d unzipped'),
-    'a.jpg': (b'\xff\xd8\xff' + bytes(40), 'a JPEG: starcal calibrate, inspect and'),
+    'a.jpg': (b'\xff\xd8\xff' + bytes(40), 'a JPEG: starcal calibrate, inspect, diagnose and'),
     'a.HEIC': (b'\0\0\0\x18ftypheic', 'a HEIF image (HEIC): starcal calibrate, inspect'),
     'a.fits': (
         b'SIMPLE  =',
-        'a FITS file: starcal calibrate, inspect and diagnose take images',
+        'a FITS file: starcal calibrate, inspect, diagnose and plan take images',
     ),
 }
 
