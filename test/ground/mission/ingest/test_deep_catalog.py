@@ -11,7 +11,7 @@ import re
 from typing import Any
 
 from astropy import units
-from astropy.io import fits
+from astropy.io import fits, votable
 from astropy.table import MaskedColumn, Table
 import erfa
 import numpy as np
@@ -119,8 +119,11 @@ def write(given: Table, path: Path) -> None:
         columns = {name: np.ma.filled(given[name], np.nan) for name in numbers}
         columns['source_id'] = np.asarray(given['source_id'])
         parquet.write_table(pyarrow.table(columns), path)
+    elif path.suffix == '.vot':
+        # The writer in C of astropy 6.1 writes a byte beyond its buffer, and later tests crash.
+        votable.from_table(given).to_xml(str(path), _debug_python_based_parser=True)
     else:
-        given.write(path, format={'.vot': 'votable', '.csv': 'ascii.csv'}.get(path.suffix))
+        given.write(path, format={'.csv': 'ascii.csv'}.get(path.suffix))
 
 
 def write_index(given: Table, path: Path) -> None:
