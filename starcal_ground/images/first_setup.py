@@ -180,26 +180,29 @@ class FirstSetup:
         options, stated = self.setup.calibration, self.given.options
         has_tracker = self.through_air is None
         has_velocity = bool(topics.velocity or topics.observations)
-        images = ensemble.images if ensemble is not None else ()
-        # The read-out is estimated by the rates of the images.
-        is_still = bool(images) and not any(
-            np.isfinite(image.star_tracker_rate_rad_s).all() for image in images
-        )
         rows = [
             ('star_tracker_sigma_arcsec', 'from the scatter of the images',
              has_tracker and not tracker_sigma_is_given(options)),
             ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
             ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
-            ('shutter',
-             'unknown, and taken as if the camera did not turn, since no image has an angular'
-             ' rate: state it, or record attitudes more often' if is_still
-             else 'unknown, read out within 20 ms' if images else 'unknown',
-             has_tracker),
+            ('shutter', _assumed_shutter(ensemble), has_tracker),
             ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
              not (has_velocity or self.setup.site.observer == 'ground'
                   or 'observer_velocity_m_s' in stated)),
         ]  # fmt: skip
         return [(name, text) for name, text, matters in rows if matters and name not in stated]
+
+
+def _assumed_shutter(ensemble: Ensemble | None) -> str:
+    """Text on a shutter that is not stated; by the rates of the images its time is estimated."""
+    if ensemble is None:
+        return 'unknown'
+    if any(np.isfinite(image.star_tracker_rate_rad_s).all() for image in ensemble.images):
+        return 'unknown, read out within 20 ms'
+    return (
+        'unknown, and taken as if the camera did not turn, since no image has an angular rate:'
+        ' state it, or record attitudes more often'
+    )
 
 
 def _in_a_line(value: object) -> str:

@@ -490,7 +490,7 @@ def judge(
         covariance_px2,
         share_px2 - beyond_px2,
         table,
-        data.groups[1],
+        data.groups[1],  # the coarsest cells
         options.outlier_sigma,
     )
     if not kept.any():

@@ -203,18 +203,14 @@ def measure_predicted(
     count = detectable_count(
         exposure.image.pixels, shown.xy_px, model.background, search.centroid.min_snr
     )
-    measured = measure_stars(
-        exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
-    )
-    own_streak = None
+    looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
+    measured = _measured(exposure, looked_at, model, search)
+    keeps_instrument = False
     if instrument is not None and shape_changed(measured, model):
-        looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
         model = _with_streaks(exposure.image, looked_at, measured, model, search.centroid)
-        if own_streak := model.streak:
-            measured = measure_stars(
-                *(exposure.image.pixels, shown.xy_px[:count], model),
-                *(search.centroid, exposure.hot_pixels),
-            )
+        keeps_instrument = model.streak is not None
+        if keeps_instrument:
+            measured = _measured(exposure, looked_at, model, search)
     # Faint stars are refused, but their light may pull the centroids of the others.
     faint = with_faint(measured, shown.xy_px)
     deeper = deeper_stars(
@@ -248,7 +244,7 @@ def measure_predicted(
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(exposure, shown, catalog, centroids, model)
-    if observations.refusal or measured.fit is None or own_streak is not None:
+    if observations.refusal or measured.fit is None or keeps_instrument:
         return observations, instrument
     fitted = measured.fitted
     stars = MeasuredStars(
@@ -260,6 +256,15 @@ def measure_predicted(
     )
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
+
+
+def _measured(
+    exposure: Exposure, shown: Prediction, model: ImageModel, search: StarSearch
+) -> Centroids:
+    """Centroids of all stars of a prediction within the image."""
+    return measure_stars(
+        exposure.image.pixels, shown.xy_px, model, search.centroid, exposure.hot_pixels
+    )
 
 
 def _with_streaks(

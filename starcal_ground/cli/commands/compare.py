@@ -106,7 +106,7 @@ def _print(comparison: Comparison) -> None:
     if comparison.is_aligned:
         print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
     else:
-        print_text('alignment: none in both, so the cameras alone are compared')
+        print_text('alignment: not in both, so the cameras alone are compared')
     total = comparison.total
     if total.degrees_of_freedom:
         print_text(
