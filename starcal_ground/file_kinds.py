@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 import shlex
 
-from starcal_ros.errors import NotABag, StarcalError
-from starcal_ros.formats.image_headers import is_fits
+from starcal_ros.errors import IngestError, NotABag, StarcalError
+from starcal_ros.formats.image_files import is_fits
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
 
@@ -109,7 +109,7 @@ _BMP_RESERVED = slice(6, 10)
 
 
 def kind_of(path: Path) -> FileKind:
-    """Kind of a regular file; raises OSError, or ValueError in one line for another file."""
+    """Kind of a regular file; raises OSError or IngestError for none."""
     if is_fits(path):
         return FITS
     with regular_file(path) as file:
@@ -125,7 +125,7 @@ def explained(error: StarcalError) -> str:
     """Text of an error; where a bag was expected, with what is there, and what helps."""
     if isinstance(error, NotABag):
         place = error.place
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, IngestError):
             instead = _instead_of_any(place) if place.is_dir() else _instead(place, kind_of(place))
             if instead:
                 return f'{str(error).partition(" (did")[0]}{instead}'
@@ -136,7 +136,7 @@ def explained(error: StarcalError) -> str:
 def _instead_of_any(folder: Path) -> str:
     """The first file of use in a folder without MCAP files."""
     for file in sorted(folder.iterdir()):
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, IngestError):
             kind = SQLITE_BAG if file.suffix == '.db3' else kind_of(file)
             if kind.is_image or kind.instead or kind in (SQLITE_BAG, ROS_1_BAG):
                 return f', but {file.name}:{_instead(file, kind).removeprefix(" but")}'

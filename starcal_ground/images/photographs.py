@@ -116,7 +116,7 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
 
 def _is_image(path: Path) -> bool:
     """True if a file is an image of any kind, or was to be one by its name."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError, IngestError):
         kind = kind_of(path)
         if kind is not UNKNOWN:
             return kind.is_image

@@ -17,9 +17,7 @@ from starcal_ros.errors import BagError, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_ahead
 from starcal_ros.formats.bag.reader import Damage
-from starcal_ros.formats.image_headers import jpeg_header, png_header, PNG_HEADER_BYTES
-from starcal_ros.formats.messages import message_codec
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message
+from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.campaign import ThroughAir
 from starcal_ros.pipeline.diagnosis import bags
@@ -190,7 +188,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
                 elif raw.type_name == message_codec.ATTITUDE_TYPE:
-                    sample = attitude_sample(*attitude_from_message(message), '')
+                    sample = attitude_sample(*sensor_messages.attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
     contents = []
@@ -219,8 +217,8 @@ def _kind(message: message_codec.Message) -> str:
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'
     content = bytes(message.data)
-    png = png_header(content[:PNG_HEADER_BYTES])
-    header = png or jpeg_header(content)
+    png = sensor_messages.png_header(content)
+    header = png or sensor_messages.jpeg_header(content)
     if header is None:
         return f'{message.format or "compressed"}, not a PNG or JPEG'
     return f'{"PNG" if png else "JPEG"} {header.width} x {header.height}'

@@ -1,29 +1,34 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Values and header cards of images in FITS, TIFF and PNG files."""
+"""Images in FITS, TIFF and PNG files: kind and size before they are decoded, values, cards."""
 
 from __future__ import annotations
 
+import bz2
 from collections.abc import Iterator, Mapping
 import contextlib
 import math
 import os
 from pathlib import Path
+import struct
 from typing import Any, NamedTuple
 import warnings
+import zlib
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats import image_headers
-from starcal_ros.formats.image_headers import has_surplus, png_header, tiff_header
-from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic, plane
+from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.untrusted import regular_file
 
 _RGB, _GREY = 3, 2
 MOST_VALUES = 2**27  # per image, all colours; the nodes have the same limit
 MOST_BYTES = 2**29  # a larger file is not decoded
+_START_BYTES = 512
+_BLOCK_BYTES = 2**20  # bzip2 gives its first byte after a block of 900 kB
+_WIDTH, _HEIGHT, _CHANNELS = 256, 257, 277  # tags of TIFF 6.0
+_TIFF_TYPES = {3: 'H', 4: 'I'}
+_TIFF_MOST_ENTRIES = 1000
 
 
 class Card(NamedTuple):
@@ -46,17 +51,17 @@ def read_image(
         values, header = read_fits(path, hdu)
     else:
         content = content_of(path)
-        if not (png_header(content) or tiff_header(content)):
+        if not (sensor_messages.png_header(content) or tiff_header(content)):
             raise IngestError(f'{path}: not an image in FITS, TIFF or PNG')
         values, header = decoded(path, content), {}
         values = values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
     is_colour = values.ndim == _RGB and values.shape[2] == _RGB
-    if (is_colour or bayer) and channel not in CHANNELS:
+    if (is_colour or bayer) and channel not in sensor_messages.CHANNELS:
         raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
     if is_colour:
-        values = plane(values, 'rgb', channel)
+        values = sensor_messages.plane(values, 'rgb', channel)
     elif bayer:
-        values = of_mosaic(values, bayer.lower(), channel)
+        values = sensor_messages.of_mosaic(values, bayer.lower(), channel)
     if values.ndim != _GREY or min(values.shape) < 2:
         raise IngestError(
             f'{path}: array of shape {values.shape}, neither an image nor three colour planes: '
@@ -65,10 +70,35 @@ def read_image(
     return values, header
 
 
+def tiff_header(content: bytes) -> sensor_messages.Header | None:
+    """Header of the first image of a TIFF (TIFF 6.0, section 2); None if it is not a TIFF."""
+    order = {b'II*\0': '<', b'MM\0*': '>'}.get(content[:4])
+    if order is None:
+        return None
+    tags = {_CHANNELS: 1}
+    try:
+        (start,) = struct.unpack_from(f'{order}I', content, 4)
+        (count,) = struct.unpack_from(f'{order}H', content, start)
+        for at in range(start + 2, start + 2 + min(count, _TIFF_MOST_ENTRIES) * 12, 12):
+            tag, kind, number = struct.unpack_from(f'{order}HHI', content, at)
+            if tag in (_WIDTH, _HEIGHT, _CHANNELS) and number == 1:
+                (tags[tag],) = struct.unpack_from(f'{order}{_TIFF_TYPES[kind]}', content, at + 8)
+        return sensor_messages.Header(tags[_WIDTH], tags[_HEIGHT], tags[_CHANNELS])
+    except (struct.error, KeyError):
+        return None
+
+
 def is_fits(path: Path) -> bool:
-    """True if a file is FITS by its content, compressed or not; raises IngestError."""
-    with errors_as(IngestError, path):
-        return image_headers.is_fits(path)
+    """True for a FITS file, compressed or not; raises IngestError."""
+    with errors_as(IngestError, path), regular_file(path) as file:
+        start = file.read(_START_BYTES)
+        if start.startswith(b'\x1f\x8b'):
+            with contextlib.suppress(zlib.error):
+                start = zlib.decompressobj(31).decompress(start, 64)
+        elif start.startswith(b'BZh'):
+            with contextlib.suppress(OSError):
+                start = bz2.BZ2Decompressor().decompress(start + file.read(_BLOCK_BYTES), 64)
+    return start.startswith(b'SIMPLE  =')
 
 
 def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
@@ -144,11 +174,14 @@ def decoded(path: Path, content: bytes) -> NDArray[Any]:
 
     The size in the header of a PNG or TIFF is checked before anything is decoded.
     """
-    header = png_header(content) or tiff_header(content)
+    png = sensor_messages.png_header(content)
+    header = png or tiff_header(content)
     if header and header.width * header.height * header.channels > MOST_VALUES:
         raise IngestError(f'{path}: its header claims {header.width} x {header.height} pixels')
-    if header and png_header(content) and has_surplus(content, header):
+    if png and sensor_messages.has_surplus(content, png):
         raise IngestError(f'{path}: inflates to far more than its pixels')
+    import cv2  # slow to import, and the kind of a file needs it not
+
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

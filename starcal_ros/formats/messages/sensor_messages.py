@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+import contextlib
 import math
 import operator
 import struct
 from types import SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
+import zlib
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +19,6 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.image_headers import (
-    has_surplus,
-    jpeg_header,
-    png_header,
-    PNG_HEADER_BYTES,
-)
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, refused_image, StarObservations
 
@@ -42,6 +38,13 @@ BAYER_ENCODINGS = {
     for letters in ('rggb', 'bggr', 'gbrg', 'grbg')
     for bits in (8, 16)
 }
+_PNG_START = b'\x89PNG\r\n\x1a\n\0\0\0\rIHDR'
+_PNG_HEADER_BYTES = 33
+_PNG_CHUNK = struct.Struct('>I4s')  # length, name
+_PNG_MOST_CHUNKS = 100_000
+_JPEG_MOST_SEGMENTS = 1000
+# Colour type -> channels; a palette is decoded to three colours.
+_PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 T = TypeVar('T')
 _STAMP_NS = operator.itemgetter(0)
 # The Earth moves at 3e4 m/s; a value beyond this limit would displace all stars.
@@ -98,6 +101,66 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
     return Image(time_ns, pixels)
 
 
+class Header(NamedTuple):
+    """Size of an image file, px, and its channels."""
+
+    width: int
+    height: int
+    channels: int
+
+
+def png_header(content: bytes) -> Header | None:
+    """Header at the start of a PNG (PNG 1.2, section 4.1.1); None if it is not a PNG."""
+    if content[:16] != _PNG_START or len(content) < _PNG_HEADER_BYTES:
+        return None
+    width, height, _, colour = struct.unpack_from('>IIBB', content, 16)
+    return Header(width, height, _PNG_CHANNELS.get(colour, 0))
+
+
+def jpeg_header(content: bytes) -> Header | None:
+    """Header of a JPEG (ITU T.81, B.2.2), from its frame; None if it is not a JPEG."""
+    if content[:2] != b'\xff\xd8':
+        return None
+    at = 2
+    with contextlib.suppress(struct.error):
+        for _ in range(_JPEG_MOST_SEGMENTS):
+            mark, code, length = struct.unpack_from('>BBH', content, at)
+            if mark != 0xFF:
+                break
+            if code == 0xFF:  # a byte of fill
+                at += 1
+                continue
+            if 0xC0 <= code <= 0xCF and code not in (0xC4, 0xC8, 0xCC):  # tables, not a frame
+                height, width, channels = struct.unpack_from('>HHB', content, at + 5)
+                return Header(width, height, channels)
+            at += 2 + length
+    return None
+
+
+def has_surplus(content: bytes, header: Header) -> bool:
+    """
+    True if a PNG inflates to far more than its pixels, which a decoder would throw away.
+
+    A megabyte of compressed data can hold a gigabyte: seconds for nothing.
+    """
+    most = 2 * (2 * header.width * header.channels + 8) * header.height  # of 16 bit, interlaced
+    inflate, at, size = zlib.decompressobj(), 8, 0
+    for _ in range(_PNG_MOST_CHUNKS):
+        if at + _PNG_CHUNK.size > len(content):
+            return False
+        length, name = _PNG_CHUNK.unpack_from(content, at)
+        at += _PNG_CHUNK.size
+        if name == b'IDAT':
+            try:
+                size += len(inflate.decompress(content[at : at + length], most - size + 1))
+            except zlib.error:
+                return False  # the decoder refuses it
+            if size > most:
+                return True
+        at += length + 4  # its checksum
+    return True
+
+
 def decode_compressed(
     data: Any, time_ns: int, size: tuple[int, int] | None = None, channel: str = ''
 ) -> Image:
@@ -112,7 +175,7 @@ def decode_compressed(
     image that cannot be decoded.
     """
     content = bytes(data)
-    png = png_header(content[:PNG_HEADER_BYTES])
+    png = png_header(content)
     header, kind = png or jpeg_header(content), 'PNG' if png else 'JPEG'
     if header is None:
         raise ImageRefused('bad_encoding', 'the compressed image is not a PNG or JPEG')

@@ -19,7 +19,6 @@ from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 from starcal_ground.bag_writer import image_to_message
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.image_headers import jpeg_header
 from starcal_ros.formats.messages.message_codec import (
     COMPRESSED_TYPE,
     IMAGE_TYPE,
@@ -35,6 +34,7 @@ from starcal_ros.formats.messages.sensor_messages import (
     decode_image,
     image_from_message,
     image_of,
+    jpeg_header,
     refused_from_message,
     view_image,
 )
