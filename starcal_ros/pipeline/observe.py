@@ -21,7 +21,6 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.estimation.options import assumed_tracker_sigma_rad
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
@@ -260,6 +259,23 @@ def _without_dark(image: Image, setup: Setup) -> Image:
     peak = int(pixels.max())
     level[(level > peak) | (pixels >= (saturation_level(pixels, setup.centroid) or np.inf))] = peak
     return Image(image.time_ns, level)
+
+
+def flattened(image: Image, flat: Floats | None, pedestal_dn: int) -> Image:
+    """
+    Image divided by the flat field above a pedestal; of blind pixels as it is.
+
+    The brightest pixels stay at the peak of the image, so that saturated ones are still found.
+    """
+    if flat is None:
+        return image
+    pixels = image.pixels
+    peak = int(pixels.max())
+    signal = (pixels.astype(np.float32) - pedestal_dn) / np.nan_to_num(flat, nan=1.0)
+    level = np.clip(np.rint(signal + pedestal_dn), 0, peak)
+    level[pixels == peak] = peak
+    cast = level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
+    return Image(image.time_ns, cast)
 
 
 def _after_order(track: Track, time_ns: int) -> Track:

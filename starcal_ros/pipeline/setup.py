@@ -2,6 +2,8 @@
 """
 Setup of a calibration: options of every stage, with the files they name loaded.
 
+The files are the prior camera, the catalog, and dark frame, flat field and bad pixels.
+
 Implausible options raise `OptionError` in one line that names the likely mistake and its remedy,
 wherever a setup is loaded: by a node at its start, by `starcal calibrate`, `inspect` and
 `diagnose`.
@@ -21,40 +23,33 @@ import re
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros import options
+from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.requirements import requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import IngestError, OptionError
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     check_options,
 )
+from starcal_ros.formats.image_files import read_image
 from starcal_ros.formats.messages.sensor_messages import CHANNELS
 from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
-from starcal_ros.options import (
-    from_mapping,
-    is_of_ros,
-    names_of,
-    option,
-    option_fields,
-    OptionValue,
-    read_parameter_file,
-    unknown_option,
-    with_home,
-)
-from starcal_ros.pipeline import detector_frames
+from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions, Mounting
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog, StarCatalog
+from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.frame_checks import ScreeningOptions
 from starcal_ros.stars.hot_pixels import hot_in_dark, HotPixels, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import CentroidOptions
@@ -65,6 +60,11 @@ _LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 _RADIANS_BELOW, _DEGREES_BELOW = 1e-3, 1e-2
 _FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as many
 _FAINTEST = 100  # stars of the catalog about which its stars are counted
+_UNIT_DN = 30000  # of a response of 1, where it is searched for stars
+_STAR_SIGMA = 8.0  # of a star in a flat field: five megapixels of noise have none
+_MOST_STARS = 5  # of a flat field of the twilight
+_MOST_BAD = 0.5  # part of the pixels from which a map is taken to be inverted
+_LEAST = 0.1  # response over the median below which a pixel is bad: its noise is ten times larger
 
 
 def check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
@@ -231,12 +231,12 @@ class Setup:
         tracker_sigma_rad = float(assumed_tracker_sigma_rad(self.calibration).max())
         return StarSearch(self.catalog, self.centroid, self.identification, tracker_sigma_rad)
 
-    def options(self) -> dict[str, OptionValue]:
+    def options(self) -> dict[str, options.OptionValue]:
         """Every option of every stage, by name."""
         return {
             field.name: getattr(getattr(self, group), field.name)
             for group, kind in _OPTION_GROUPS
-            for field in option_fields(kind)
+            for field in options.option_fields(kind)
         }
 
 
@@ -342,17 +342,19 @@ def read_values(params: Path) -> dict[str, object]:
 
     Raises OptionError when it is not a parameter file.
     """
-    return paths_from(read_parameter_file(params, NODES), params.parent)
+    return paths_from(options.read_parameter_file(params, NODES), params.parent)
 
 
 def paths_from(values: Mapping[str, object], folder: Path) -> dict[str, object]:
     """Options whose relative paths of files to read are relative to a folder."""
-    names = [field.name for field in option_fields(SetupOptions) if field.metadata['is_path']]
+    names = [
+        field.name for field in options.option_fields(SetupOptions) if field.metadata['is_path']
+    ]
     paths = {name: values[name] for name in names if isinstance(values.get(name), str)}
     return {
         **values,
         **{
-            name: str(folder / with_home(name, str(path)))
+            name: str(folder / options.with_home(name, str(path)))
             for name, path in paths.items()
             if path and '://' not in str(path)
         },
@@ -391,11 +393,13 @@ def option_groups(values: Mapping[str, object], others: Sequence[type] = ()) -> 
     ``others`` are further option classes whose names are also allowed. Raises OptionError for an
     unknown name or a bad value.
     """
-    known = names_of(*OPTION_CLASSES, *others)
+    known = options.names_of(*OPTION_CLASSES, *others)
     for name in values:
-        if name not in known and not is_of_ros(name):
-            raise OptionError(unknown_option(name, known))
-    groups: dict[str, Any] = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS}
+        if name not in known and not options.is_of_ros(name):
+            raise OptionError(options.unknown_option(name, known))
+    groups: dict[str, Any] = {
+        name: options.from_mapping(kind, values) for name, kind in _OPTION_GROUPS
+    }
     _check_relative(files_of(groups['frames']))
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
     check_site(groups['site'])
@@ -425,16 +429,16 @@ def load_setup(
     if frames.catalog or magnitude_limit < BUNDLED_MAGNITUDE:
         check_field_of_stars(catalog, magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
-    dark = detector_frames.read_dark(frames.dark_frame, *size)
-    flat = detector_frames.read_flat(frames.flat_field, *size)
-    bad = detector_frames.read_bad_pixels(frames.bad_pixel_map, *size)
+    dark = read_dark(frames.dark_frame, *size)
+    flat = read_flat(frames.flat_field, *size)
+    bad = read_bad_pixels(frames.bad_pixel_map, *size)
     return Setup(
         **groups,
         prior=prior,
         catalog=catalog,
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=detector_frames.with_bad_pixels(hot_in_dark(dark), bad, flat),
+        hot=with_bad_pixels(hot_in_dark(dark), bad, flat),
         is_aligned=is_aligned,
         camera_name=camera_yaml.read_camera_name(frames.camera_info_url)
         if frames.camera_info_url
@@ -451,10 +455,10 @@ def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
 
 
 def _mountings(
-    options: AttitudeOptions, setup: SetupOptions, prior: CameraGeometry, is_aligned: bool
+    attitude: AttitudeOptions, setup: SetupOptions, prior: CameraGeometry, is_aligned: bool
 ) -> tuple[Mounting, ...]:
     """The additional star trackers in the frame of the first, from the prior alignments."""
-    frames = [frame for frame in options.more_star_trackers if frame]
+    frames = [frame for frame in attitude.more_star_trackers if frame]
     if not frames:
         return ()
     taken = {setup.star_tracker_frame.lstrip('/'), setup.camera_frame.lstrip('/')}
@@ -472,12 +476,12 @@ def _mountings(
             'more_star_trackers: more_alignments needs prior_alignment too: it'
             ' cannot be found from the images'
         )
-    if len(options.more_alignments) != 4 * len(frames):
+    if len(attitude.more_alignments) != 4 * len(frames):
         raise OptionError(
-            f'more_alignments: {len(options.more_alignments)} numbers, but {len(frames)} further'
+            f'more_alignments: {len(attitude.more_alignments)} numbers, but {len(frames)} further'
             f' star trackers need {4 * len(frames)}'
         )
-    rows = np.array(options.more_alignments).reshape(-1, 4).tolist()
+    rows = np.array(attitude.more_alignments).reshape(-1, 4).tolist()
     quaternions = [_unit_quaternion('more_alignments', row) for row in rows]
     first = Rotation.from_quat(prior.star_tracker_from_camera_xyzw)
     mounted = (first * Rotation.from_quat(quaternions).inv()).as_quat()
@@ -511,3 +515,92 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
+
+
+def read_dark(path: str, width: int, height: int) -> Pixels | None:
+    """Pixels (height, width) of a dark frame; None without a path; raises as `read_flat`."""
+    if not path:
+        return None
+    values = _read('dark_frame', path, width, height)
+    if values.dtype not in (np.uint8, np.uint16):
+        raise OptionError(
+            f'dark_frame: {path} is {values.dtype}, expected unsigned 8 or 16 bit, one channel of'
+            f' {width} x {height}'
+        )
+    return values
+
+
+def read_flat(path: str, width: int, height: int) -> Floats | None:
+    """
+    Response (height, width) of the pixels, median 1; NaN where it is under a tenth of that.
+
+    None without a path. Raises OptionError when the file is missing, damaged or of another size,
+    or holds no positive number or stars.
+    """
+    if not path:
+        return None
+    values = _read('flat_field', path, width, height).astype(np.float64)
+    with np.errstate(all='ignore'):
+        middle = float(np.nanmedian(values))
+        response = values / middle
+    if not middle > 0:
+        raise OptionError(f'flat_field: {path}: the median is {middle:g}, not positive')
+    stars = _excess_of_stars(response)
+    if stars > _MOST_STARS:
+        raise OptionError(
+            f'flat_field: {path} shows {stars} stars: it is a frame of the sky; give a frame of an'
+            ' evenly lit field, without its bias'
+        )
+    response[~(response >= _LEAST)] = np.nan
+    return np.asarray(response)
+
+
+def read_bad_pixels(path: str, width: int, height: int) -> Indices:
+    """Flat indices (k,) of the pixels of a map that are not 0; raises as `read_flat`."""
+    if not path:
+        return np.empty(0, np.int64)
+    bad = np.flatnonzero(_read('bad_pixel_map', path, width, height))
+    if len(bad) > _MOST_BAD * width * height:
+        raise OptionError(
+            f'bad_pixel_map: {path} marks {len(bad) / (width * height):.0%} of the pixels as bad:'
+            ' write 0 for good pixels, any other value for bad ones'
+        )
+    return bad
+
+
+def _excess_of_stars(response: Floats) -> int:
+    """
+    Number of star-like bright spots of a response beyond that of dark ones.
+
+    Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
+    """
+    level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
+    # Columns and rows of another gain have edges, whose maxima are no stars either.
+    level = level / np.maximum(np.median(level, axis=0), _LEAST)
+    level = level / np.maximum(np.median(level, axis=1), _LEAST)[:, None] * _UNIT_DN
+    bright, dark = (
+        detect(pixels, measure_background(pixels), _STAR_SIGMA)
+        for pixels in (
+            np.clip(np.rint(values), 0, 2 * _UNIT_DN).astype(np.uint16)
+            for values in (level, 2 * _UNIT_DN - level)
+        )
+    )
+    return len(bright.snr) - len(dark.snr)
+
+
+def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPixels:
+    """Hot pixels, bad pixels and those without response in the flat field, together."""
+    blind = np.empty(0, np.int64) if flat is None else np.flatnonzero(np.isnan(flat))
+    index = np.union1d(np.union1d(hot.index, bad), blind)
+    return dataclasses.replace(hot, index=index) if len(index) else hot
+
+
+def _read(name: str, path: str, width: int, height: int) -> NDArray[Any]:
+    expected = f'expected one channel of {width} x {height}'
+    try:
+        values, _ = read_image(Path(path.removeprefix('file://')))
+    except IngestError as error:
+        raise OptionError(f'{name}: {error}; {expected}') from error
+    if values.shape != (height, width):
+        raise OptionError(f'{name}: {path} is of shape {values.shape}, {expected}')
+    return values

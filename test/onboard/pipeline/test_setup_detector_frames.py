@@ -15,7 +15,6 @@ from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[imp
 from starcal_ground.products import write_camera_info
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image, StarObservations
 
@@ -88,7 +87,7 @@ def test_pixels_without_response_are_bad(camera_yaml: Path, tmp_path: Path) -> N
     cv2.imwrite(str(tmp_path / 'flat.png'), flat)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
     assert setup.hot.index.tolist() == [7 * WIDTH + 9]
-    same = flattened(image(), setup.flat, 0)
+    same = observe.flattened(image(), setup.flat, 0)
     assert (same.pixels == image().pixels).all()
 
 
@@ -110,7 +109,7 @@ def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
 def test_saturated_pixels_stay_at_the_peak() -> None:
     pixels = np.array([[4095, 2000], [1000, 4095]], np.uint16)
     flat = np.array([[1.5, 0.25], [0.5, 0.5]])
-    found = flattened(Image(1, pixels), flat, 0).pixels
+    found = observe.flattened(Image(1, pixels), flat, 0).pixels
     assert found.tolist() == [[4095, 4095], [2000, 4095]]
 
 
