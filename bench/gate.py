@@ -89,7 +89,7 @@ def _judged(
     options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=assumed_arcsec)
     setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
     try:
-        found = solve.solve(ensemble, setup)
+        found = solve.solve(ensemble, setup)[0]
     except TooFewObservations:
         return ['cannot be solved'], np.nan
     names = [check.option or check.note for check in found.gate if check.passed is False]

@@ -75,7 +75,7 @@ def observations() -> tuple[StarObservations, ...]:
 @functools.cache
 def calibration() -> Calibration:
     """Return the calibration of that bag, which passes the gate."""
-    solved = solve.solve(functools.reduce(Ensemble.add, observations(), Ensemble()), setup())
+    solved = solve.solve(functools.reduce(Ensemble.add, observations(), Ensemble()), setup())[0]
     assert solved.accepted, solved.reasons
     return solved
 

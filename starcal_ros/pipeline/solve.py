@@ -124,6 +124,7 @@ def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     return observability.ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
+@one_blas_thread()
 def solve(
     ensemble: Ensemble,
     setup: Setup,
@@ -131,28 +132,15 @@ def solve(
     estimate: Sequence[str] = (),
     inputs: Mapping[str, str] | None = None,
     active: Calibration | None = None,
-) -> Calibration:
+) -> tuple[Calibration, Residuals]:
     """
-    A calibration of the ensemble with the verdict of the gate and its provenance.
+    A calibration of the ensemble, judged by the gate, and its residuals by star and image.
 
     ``method`` and ``estimate`` override the options where not empty; ``inputs`` names the sources
     of the observations, for the provenance; the gate limits the change from ``active``, the
     calibration that this one would replace. Raises TooFewObservations when the ensemble is too
     small; the text names the shortage. Raises OptionError for an unknown method or parameter name.
     """
-    return solve_with_residuals(ensemble, setup, method, estimate, inputs, active)[0]
-
-
-@one_blas_thread()
-def solve_with_residuals(
-    ensemble: Ensemble,
-    setup: Setup,
-    method: str = '',
-    estimate: Sequence[str] = (),
-    inputs: Mapping[str, str] | None = None,
-    active: Calibration | None = None,
-) -> tuple[Calibration, Residuals]:
-    """The calibration of `solve`, and its residuals by star and image."""
     setup = aligned_by(ensemble, _as_asked_for(setup, method, estimate))
     result = estimated(ensemble, setup)
     provenance = provenance_of(setup, ensemble, inputs or {})

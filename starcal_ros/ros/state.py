@@ -12,16 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_ros import errors
 from starcal_ros.assessment import requirements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.errors import (
-    ArchiveError,
-    missing_package,
-    OptionError,
-    StarcalError,
-    TooFewObservations,
-)
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup
 from starcal_ros.records import (
@@ -102,8 +96,8 @@ class CalibratorState:
         try:
             from starcal_ros.ros.archive import Archive, read_seal
         except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
-            raise ArchiveError(
-                f'state_dir: {missing_package(error)}, or leave state_dir empty: then a'
+            raise errors.ArchiveError(
+                f'state_dir: {errors.missing_package(error)}, or leave state_dir empty: then a'
                 ' restart loses the ensemble'
             ) from error
         seal = read_seal(options.state_key_file)
@@ -112,7 +106,7 @@ class CalibratorState:
             ensemble, history = archive.read_ensemble(), archive.read_history()
             _check_size(options.state_dir, ensemble, history, setup)
             ensemble = _of_size(ensemble, archive, setup)
-        except StarcalError:
+        except errors.StarcalError:
             archive.close()
             raise
         with self._disk, self._records:
@@ -211,10 +205,10 @@ class CalibratorState:
         try:
             calibration = solving.solve(
                 ensemble, self._setup, method, estimate, active=self.active
-            )
-        except TooFewObservations as error:
+            )[0]
+        except errors.TooFewObservations as error:
             return Answer(False, f'{error}{self._why_refused(ensemble.refused)}')
-        except StarcalError as error:
+        except errors.StarcalError as error:
             return Answer(False, str(error))
         if not calibration.accepted and not force:
             refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
@@ -278,7 +272,7 @@ class CalibratorState:
         try:
             self._archive.keep(ensemble, history)
             self.trouble = ''
-        except ArchiveError as error:
+        except errors.ArchiveError as error:
             self.trouble = str(error)
         except Exception as error:  # whatever it is, the records are not on disk
             self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
@@ -354,7 +348,7 @@ def _check_size(
     }
     if sizes and (prior.width, prior.height) not in sizes:
         width, height = min(sizes)
-        raise OptionError(
+        raise errors.OptionError(
             f'state_dir: {folder} is of a camera of {width} x {height}, '
             f'the prior camera has {prior.width} x {prior.height}'
         )

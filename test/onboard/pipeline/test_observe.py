@@ -472,7 +472,7 @@ def test_an_image_without_a_match_is_measured_with_the_calibration() -> None:
     ensemble = Ensemble()
     for record in before:
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
-    geometry = solve.solve(ensemble, setup).geometry
+    geometry = solve.solve(ensemble, setup)[0].geometry
     again = topics.measured_again([TINY], chosen, setup, geometry, before)
     assert [record.refusal for record in again] == [''] * 5 + ['no_stars'] + [''] * 4
     assert all(a is b for k, (a, b) in enumerate(zip(again, before, strict=True)) if k != 2)
