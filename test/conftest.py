@@ -37,7 +37,7 @@ LONGEST = (
     *('test_kills', 'test_diagnose', 'test_object_store'),
     *('test_c_camera', 'test_deep_catalog', 'test_set_up_mistakes', 'test_trend'),
     *('test_recording', 'test_untrusted_files', 'test_docs'),
-    *('test_ros_tools', 'test_hostile_messages', 'test_camera_info_client'),
+    *('test_ros_tools', 'test_hostile_messages', 'test_calibrator_camera_driver'),
 )
 
 

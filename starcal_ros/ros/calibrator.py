@@ -1,19 +1,22 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Calibrator node: subscribes to star observations, publishes calibrations."""
+"""Calibrator node: subscribes to star observations, publishes calibrations, to a camera too."""
 
 from __future__ import annotations
 
 import array
 from collections.abc import Sequence
 import contextlib
+import math
 import sys
 import threading
+import time
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -36,7 +39,6 @@ from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import CalibratorOptions, load_setup
 from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros import node
-from starcal_ros.ros.camera_info_client import CameraDriver
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.state import Answer, CalibratorState
 
@@ -47,6 +49,9 @@ _OBSERVATIONS = QoSProfile(depth=1000)
 _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 # Of every publisher of static transforms the last message.
 _ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_TIMEOUT_S = 5.0  # of set_camera_info, and of its answer: a driver may write to flash memory
+_LOOK_S = 0.5  # period of checks for the service and the timeout
+_LONGEST_PAUSE_S = 300.0  # between two attempts at a driver that does not answer
 _RETRY_S = 1.0  # after a failed write
 _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
@@ -78,7 +83,6 @@ class Calibrator(node.StarcalNode):
             (Trigger, '~/reset', self._on_reset, deciding),
             (Trigger, '~/rollback', self._on_rollback, deciding),
             (LineOfSightTable, '~/lookup', self._on_lookup, sending),
-            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
         ):
             self.create_service(kind, name, self._answered(answer), callback_group=group)
 
@@ -293,15 +297,6 @@ class Calibrator(node.StarcalNode):
             response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
         return response
 
-    def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
-        driver = self._driver
-        if driver is None:
-            response.success = False
-            response.message = 'parameter set_camera_info_service is empty'
-        else:
-            response.success, response.message = driver.hand_over_again()
-        return response
-
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
@@ -365,6 +360,117 @@ class Calibrator(node.StarcalNode):
             return response
 
         return run_and_tell
+
+
+class CameraDriver:
+    """
+    Client of set_camera_info that reports the outcome of each call.
+
+    A calibration is sent as soon as the service is available, and again to each server of it that
+    appears: a driver that restarts has lost its camera.  After a refusal, or without an answer, it
+    is sent again after a pause that doubles: the driver may be busy, or the request or its answer
+    was lost before the two had discovered each other.  Safe to use from several threads.
+    """
+
+    def __init__(self, of_node: node.StarcalNode, service: str) -> None:
+        self.failures = 0
+        self.outcome = 'no calibration'
+        self.has_failed = False  # last attempt
+        self._node, self._service = of_node, service
+        self._camera_info: Any = None
+        self._is_there = False
+        self._servers: frozenset[bytes] = frozenset()
+        self._call: Any = None
+        self._since_s = 0.0  # monotonic clock: the last request, or the last that was due
+        self._pause_s = _TIMEOUT_S
+        self._next_s = math.inf  # of the next request; infinite: once the service appears
+        self._closed = False
+        self._lock = threading.RLock()
+        group = ReentrantCallbackGroup()
+        self._client = of_node.create_client(SetCameraInfo, service, callback_group=group)
+        self._answers = f'rr{of_node.resolve_service_name(service)}Reply'  # its DDS topic
+        self._timer = of_node.steady_timer(_LOOK_S, of_node.guarded(self._look), group)
+
+    def close(self) -> None:
+        """Destroy the client."""
+        with self._lock:
+            self._closed = True
+            self._drop_call()
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_client(self._client)
+
+    def hand_over(self, camera_info: Any) -> None:
+        """Send a sensor_msgs/CameraInfo in place of any earlier one; does not wait."""
+        with self._lock:
+            self._camera_info = camera_info
+            self._drop_call()
+            self._since_s = self._next_s = time.monotonic()
+            self._pause_s = _TIMEOUT_S
+            self.outcome, self.has_failed = 'waiting for the service', False
+            self._look()
+
+    def _look(self) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            now_s = time.monotonic()
+            is_due, is_overdue = now_s >= self._next_s, now_s > self._since_s + _TIMEOUT_S
+            appeared = self._has_appeared() and self._camera_info is not None
+            if appeared:
+                self._pause_s = _TIMEOUT_S
+            if self._is_there and (is_due or appeared):
+                self._send(now_s)
+            elif is_due and is_overdue:
+                self._next_s = math.inf
+                self._fail('service not available; will be sent when it is')
+            elif self._call is not None and is_overdue:
+                self._drop_call()
+                self._fail(f'no answer within {_TIMEOUT_S:g} s')
+
+    def _has_appeared(self) -> bool:
+        """
+        Return True if the service, or another server of it, has appeared since the last look.
+
+        A driver restarts in less time than passes between two looks, and one that was killed
+        counts as there until its lease ends, 20 s with Fast DDS.  Servers are known by the DDS
+        topic of their answers; a middleware without DDS names leaves that empty.
+        """
+        was_there, self._is_there = self._is_there, self._client.service_is_ready()
+        had = self._servers
+        servers = self._node.get_publishers_info_by_topic(self._answers, no_mangle=True)
+        self._servers = frozenset(bytes(server.endpoint_gid) for server in servers)
+        return self._is_there and (not was_there or not self._servers <= had)
+
+    def _send(self, now_s: float) -> None:
+        self._drop_call()
+        self._since_s, self._next_s = now_s, now_s + _TIMEOUT_S + self._pause_s
+        self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        self.outcome = 'waiting for its answer'
+        self._call = self._client.call_async(SetCameraInfo.Request(camera_info=self._camera_info))
+        self._call.add_done_callback(self._node.guarded(self._answered))
+
+    def _answered(self, call: Any) -> None:
+        with self._lock:
+            if call is not self._call or self._closed:
+                return  # of a calibration that is no longer active
+            self._call = None
+            if call.exception() is not None:
+                self._fail(f'failed: {call.exception()}')
+            elif call.result().success:
+                self.outcome, self.has_failed, self._next_s = 'accepted', False, math.inf
+                self._node.get_logger().info(f'{self._service}: accepted')
+            else:
+                self._fail(f'refused: {" ".join(call.result().status_message.split())}')
+
+    def _drop_call(self) -> None:
+        if self._call is not None:
+            self._client.remove_pending_request(self._call)
+            self._call = None
+
+    def _fail(self, outcome: str) -> None:
+        self.outcome, self.has_failed = outcome, True
+        self.failures += 1
+        self._node.get_logger().error(f'{self._service}: {outcome}')
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -317,7 +317,7 @@ def test_calls_to_a_node_that_is_deactivated_are_answered(
     client: Client, filled: NodeProcess
 ) -> None:
     calls = [(client.node.create_client(Calibrate, '/calibrator/solve'), Calibrate.Request())]
-    for name in ('calibrate', 'rollback', 'send_camera_info'):
+    for name in ('calibrate', 'rollback'):
         service = client.node.create_client(Trigger, f'/calibrator/{name}')
         calls.append((service, Trigger.Request()))
     client.until(lambda: all(service.service_is_ready() for service, _ in calls))

@@ -119,8 +119,6 @@ def test_driver_is_told_and_its_failures_are_seen(
         ),
     )
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    nothing = client.call(Trigger, '/calibrator/send_camera_info')
-    assert (nothing.success, nothing.message) == (False, 'no calibration is active')
     fill(client, tiny_observations)
     assert client.call(Trigger, '/calibrator/calibrate').success
     client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))
@@ -142,13 +140,9 @@ def test_driver_is_told_and_its_failures_are_seen(
         return response
 
     client.node.create_service(SetCameraInfo, SERVICE, answer)
-    refused = client.call(Trigger, '/calibrator/send_camera_info')
-    assert not refused.success and refused.message == f'{SERVICE}: refused: sensor busy'
     client.until(told(diagnostics, 'refused: sensor busy', b'\x01'))
 
-    accepts = True
-    taken = client.call(Trigger, '/calibrator/send_camera_info')
-    assert taken.success, taken.message
+    accepts = True  # it is called again without a request
     client.until(told(diagnostics, 'accepted', b'\x00'))
     published = client.latched(CameraInfo, 'camera_info')
     client.until(lambda: published)
@@ -166,12 +160,6 @@ def test_driver_is_told_and_its_failures_are_seen(
     ):
         assert f'{SERVICE}: {outcome}' in said
     assert 'Traceback' not in said
-
-
-def test_without_a_driver(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    start_node('calibrator', ros=('--params-file', str(tiny_bag / 'params.yaml')))
-    answer = client.call(Trigger, '/calibrator/send_camera_info')
-    assert not answer.success and 'set_camera_info_service' in answer.message
 
 
 @pytest.mark.parametrize('ends_by', [signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)
