@@ -23,18 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from starcal_ros.arrays import Floats
+from starcal_ros.camera import lens
 from starcal_ros.camera.detector_field import DetectorField
-from starcal_ros.camera.lens import (
-    coefficient_jacobian,
-    COEFFICIENTS,
-    directions_of,
-    distort,
-    distort_jacobian,
-    fold_radius2,
-    ideal_by_rotation,
-    ideal_points,
-    ros_distortion,
-)
 from starcal_ros.record_fields import Record
 
 MAX_SIDE_PX = 65536
@@ -48,7 +38,7 @@ INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 
 def parameter_names(model: str) -> tuple[str, ...]:
     """Names of the parameters of a lens model, in order."""
-    return INTRINSIC_NAMES + COEFFICIENTS[model]
+    return INTRINSIC_NAMES + lens.COEFFICIENTS[model]
 
 
 PARAMETER_NAMES = parameter_names('plumb_bob')
@@ -93,8 +83,10 @@ class CameraModel(Record):
 
     def __post_init__(self) -> None:
         """Freeze a float copy of the parameters."""
-        if self.model not in COEFFICIENTS:
-            raise ValueError(f'lens model: {self.model!r} is not one of {", ".join(COEFFICIENTS)}')
+        if self.model not in lens.COEFFICIENTS:
+            raise ValueError(
+                f'lens model: {self.model!r} is not one of {", ".join(lens.COEFFICIENTS)}'
+            )
         parameters = np.array(self.parameters, np.float64)
         count = len(self.parameter_names)
         if parameters.shape != (count,) or not np.isfinite(parameters).all():
@@ -142,7 +134,7 @@ class CameraModel(Record):
     @property
     def opencv_coefficients(self) -> Floats:
         """Distortion (c,) in OpenCV's order: for cv2, or cv2.fisheye if ``equidistant``."""
-        return ros_distortion(self.model, self.distortion)[1]
+        return lens.ros_distortion(self.model, self.distortion)[1]
 
     def replace(self, **parameters: float) -> CameraModel:
         """Return the camera with some named parameters changed; ValueError for other names."""
@@ -209,7 +201,7 @@ def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
-    distorted = distort(camera.model, _plane_points(camera, pixels), camera.distortion)
+    distorted = lens.distort(camera.model, _plane_points(camera, pixels), camera.distortion)
     return _pixels(camera.intrinsics, distorted) - pixels
 
 
@@ -235,7 +227,7 @@ def project_parameters(model: str, parameters: Floats, directions_camera: Floats
     is given a direction at or behind the plane of the lens (Z <= 0).  Complex parameters or
     directions pass through, for complex-step derivatives.
     """
-    distorted = distort(model, ideal_points(model, directions_camera), parameters[5:])
+    distorted = lens.distort(model, lens.ideal_points(model, directions_camera), parameters[5:])
     return _pixels(parameters[:5], distorted)
 
 
@@ -286,7 +278,7 @@ def project_jacobians(
     """
     xy = _ideal_in_front(camera.model, directions_camera)
     fx, skew, fy, _, _ = camera.intrinsics
-    distorted = distort(camera.model, xy, camera.distortion)
+    distorted = lens.distort(camera.model, xy, camera.distortion)
     xd, yd = distorted[..., 0], distorted[..., 1]
 
     J_parameters = np.zeros((*xd.shape, 2, len(camera.parameters)))
@@ -295,7 +287,7 @@ def project_jacobians(
     J_parameters[..., 0, 3] = 1.0
     J_parameters[..., 1, 2] = yd
     J_parameters[..., 1, 4] = 1.0
-    columns = coefficient_jacobian(camera.model, xy, camera.distortion)
+    columns = lens.coefficient_jacobian(camera.model, xy, camera.distortion)
     for k, (column_x, column_y) in enumerate(zip(*columns, strict=True), start=5):
         J_parameters[..., 0, k] = fx * column_x + skew * column_y
         J_parameters[..., 1, k] = fy * column_y
@@ -312,10 +304,10 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
     xy = _ideal_in_front(camera.model, directions_camera)
     fx, skew, fy, _, _ = camera.intrinsics
-    J_xy = distort_jacobian(camera.model, xy, camera.distortion)
+    J_xy = lens.distort_jacobian(camera.model, xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
     J_v = fy * J_xy[..., 1, :]
-    x_theta, y_theta = ideal_by_rotation(camera.model, xy)
+    x_theta, y_theta = lens.ideal_by_rotation(camera.model, xy)
     J = np.empty((*xy.shape[:-1], 2, 3))
     J[..., 0, :] = J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta
     J[..., 1, :] = J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta
@@ -326,7 +318,7 @@ def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
     """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
     e = np.asarray(directions_camera, np.float64)
     if model == 'equidistant':
-        return ideal_points(model, e)
+        return lens.ideal_points(model, e)
     z_inverse = 1.0 / e[..., 2]
     return np.asarray(e[..., :2] * z_inverse[..., None])
 
@@ -339,7 +331,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     model, where it has no inverse on the branch of the optical axis.
     """
     model, distortion = camera.model, camera.distortion
-    fold2 = fold_radius2(model, distortion)
+    fold2 = lens.fold_radius2(model, distortion)
     pixels = np.asarray(pixels, np.float64)
     if (field := camera.moving_field) is not None:
         pixels = pixels - field.displacement_px(pixels)
@@ -349,10 +341,10 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
     error = np.full(target.shape, np.inf)
     for _ in range(_INVERSE_STEPS):
-        error = distort(model, xy, distortion) - target
+        error = lens.distort(model, xy, distortion) - target
         if np.abs(error).max(initial=0.0) < _INVERSE_TOLERANCE:
             break
-        J = distort_jacobian(model, xy, distortion)
+        J = lens.distort_jacobian(model, xy, distortion)
         a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
         with np.errstate(all='ignore'):
             determinant = a * d - b * c
@@ -369,13 +361,13 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
             step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
         moved = xy - np.nan_to_num(step)
         xy = _inside(xy, moved, fold2) if guarded else moved
-    J = distort_jacobian(model, xy, distortion)
+    J = lens.distort_jacobian(model, xy, distortion)
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
     xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
-    return directions_of(model, xy)
+    return lens.directions_of(model, xy)
 
 
 def _inside(before: Floats, after: Floats, fold2: float) -> Floats:
@@ -443,8 +435,8 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     """
     if model == camera.model and not camera.has_field:
         return dataclasses.replace(camera, field=None), 0.0
-    if model not in COEFFICIENTS:
-        raise ValueError(f'lens model: {model!r} is not one of {", ".join(COEFFICIENTS)}')
+    if model not in lens.COEFFICIENTS:
+        raise ValueError(f'lens model: {model!r} is not one of {", ".join(lens.COEFFICIENTS)}')
     names = parameter_names(model)
     known = dict(zip(camera.parameter_names, camera.parameters, strict=True))
     same_plane = 'equidistant' not in (model, camera.model)

@@ -25,24 +25,7 @@ from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.formats.messages import sensor_messages
-from starcal_ros.formats.messages.message_codec import (
-    nearest_stamp_ns,
-    offset_ns,
-    RawMessage,
-    stamp_ns,
-)
-from starcal_ros.formats.messages.record_messages import (
-    calibration_from_message,
-    camera_info_to_message,
-    observations_to_message,
-)
-from starcal_ros.formats.messages.sensor_messages import (
-    color_image_to_message,
-    image_of,
-    latest_at,
-    view_image,
-)
+from starcal_ros.formats.messages import message_codec, record_messages, sensor_messages
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.annotation import annotate
@@ -216,16 +199,16 @@ class StarObserver(StarcalNode):
         }
         return [self.resolve_topic_name(topic) for topic, count in taken.items() if not count]
 
-    def _on_image(self, raw: RawMessage) -> None:
+    def _on_image(self, raw: message_codec.RawMessage) -> None:
         self._image_arrivals.add(0.0)
         try:
-            message = view_image(raw)
+            message = sensor_messages.view_image(raw)
         except ImageRefused:
-            self._in_worker(self._publish, image_of(raw))
+            self._in_worker(self._publish, sensor_messages.image_of(raw))
             return
         self._publish_camera_info(message)
-        time_ns = stamp_ns(message.header.stamp)
-        time_ns += offset_ns(self._setup.attitude.stamp_offset_s)
+        time_ns = message_codec.stamp_ns(message.header.stamp)
+        time_ns += message_codec.offset_ns(self._setup.attitude.stamp_offset_s)
         width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
         self._queue.put(time_ns, width, height, raw)
 
@@ -274,14 +257,14 @@ class StarObserver(StarcalNode):
         self._temperatures.append(sensor_messages.temperature_from_message(message))
 
     def _on_calibration(self, message: Any) -> None:
-        calibration = calibration_from_message(message)
+        calibration = record_messages.calibration_from_message(message)
         if not (calibration.accepted or calibration.forced):
             raise ValueError('calibration: refused by the gate')
         geometry = calibration.geometry
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: image size differs from the prior camera')
-        self._camera_info = camera_info_to_message(calibration, make_message)
+        self._camera_info = record_messages.camera_info_to_message(calibration, make_message)
         self._in_worker(self._predict_with, geometry, calibration.number)
 
     def _predict_with(self, geometry: CameraGeometry, number: int) -> None:
@@ -325,7 +308,7 @@ class StarObserver(StarcalNode):
             return
         offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
         size, channel = (camera.width, camera.height), self._setup.frames.image_channel
-        image = image_of(waiting.message, offset_s, size, channel)
+        image = sensor_messages.image_of(waiting.message, offset_s, size, channel)
         if isinstance(image, StarObservations):
             self._publish(image)
             return
@@ -367,8 +350,12 @@ class StarObserver(StarcalNode):
             first,
             self._setup,
             track,
-            latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
-            latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
+            sensor_messages.latest_at(
+                sorted(self._velocities, key=_STAMP_NS), image.time_ns, None
+            ),
+            sensor_messages.latest_at(
+                sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan
+            ),
             more,
         )
 
@@ -428,11 +415,15 @@ class StarObserver(StarcalNode):
 
     def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
         width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))
-        return refused_image(nearest_stamp_ns(waiting.time_ns), width, height, reason, detail)
+        return refused_image(
+            message_codec.nearest_stamp_ns(waiting.time_ns), width, height, reason, detail
+        )
 
     def _publish(self, observations: StarObservations) -> None:
         frame_id = self._setup.frames.camera_frame
-        self._observations.publish(observations_to_message(observations, frame_id, make_message))
+        self._observations.publish(
+            record_messages.observations_to_message(observations, frame_id, make_message)
+        )
         self._counts[observations.refusal] += 1
         self._last_refusal = (
             observations.refusal and f'{observations.refusal}: {observations.detail}'
@@ -450,7 +441,7 @@ class StarObserver(StarcalNode):
         picture = annotate(image, observations, geometry)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
-            color_image_to_message(image.time_ns, picture, frame_id, make_message)
+            sensor_messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
         )
 
 

@@ -25,14 +25,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.message_codec import RawMessage
-from starcal_ros.formats.messages.sensor_messages import (
-    attitude_from_message,
-    image_of,
-    latest_at,
-    temperature_from_message,
-    velocity_from_message,
-)
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import ARC_S, attitude_sample, AttitudeHistory, AttitudeOptions
 
@@ -90,12 +84,12 @@ class Telemetry:
             **dict(zip(self._topics.more_attitudes, self.more_attitudes, strict=True)),
         }
         if raw.topic in by_topic:
-            time_ns, quaternion = attitude_from_message(message)
+            time_ns, quaternion = sensor_messages.attitude_from_message(message)
             sample = attitude_sample(time_ns, quaternion, self._options.attitude_direction)
             by_topic[raw.topic].add(time_ns, sample)
         elif raw.topic == self._topics.velocity:
             try:
-                time_ns, velocity_m_s = velocity_from_message(message)
+                time_ns, velocity_m_s = sensor_messages.velocity_from_message(message)
             except ValueError as error:
                 self.velocities_left_out += 1
                 if self.velocities_left_out == 1:
@@ -103,7 +97,7 @@ class Telemetry:
                 return True
             bisect.insort(self.velocities, (time_ns, velocity_m_s), key=_stamp_ns)
         else:
-            time_ns, temperature_degc = temperature_from_message(message)
+            time_ns, temperature_degc = sensor_messages.temperature_from_message(message)
             bisect.insort(self.temperatures, (time_ns, temperature_degc), key=_stamp_ns)
         newest_ns = self._newest_ns.setdefault(raw.topic, time_ns)
         self._newest_ns[raw.topic] = max(newest_ns, time_ns)
@@ -128,8 +122,8 @@ class Telemetry:
 
     def at(self, time_ns: int) -> tuple[Floats | None, float]:
         """Velocity and temperature at a time."""
-        velocity_m_s = latest_at(self.velocities, time_ns, None)
-        return velocity_m_s, latest_at(self.temperatures, time_ns, math.nan)
+        velocity_m_s = sensor_messages.latest_at(self.velocities, time_ns, None)
+        return velocity_m_s, sensor_messages.latest_at(self.temperatures, time_ns, math.nan)
 
     def numbers_at(self, time_ns: int) -> Floats:
         """All that a measurement takes from the samples, (17,); NaN where there is none."""
@@ -191,7 +185,7 @@ def read_frames(
     for raw in read_ahead(messages):
         in_order = True
         if raw.topic == topics.image:
-            waiting.append(image_of(raw, options.stamp_offset_s, size, channel))
+            waiting.append(sensor_messages.image_of(raw, options.stamp_offset_s, size, channel))
         elif not is_complete:
             in_order = telemetry.add(raw)
         if not is_complete and (not in_order or _is_too_much(waiting)):
