@@ -3,8 +3,7 @@
 State on disk: the ensemble, and the activated calibrations, safe from a crash.
 
 ``ensemble/00000012.mcap`` is one image, numbered in order of arrival: a whole bag that any reader
-of MCAP opens.  ``ensemble/refused.json`` counts the refused images.  ``ensemble/metadata.yaml``
-lists the images for rosbag2 while no calibrator uses the folder, unless the last one was killed.
+of MCAP opens.  ``ensemble/refused.json`` counts the refused images.
 ``calibrations/00000007_calibration_00000003.json`` records that event 7 activated calibration 3
 (here by a roll-back): a ``calibration.json`` with two more keys.
 
@@ -40,7 +39,7 @@ from starcal_ros.errors import ArchiveError, BagError, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.bag.writer import FileSpan, metadata_text, observations_bag, TopicSummary
+from starcal_ros.formats.bag.writer import observations_bag
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import record_messages
 from starcal_ros.formats.products import product_files
@@ -61,7 +60,7 @@ ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
 _EMPTIED = 'ensemble.emptied'
-_REFUSED, _METADATA = 'refused.json', 'metadata.yaml'
+_REFUSED = 'refused.json'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
 # Numbers in the names of files that are not read count as given up to this one: a calibrator does
@@ -221,26 +220,15 @@ class Archive:
         self._events: dict[int, Path] = {}  # those on disk
         self._lock = _locked(folder)
         self._finish_emptying()
-        # After a kill the metadata would lack the last images, and readers would skip them.
-        for stale in (*folder.glob(f'*/.*{PART}'), folder / _ENSEMBLE / _METADATA):
+        for stale in folder.glob(f'*/.*{PART}'):
             with contextlib.suppress(OSError):
                 stale.unlink()
 
     def close(self) -> None:
-        """Describe the ensemble for rosbag2 and unlock the folder; safe to call twice."""
+        """Unlock the folder; safe to call twice."""
         if self._lock >= 0:
-            self._describe()
             os.close(self._lock)
         self._lock = -1
-
-    def _describe(self) -> None:
-        kept = sorted(self._images.items(), key=lambda item: item[1].path.name)
-        if not kept:
-            return
-        files = [FileSpan(image.path.name, stamp, stamp, 1) for stamp, image in kept]
-        topic = TopicSummary(TOPIC, codec.OBSERVATIONS_TYPE, len(files))
-        with contextlib.suppress(OSError, ProductError):  # the images are whole without it
-            self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
 
     def saved(self, ensemble: Ensemble) -> int:
         """Number of images of an ensemble on disk."""
@@ -268,7 +256,7 @@ class Archive:
                 self._next_image = max(self._next_image, int(name[1]) + 1)
         for path, _ in self._files(_ENSEMBLE, re.compile(re.escape(_REFUSED))):
             self._refused = self._read_refused(path)
-        self._images = images  # all or none: `close` describes them
+        self._images = images
         return Ensemble(tuple(kept.image for kept in images.values()), dict(self._refused))
 
     def set_aside_image(self, time_ns: int, why: str) -> None:

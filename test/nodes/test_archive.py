@@ -16,7 +16,6 @@ import time
 from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
 from sample_records import assert_same  # type: ignore[import-not-found]
 
 from starcal_ros.errors import ArchiveError
@@ -69,24 +68,6 @@ def test_the_ensemble_is_a_bag(tmp_path: Path) -> None:
         archive.keep(Ensemble(images()[:12]), ())
     found = list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))
     assert [one.time_ns for one in found] == [one.time_ns for one in images()[:12]]
-    with AnyReader([tmp_path / 'ensemble']) as other:  # by its metadata, as rosbag2 does
-        assert {topic: info.msgcount for topic, info in other.topics.items()} == {
-            TOPIC: len(found)
-        }
-        assert (other.start_time, other.end_time - 1) == (found[0].time_ns, found[-1].time_ns)
-
-
-def test_no_metadata_lacks_an_image(tmp_path: Path) -> None:
-    """While the folder is in use, and so after a kill, there is none: all images are read."""
-    metadata = tmp_path / 'ensemble' / 'metadata.yaml'
-    with opened(tmp_path) as archive:
-        archive.keep(Ensemble(images()[:2]), ())
-        assert not metadata.exists()
-    assert metadata.exists()
-    with opened(tmp_path) as archive:
-        assert not metadata.exists()
-        archive.keep(Ensemble((*archive.read_ensemble().images, images()[2])), ())
-        assert len(list(bag_reader.read_observations([metadata.parent], TOPIC))) == 3
 
 
 def test_what_goes_from_the_ensemble_goes_from_the_disk(tmp_path: Path) -> None:

@@ -153,10 +153,10 @@ def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
     row(FAST, 'launch', 'ros2 launch starcal replay.launch.py', '10 images')
     if not has_rosbag2(ros2):
         return
-    info = ros2.run('bag', 'info', tmp_path / 'state' / 'ensemble')
+    info = ros2.run('bag', 'info', tmp_path / 'state' / 'ensemble' / '00000001.mcap')
     words = info.stdout.split()
-    assert words[words.index('Messages:') + 1] == '10', info.stdout + info.stderr
-    row(FAST, 'rosbag2', 'ros2 bag info STATE_DIR/ensemble', '10 messages')
+    assert words[words.index('Messages:') + 1] == '1', info.stdout + info.stderr
+    row(FAST, 'rosbag2', 'ros2 bag info STATE_DIR/ensemble/00000001.mcap', '1 message')
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
 import io
 from typing import IO
 
@@ -69,13 +67,41 @@ class MessageWriter:
 
     def metadata(self, name: str) -> str:
         """Return the content of the metadata.yaml of the file of that name."""
-        messages = sum(self._counts.values())
-        file = FileSpan(name, self._first_ns or 0, self._last_ns, messages)
+        first_ns = self._first_ns or 0
+
+        def span() -> dict[str, object]:  # twice the same object would be an alias in YAML
+            return {
+                'starting_time': {'nanoseconds_since_epoch': first_ns},
+                'duration': {'nanoseconds': max(self._last_ns - first_ns, 0)},
+                'message_count': sum(self._counts.values()),
+            }
+
         topics = [
-            TopicSummary(topic, type_name, self._counts[topic])
+            {
+                'topic_metadata': {
+                    'name': topic,
+                    'type': type_name,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': [_offered_qos()],
+                    'type_description_hash': typestore().hash_rihs01(type_name),
+                },
+                'message_count': self._counts[topic],
+            }
             for topic, (_, type_name) in self._channels.items()
         ]
-        return metadata_text([file], topics)
+        information = {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            'relative_file_paths': [name],
+            **span(),
+            'topics_with_message_count': topics,
+            'compression_format': '',
+            'compression_mode': '',
+            'files': [{'path': name, **span()}],
+            'custom_data': None,
+            'ros_distro': 'jazzy',
+        }
+        return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=True)
 
 
 def observations_bag(topic: str, record: StarObservations, frame_id: str) -> bytes:
@@ -86,65 +112,6 @@ def observations_bag(topic: str, record: StarObservations, frame_id: str) -> byt
     writer.write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
     writer.finish()
     return stream.getvalue()
-
-
-@dataclass(frozen=True)
-class FileSpan:
-    """A file of a bag: name, stamps of its first and last message, number of messages."""
-
-    name: str
-    first_ns: int
-    last_ns: int
-    messages: int
-
-
-@dataclass(frozen=True)
-class TopicSummary:
-    """A topic of a bag."""
-
-    name: str
-    type_name: str
-    messages: int
-
-
-def metadata_text(files: Sequence[FileSpan], topics: Sequence[TopicSummary]) -> str:
-    """Return the content of the metadata.yaml of at least one file."""
-    first_ns, last_ns = min(file.first_ns for file in files), max(file.last_ns for file in files)
-    whole = FileSpan('', first_ns, last_ns, sum(file.messages for file in files))
-    topic_list = [
-        {
-            'topic_metadata': {
-                'name': topic.name,
-                'type': topic.type_name,
-                'serialization_format': 'cdr',
-                'offered_qos_profiles': [_offered_qos()],
-                'type_description_hash': typestore().hash_rihs01(topic.type_name),
-            },
-            'message_count': topic.messages,
-        }
-        for topic in topics
-    ]
-    information = {
-        'version': 9,
-        'storage_identifier': 'mcap',
-        'relative_file_paths': [file.name for file in files],
-        **_span(whole),
-        'topics_with_message_count': topic_list,
-        'compression_format': '',
-        'compression_mode': '',
-        'files': [{'path': file.name, **_span(file)} for file in files],
-        'custom_data': None,
-        'ros_distro': 'jazzy',
-    }
-    return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=True)
-
-
-def _span(file: FileSpan) -> dict[str, object]:
-    return {
-        'starting_time': {'nanoseconds_since_epoch': file.first_ns},
-        'duration': {'nanoseconds': max(file.last_ns - file.first_ns, 0)},
-        'message_count': file.messages,
-    }
 
 
 def _offered_qos() -> dict[str, object]:
