@@ -66,7 +66,6 @@ class Calibrator(node.StarcalNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self._made: list[tuple[Any, Any]] = []
         self._listeners: list[tuple[Any, Any]] = []
         self._publishing = threading.Lock()
         self._state = CalibratorState(self._now_ns)
@@ -96,22 +95,17 @@ class Calibrator(node.StarcalNode):
             self.get_logger().error(text)
         if self._state.withheld:
             self._last_gate = f'refused: {self._state.withheld[0]}'
-
-        def latched(kind: Any, topic: str) -> Any:
-            publisher = self.create_lifecycle_publisher(kind, topic, LATCHED)
-            self._made.append((self.destroy_lifecycle_publisher, publisher))
-            return publisher
-
-        self._camera_info = latched(CameraInfo, 'camera_info')
-        self._alignment = latched(TransformStamped, 'alignment')
-        self._calibration = latched(CalibrationMessage, 'calibration')
-        self._candidate = latched(CalibrationMessage, 'candidate_calibration')
-        self._status = latched(StatusMessage, 'ensemble_status')
+        self._camera_info = self.publisher(CameraInfo, 'camera_info', LATCHED)
+        self._alignment = self.publisher(TransformStamped, 'alignment', LATCHED)
+        self._calibration = self.publisher(CalibrationMessage, 'calibration', LATCHED)
+        self._candidate = self.publisher(CalibrationMessage, 'candidate_calibration', LATCHED)
+        self._status = self.publisher(StatusMessage, 'ensemble_status', LATCHED)
         self._tf_static = None
         self._own_transforms: list[Any] = []
         self._foreign_frames: set[str] = set()
         with contextlib.suppress(ImportError):  # tf2_msgs need not be installed
-            self._tf_static = latched(node.message_class(_TRANSFORMS), '/tf_static')
+            kind = node.message_class(_TRANSFORMS)
+            self._tf_static = self.publisher(kind, '/tf_static', LATCHED)
 
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
@@ -156,9 +150,7 @@ class Calibrator(node.StarcalNode):
     def cleanup(self) -> None:
         """Destroy the publishers and close the state folder; the state stays in memory."""
         with self._publishing:
-            while self._made:
-                destroy, entity = self._made.pop()
-                destroy(entity)
+            super().cleanup()
         self._state.close()
 
     def health(self) -> node.Health:

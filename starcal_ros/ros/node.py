@@ -34,6 +34,7 @@ from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.message_codec import Message
@@ -70,6 +71,7 @@ class StarcalNode(PrintableLog, LifecycleNode):
         for unknown in self.options.unknown():
             raise OptionError(unknown_option(unknown, self.options.names()))
         self.failure = ''  # why the last transition failed, one line
+        self._publishers_made: list[Any] = []
         self.inputs = Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
@@ -102,9 +104,16 @@ class StarcalNode(PrintableLog, LifecycleNode):
         """Destroy the subscriptions and services; may be called twice."""
         raise NotImplementedError
 
+    def publisher(self, kind: Any, topic: str, qos: QoSProfile) -> Any:
+        """Return a publisher that `cleanup` destroys."""
+        made = self.create_lifecycle_publisher(kind, topic, qos)
+        self._publishers_made.append(made)
+        return made
+
     def cleanup(self) -> None:
-        """Destroy the objects created by `configure`; may be called twice."""
-        raise NotImplementedError
+        """Destroy the publishers; may be called twice."""
+        while self._publishers_made:
+            self.destroy_lifecycle_publisher(self._publishers_made.pop())
 
     def health(self) -> Health:
         """Return level, message and values of the diagnostics of the active node."""

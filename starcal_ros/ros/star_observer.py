@@ -68,7 +68,6 @@ class StarObserver(StarcalNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self._publishers_made: list[Any] = []
         self._worker: threading.Thread | None = None
 
     def configure(self) -> None:
@@ -78,17 +77,14 @@ class StarObserver(StarcalNode):
         self._setup = load_setup(values, self.options.classes)
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
-        self._observations = self.create_lifecycle_publisher(
+        self._observations = self.publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
-        self._annotated = self.create_lifecycle_publisher(
-            ImageMessage, 'annotated_image', QoSProfile(depth=2)
-        )
+        self._annotated = self.publisher(ImageMessage, 'annotated_image', QoSProfile(depth=2))
         self._camera_info: Any = None  # of the active calibration, header of the last image
-        self._camera_infos = self.create_lifecycle_publisher(
+        self._camera_infos = self.publisher(
             CameraInfo, 'image_camera_info', QoSProfile(depth=_IMAGES)
         )
-        self._publishers_made = [self._observations, self._annotated, self._camera_infos]
 
     def activate(self) -> None:
         """Subscribe to images and attitudes, start the worker thread."""
@@ -144,11 +140,6 @@ class StarObserver(StarcalNode):
         self._worker.join()
         self._worker = None
         self._unmatched.close()
-
-    def cleanup(self) -> None:
-        """Destroy the publishers."""
-        while self._publishers_made:
-            self.destroy_lifecycle_publisher(self._publishers_made.pop())
 
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
