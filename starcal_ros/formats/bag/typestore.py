@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
 import functools
 import os
 from pathlib import Path
-import re
 import sys
 from typing import Any
 
@@ -18,10 +17,7 @@ from rosbags.typesys.store import Typestore
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages.message_codec import Message
 
-_TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
-# The largest definition of starcal has 4,718 characters, its longest array nine items.
-_MOST_CHARACTERS, _MOST_ITEMS = 1 << 16, 1000
-_COUNT = re.compile(r'(\d+)\s*\]')
+_MOST_CHARACTERS = 1 << 16  # the largest definition of starcal has 4,718
 
 
 def make_message(type_name: str, /, **fields: Any) -> Message:
@@ -59,94 +55,44 @@ def _definitions_folder() -> Path:
 @functools.lru_cache(maxsize=64)
 def typestore_of(type_name: str, definition: str) -> Typestore:
     """
-    Types by the definition in a bag, whose writer may be another version; else `typestore`.
+    Types by the definition in a bag, if another version of starcal wrote it; else `typestore`.
 
-    Raises BagError when the definition is invalid and the type is not one of `typestore`.
+    A definition that `check_definition` refuses is not taken: the message then is not readable.
     """
-    try:
-        return typestore_with(type_name, definition)
+    own = typestore()
+    is_own = type_name.startswith('starcal/') and type_name in own.types
+    if not is_own or definition == described(type_name)[0]:
+        return own
     # The exceptions of an invalid definition have no common base class.
-    except Exception as error:
-        if type_name not in typestore().types:
-            raise BagError(
-                f'{type_name:.60}: its definition in the bag: {error!s:.100}'
-            ) from error
-        return typestore()
+    with contextlib.suppress(Exception):
+        definitions = check_definition(type_name, definition)
+        store = get_typestore(Stores.EMPTY)
+        store.register(definitions)
+        return store
+    return own
 
 
-def typestore_with(type_name: str, definition: str) -> Typestore:
+def check_definition(type_name: str, definition: str) -> dict[str, Any]:
     """
-    Types with the bag's own definition of one: another version may have written the bag.
+    Types of a definition that differs from that of this version in its fields alone.
 
-    Raises ValueError when the definition is too large, since code is generated from it, and
-    exceptions of any class when it is invalid.
+    Code is generated from it.  Fields may lack, and others may be added that are numbers, texts or
+    lists of them.  Raises ValueError for any other difference, and exceptions of any class for
+    what is no definition.
     """
-    if not _TYPE_NAME.fullmatch(type_name):
-        raise ValueError('not a type name')
     if len(definition) > _MOST_CHARACTERS:
         raise ValueError(f'longer than {_MOST_CHARACTERS} characters')
-    for count in _COUNT.findall(definition):
-        if len(count) > 9 or int(count) > _MOST_ITEMS:
-            raise ValueError(f'an array of more than {_MOST_ITEMS} items')
-    definitions = get_types_from_msg(definition, type_name)
-    _count_items(type_name, definitions, {})
+    definitions, known_types = get_types_from_msg(definition, type_name), typestore().fielddefs
     for name, (_, fields) in definitions.items():
-        _check_fields(name, dict(fields))
-    store = get_typestore(Stores.EMPTY)
-    store.register(definitions)
-    return store
-
-
-def _check_fields(name: str, fields: Mapping[str, Any]) -> None:
-    """
-    Compare the fields of a definition with those of this version, which may have others.
-
-    Raises ValueError when a field of the same name has another type, or the header is missing.
-    """
-    if name not in typestore().fielddefs:
-        return
-    known = dict(typestore().fielddefs[name][1])
-    if 'header' in known and 'header' not in fields:
-        raise ValueError(f'{name} has no header')
-    for field in fields.keys() & known.keys():
-        if _without_lengths(fields[field]) != _without_lengths(known[field]):
-            raise ValueError(f'{name}.{field} has another type')
-
-
-def _without_lengths(kind: Any) -> Any:
-    node, content = kind
-    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return ('list', _without_lengths(content[0]))
-    return content if node == Nodetype.NAME else content[0]
-
-
-def _count_items(name: str, types: Mapping[str, Any], known: dict[str, int]) -> int:
-    """
-    Smallest number of items of a message of a type; types that others define count as one.
-
-    Raises ValueError for a type that contains itself, that has no fields, or that has too many
-    items: reading one would take for ever.
-    """
-    if name not in types:
-        return 1
-    if name in known:
-        if not known[name]:
-            raise ValueError(f'{name} contains itself')
-        return known[name]
-    known[name] = 0
-    _, fields = types[name]
-    known[name] = sum(_items_of(kind, types, known) for _, kind in fields)
-    if not 0 < known[name] <= _MOST_ITEMS:
-        raise ValueError(f'{name} has {known[name]} items')
-    return known[name]
-
-
-def _items_of(kind: Any, types: Mapping[str, Any], known: dict[str, int]) -> int:
-    node, content = kind
-    if node == Nodetype.NAME:
-        return _count_items(content, types, known)
-    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        item, count = content
-        each = _items_of(item, types, known)
-        return each * int(count) if node == Nodetype.ARRAY else 1
-    return 1
+        if name not in known_types:
+            raise ValueError(f'{name} is no type of this version')
+        known = dict(known_types[name][1])
+        # A list of items without a byte could be read for ever.
+        if not fields or ('header' in known and 'header' not in dict(fields)):
+            raise ValueError(f'{name} has no header, or no fields')
+        for field, kind in fields:
+            node, content = kind
+            item = content[0][0] if node == Nodetype.SEQUENCE else node
+            if kind != known.get(field, kind) or (field not in known and item != Nodetype.BASE):
+                raise ValueError(f'{name}.{field} has another type')
+    return definitions
