@@ -22,7 +22,6 @@ import dataclasses
 from dataclasses import dataclass
 import difflib
 import functools
-import html
 import math
 import sys
 import textwrap
@@ -209,10 +208,6 @@ class Record:
         text = f'{type(self).__name__}({", ".join(self._in_words())})'
         indent, end = {'subsequent_indent': '  '}, {'max_lines': _LINES, 'placeholder': ' ...)'}
         return '\n'.join(textwrap.wrap(text, _WIDTH, **indent, **end))  # type: ignore[arg-type]
-
-    def _repr_html_(self) -> str:
-        """Return the summary, for notebooks."""
-        return f'<pre>{html.escape(self.summary())}</pre>'
 
     def summary(self) -> str:
         """Text with a line for each field; arrays and lists by their size."""

@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ros.errors import ArchiveError, BagError, OptionError, ProductError
+from starcal_ros.errors import ArchiveError, BagError, errors_as, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.bag.typestore import make_message, typestore
@@ -63,10 +63,9 @@ _EMPTIED = 'ensemble.emptied'
 _REFUSED = 'refused.json'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
-# Numbers in the names of files that are not read count as given up to this one: a calibrator does
-# not reach it, and a file with a longer number would leave none for those after it.
+# Numbers in the names of files that are not read count as given too, but for longer ones: after
+# those there would be none.
 _NUMBERED = re.compile(r'\.?(\d{8})[._]')
-_LAST_NUMBER = 999_999_999
 _MOST_BYTES = 64 << 20  # of a file: an image of 10,000 stars has 1 MB
 _MOST_COUNT = 2**32 - 1  # of refused images: that of the message
 _LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
@@ -144,12 +143,8 @@ def read_seal(key_file: str) -> Seal:
     """
     if not key_file:
         return Seal()
-    try:
+    with errors_as(OptionError, f'state_key_file: {key_file}'):
         key = read_bytes(Path(key_file), _MOST_KEY_BYTES).strip()
-    except OSError as error:
-        raise OptionError(f'state_key_file: {key_file}: {error.strerror}') from error
-    except ValueError as error:
-        raise OptionError(f'state_key_file: {key_file}: {error}') from error
     if len(key) < _LEAST_KEY_BYTES:
         raise OptionError(
             f'state_key_file: {key_file} holds {len(key)} bytes, at least {_LEAST_KEY_BYTES} are '
@@ -322,7 +317,6 @@ class Archive:
             'archive': json_object(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
         }
         name = f'{record.event:08d}_calibration_{record.calibration.number:08d}.json'
-        _check_number(record.event)
         path = self._write(_CALIBRATIONS, name, self._seal.sealed(content))
         self._events[record.event] = path
         self.last_event = max(self.last_event, record.event)
@@ -333,7 +327,6 @@ class Archive:
             stale.path.unlink(missing_ok=True)
             del self._images[image.time_ns]
         number = self._next_image
-        _check_number(number)
         try:
             data = observations_bag(TOPIC, image, self._frame_id)
         except BagError as error:
@@ -526,14 +519,6 @@ def _free_name(path: Path) -> Path:
         [path], (path.with_name(f'{path.name}{k}') for k in itertools.count(2))
     )
     return next(name for name in names if not os.path.lexists(name))
-
-
-def _check_number(number: int) -> None:
-    if number > _LAST_NUMBER:
-        raise ArchiveError(
-            f'state_dir: number {number} has too many digits; move the files with the highest '
-            'numbers to another place'
-        )
 
 
 def _locked(folder: Path) -> int:

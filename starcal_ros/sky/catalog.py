@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import CatalogError
+from starcal_ros.errors import CatalogError, errors_as
 from starcal_ros.untrusted import read_archive
 
 CATALOG_PATH = Path(__file__).parent / 'data' / 'star_catalog.npz'
@@ -203,12 +203,8 @@ def column_digest(columns: Mapping[str, NDArray[np.generic]]) -> str:
 
 
 def _read_columns(path: Path) -> tuple[dict[str, NDArray[np.generic]], str]:
-    try:
+    with errors_as(CatalogError, f'{path}: star catalog'):
         entries = read_archive(path, ('format', 'digest', *COLUMN_TYPES))
-    except OSError as error:
-        raise CatalogError(f'{path}: star catalog cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise CatalogError(f'{path}: not a star catalog, or a damaged one ({error})') from error
     missing = [name for name in ('format', 'digest', *COLUMN_TYPES) if name not in entries]
     if missing:
         raise CatalogError(f'{path}: not a star catalog (missing: {", ".join(missing)})')
@@ -314,15 +310,10 @@ def cone(
     magnitude_limit : float, optional
         Omit stars fainter than this V.
     """
-    axis = np.asarray(direction_icrs, np.float64)
-    norm = float(np.linalg.norm(axis)) if axis.shape == (3,) else math.nan
-    if not (math.isfinite(norm) and norm > 0):
-        raise ValueError(f'direction_icrs is {direction_icrs!r}, expected three finite numbers')
-    if not 0 <= radius_rad <= math.pi:
-        raise ValueError(f'radius_rad is {radius_rad!r}, expected 0 to pi')
+    axis = np.asarray(direction_icrs / np.linalg.norm(direction_icrs))
     # A cosine does not resolve angles below 1e-8 rad; the margin is 1.6e-3.
     cos_radius = math.cos(min(radius_rad + CONE_MARGIN_RAD, math.pi))
-    rows = np.flatnonzero(catalog.direction_icrs @ (axis / norm) >= cos_radius)
+    rows = np.flatnonzero(catalog.direction_icrs @ axis >= cos_radius)
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
     return rows

@@ -162,4 +162,3 @@ def test_a_large_record_is_shown_in_three_lines() -> None:
     )
     assert repr(dataclasses.replace(large, parts=(large,) * 3)).count('\n') <= 2
     assert 'numbers=<300 x 2 float64>' in large.summary()
-    assert '&lt;300 x 2 float64&gt;' in large._repr_html_()

@@ -342,17 +342,12 @@ def of_mosaic(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
     Pixels (h // 2, w // 2) of a colour in a Bayer mosaic (h, w).
 
     Green is taken from the first of its two sites.  Pixel (u, v) is pixel (2 u + i, 2 v + j) of
-    the mosaic with (i, j) from `site`: the prior camera must be one of this image.
+    the mosaic, (i, j) the site of the colour in the pattern: the prior camera must be one of this
+    image.
     """
-    i, j = site(letters, channel)
+    j, i = divmod(letters.index(channel[0]), 2)
     height, width = pixels.shape
     return np.ascontiguousarray(pixels[j : height // 2 * 2 : 2, i : width // 2 * 2 : 2])
-
-
-def site(letters: str, channel: str) -> tuple[int, int]:
-    """Column and row (i, j) of the first site of a colour in a Bayer pattern, ``rggb``."""
-    j, i = divmod(letters.index(channel[0]), 2)
-    return i, j
 
 
 def attitude_from_message(message: codec.Message) -> tuple[int, Floats]:

@@ -99,13 +99,10 @@ def of_a_failure(
 
 def aligned_by_bags(paths: Sequence[Path], requested: Topics, setup: Setup) -> tuple[Setup, str]:
     """
-    A setup with the alignment that the images show where none is given, and a sentence on it.
+    A setup with the alignment that the images show, since none is given, and a sentence on it.
 
-    Recorded observations need none: their stars are identified. Raises BagError when a bag cannot
-    be read. Raises OptionError when fewer than three images agree.
+    Raises BagError when a bag cannot be read, OptionError when fewer than three images agree.
     """
-    if setup.is_aligned or bag_topics.choose_topics(paths, requested, setup).observations:
-        return setup, ''
     values, sentence = found_alignment(diagnose_bags(paths, requested, setup))
     if values is None:
         raise OptionError(f'prior_alignment: not given, and not found: {sentence}')

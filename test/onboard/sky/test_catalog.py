@@ -253,38 +253,23 @@ def test_cone_loses_no_fast_star(catalog):
             assert row in cone(catalog, there, 0.0)
 
 
-@pytest.mark.parametrize(
-    ('axis', 'radius_rad', 'match'),
-    [
-        ([0.0, 0.0, 0.0], 0.1, 'direction_icrs'),
-        ([0.0, np.nan, 1.0], 0.1, 'direction_icrs'),
-        ([1.0, 0.0], 0.1, 'direction_icrs'),
-        ([1.0, 0.0, 0.0], -0.1, 'radius_rad'),
-        ([1.0, 0.0, 0.0], np.nan, 'radius_rad'),
-    ],
-)
-def test_cone_refuses_nonsense(catalog, axis, radius_rad, match):
-    with pytest.raises(ValueError, match=match):
-        cone(catalog, np.array(axis), radius_rad)
-
-
 def test_bad_files_are_refused(tmp_path: Path):
     good = CATALOG_PATH.read_bytes()
     path = tmp_path / 'stars.npz'
-    with pytest.raises(CatalogError, match='stars.npz: star catalog cannot be read: No such file'):
+    with pytest.raises(CatalogError, match='stars.npz: star catalog: cannot be read: No such'):
         load_catalog(path)
     with pytest.raises(CatalogError, match='cannot be read'):
         load_catalog(tmp_path)
     for content in (b'', b'stars', good[:-100], good[: len(good) // 2]):
         path.write_bytes(content)
-        with pytest.raises(CatalogError, match='stars.npz: not a star catalog, or a damaged one'):
+        with pytest.raises(CatalogError, match='stars.npz: star catalog: not a NumPy archive'):
             load_catalog(path)
     np.savez(path, ra=np.zeros(3))
     with pytest.raises(CatalogError, match='missing: format, digest, id'):
         load_catalog(path)
     with path.open('wb') as stream:
         np.save(stream, np.zeros(3))
-    with pytest.raises(CatalogError, match='not a star catalog'):
+    with pytest.raises(CatalogError, match='not a NumPy archive'):
         load_catalog(path)
 
 
