@@ -7,5 +7,4 @@ are the only description of a record: `record_fields` reads and writes JSON and 
 """
 
 from starcal_ros.records.calibration import *
-from starcal_ros.records.calibration_parts import *
 from starcal_ros.records.observations import *
