@@ -22,8 +22,13 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
-from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, IMAGES_OF_AN_ALIGNMENT
+from starcal_ros.pipeline.diagnosis.diagnose import (
+    diagnose,
+    Diagnosis,
+    IMAGES_OF_AN_ALIGNMENT,
+    wire_attitudes,
+    WireAttitudes,
+)
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import ChildProcess
 from starcal_ros.records import AttitudeSample, Image

@@ -21,8 +21,13 @@ from starcal_ros.formats.bag.frames import read_frames
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.identification.blind.images import LOOKED_AT
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
-from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
+from starcal_ros.pipeline.diagnosis.diagnose import (
+    diagnose,
+    Diagnosis,
+    found_alignment,
+    wire_attitudes,
+    WireAttitudes,
+)
 from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.pipeline.topics import Topics
