@@ -22,10 +22,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages import message_codec
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import PlayerOptions
-from starcal_ros.ros import node
-from starcal_ros.ros.inputs import LATCHED
-from starcal_ros.ros.parameters import OptionParameters
-from starcal_ros.ros.printable_log import PrintableLog
+from starcal_ros.ros import inputs, node, parameters, printable_log
 
 NAME = 'bag_player'
 # A writer ahead of its readers by more than its history loses messages, reliable or not.  Images
@@ -45,12 +42,14 @@ _LATCHED_TYPES = (
 )
 
 
-class BagPlayer(PrintableLog):
+class BagPlayer(printable_log.PrintableLog):
     """Publishes the messages of a bag in order, with their stamps, at a given rate."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self.own = from_mapping(PlayerOptions, OptionParameters(self, [PlayerOptions]).values())
+        self.own = from_mapping(
+            PlayerOptions, parameters.OptionParameters(self, [PlayerOptions]).values()
+        )
         if not self.own.bag:
             raise BagError('bag: path of the bag to play is missing')
         self._topics = reader.topics([self.own.bag])
@@ -219,7 +218,7 @@ class BagPlayer(PrintableLog):
 
 def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     if topic.type_name in _LATCHED_TYPES:
-        return LATCHED
+        return inputs.LATCHED
     return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
 
 

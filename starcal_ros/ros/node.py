@@ -41,9 +41,7 @@ from starcal_ros.formats.messages.message_codec import Message
 from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, Setup
 from starcal_ros.processes import return_freed_memory
-from starcal_ros.ros.inputs import Inputs
-from starcal_ros.ros.parameters import folders_of_paths, OptionParameters, unread_sections
-from starcal_ros.ros.printable_log import PrintableLog
+from starcal_ros.ros import inputs, parameters, printable_log
 from starcal_ros.text import printable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -56,7 +54,7 @@ _SILENT_S = 5.0
 _TRIM_S = 10.0
 
 
-class StarcalNode(PrintableLog, LifecycleNode):
+class StarcalNode(printable_log.PrintableLog, LifecycleNode):
     """
     Base class of the lifecycle nodes.
 
@@ -67,12 +65,12 @@ class StarcalNode(PrintableLog, LifecycleNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
+        self.options = parameters.OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
         for unknown in self.options.unknown():
             raise OptionError(unknown_option(unknown, self.options.names()))
         self.failure = ''  # why the last transition failed, one line
         self._publishers_made: list[Any] = []
-        self.inputs = Inputs(self)
+        self.inputs = inputs.Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
         self._taken: Counter[Callable[[Any], None]] = Counter()
@@ -377,8 +375,8 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
         nonlocal node, executor
         node = make_node()
         given = sys.argv if args is None else args
-        node.options.folders = folders_of_paths(given, node.get_fully_qualified_name())
-        for text in unread_sections(given, node.get_fully_qualified_name(), name):
+        node.options.folders = parameters.folders_of_paths(given, node.get_fully_qualified_name())
+        for text in parameters.unread_sections(given, node.get_fully_qualified_name(), name):
             node.get_logger().warning(text)
         executor = Executor(_THREADS)
         executor.add_node(node)

@@ -27,10 +27,8 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec, record_messages, sensor_messages
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.annotation import annotate
+from starcal_ros.pipeline import annotation, observe, setup
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
-from starcal_ros.pipeline.setup import aligned, load_setup, ObserverOptions
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -73,8 +71,8 @@ class StarObserver(StarcalNode):
     def configure(self) -> None:
         """Load the prior camera and the catalog, create the publishers."""
         values = self.options.values()
-        self._own = from_mapping(ObserverOptions, values)
-        self._setup = load_setup(values, self.options.classes)
+        self._own = from_mapping(setup.ObserverOptions, values)
+        self._setup = setup.load_setup(values, self.options.classes)
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
         self._observations = self.publisher(
@@ -361,7 +359,7 @@ class StarObserver(StarcalNode):
             self.get_logger().warning(f'prior_alignment is not given, and not found: {sentence}')
             return
         is_prior = self._geometry is self._setup.prior
-        self._setup = aligned(self._setup, np.array(values))
+        self._setup = setup.aligned(self._setup, np.array(values))
         self._unmatched.aligned(self._setup)
         self.get_logger().info(sentence)
         if is_prior:
@@ -429,7 +427,7 @@ class StarObserver(StarcalNode):
     def _publish_annotated(
         self, image: Image, observations: StarObservations, geometry: CameraGeometry
     ) -> None:
-        picture = annotate(image, observations, geometry)
+        picture = annotation.annotate(image, observations, geometry)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
             sensor_messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)

@@ -12,8 +12,7 @@ import yaml
 
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import described, make_message, typestore
-from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
-from starcal_ros.formats.messages.record_messages import observations_to_message
+from starcal_ros.formats.messages import message_codec, record_messages
 from starcal_ros.records import StarObservations
 
 _COMPRESSION = CompressionType.ZSTD
@@ -108,8 +107,8 @@ def observations_bag(topic: str, record: StarObservations, frame_id: str) -> byt
     """Return the bytes of a complete bag with a single starcal/StarObservations."""
     stream = io.BytesIO()
     writer = MessageWriter(stream)
-    message = observations_to_message(record, frame_id, make_message)
-    writer.write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
+    message = record_messages.observations_to_message(record, frame_id, make_message)
+    writer.write(topic, message_codec.OBSERVATIONS_TYPE, record.time_ns, message)
     writer.finish()
     return stream.getvalue()
 
