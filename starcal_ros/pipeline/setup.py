@@ -454,6 +454,21 @@ def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
     return dataclasses.replace(setup, prior=prior, is_aligned=True)
 
 
+def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
+    """
+    A copy of a setup with another method and other parameters to estimate, each unless empty.
+
+    Raises OptionError for an unknown method or parameter name.
+    """
+    asked = {'method': method, 'estimate': tuple(estimate)}
+    changed = {name: value for name, value in asked.items() if value}
+    for field in options.option_fields(CalibrationOptions):
+        if field.name in changed:
+            options.check_value(field, changed[field.name])
+    calibration = dataclasses.replace(setup.calibration, **changed)  # type: ignore[arg-type]
+    return dataclasses.replace(setup, calibration=calibration)
+
+
 def _mountings(
     attitude: AttitudeOptions, setup: SetupOptions, prior: CameraGeometry, is_aligned: bool
 ) -> tuple[Mounting, ...]:

@@ -7,7 +7,7 @@ A calibration has its provenance: software, options, catalog, prior and observat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 import dataclasses
 import functools
 import hashlib
@@ -33,7 +33,6 @@ from starcal_ros.errors import errors_as, OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.identification.star_finder import realigned
-from starcal_ros.options import check_value
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import (
@@ -128,20 +127,17 @@ def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
 def solve(
     ensemble: Ensemble,
     setup: Setup,
-    method: str = '',
-    estimate: Sequence[str] = (),
     inputs: Mapping[str, str] | None = None,
     active: Calibration | None = None,
 ) -> tuple[Calibration, Residuals]:
     """
     A calibration of the ensemble, judged by the gate, and its residuals by star and image.
 
-    ``method`` and ``estimate`` override the options where not empty; ``inputs`` names the sources
-    of the observations, for the provenance; the gate limits the change from ``active``, the
-    calibration that this one would replace. Raises TooFewObservations when the ensemble is too
-    small; the text names the shortage. Raises OptionError for an unknown method or parameter name.
+    ``inputs`` names the sources of the observations, for the provenance; the gate limits the
+    change from ``active``, the calibration that this one would replace. Raises TooFewObservations
+    when the ensemble is too small; the text names the shortage.
     """
-    setup = aligned_by(ensemble, _as_asked_for(setup, method, estimate))
+    setup = aligned_by(ensemble, setup)
     result = estimated(ensemble, setup)
     provenance = provenance_of(setup, ensemble, inputs or {})
     calibration = _not_judged(result, ensemble, setup, provenance)
@@ -159,18 +155,6 @@ def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
     if setup.frames.lens_model == 'auto':
         return estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)[0]
     return estimate_calibration(ensemble, setup.prior, setup.calibration)
-
-
-def _as_asked_for(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
-    """The setup with the requested method and parameters to estimate, where given."""
-    options = setup.calibration
-    options = dataclasses.replace(
-        options, method=method or options.method, estimate=tuple(estimate) or options.estimate
-    )
-    for field in dataclasses.fields(CalibrationOptions):
-        if field.name in ('method', 'estimate'):
-            check_value(field, getattr(options, field.name))
-    return dataclasses.replace(setup, calibration=options)
 
 
 def _not_judged(

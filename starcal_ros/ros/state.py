@@ -17,7 +17,7 @@ from starcal_ros.assessment import requirements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.pipeline import solve as solving
-from starcal_ros.pipeline.setup import CalibratorOptions, Setup
+from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method
 from starcal_ros.records import (
     Activation,
     Calibration,
@@ -203,9 +203,8 @@ class CalibratorState:
         """Solve, and activate a calibration that the gate accepts, or any with ``force``."""
         ensemble = self.ensemble
         try:
-            calibration = solving.solve(
-                ensemble, self._setup, method, estimate, active=self.active
-            )[0]
+            setup = with_method(self._setup, method, estimate)
+            calibration = solving.solve(ensemble, setup, active=self.active)[0]
         except errors.TooFewObservations as error:
             return Answer(False, f'{error}{self._why_refused(ensemble.refused)}')
         except errors.StarcalError as error:

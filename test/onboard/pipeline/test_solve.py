@@ -20,7 +20,7 @@ from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.pipeline import observe, solve, topics
-from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.setup import load_setup, Setup, with_method
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image
 from starcal_ros.sky.attitude import AttitudeHistory
 
@@ -101,7 +101,7 @@ def test_a_solution_with_its_statistics(setup: Setup) -> None:
 
 def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
     # With the principal point held: one that is estimated trades with pitch and yaw.
-    found = solve.solve(ensemble(), setup, estimate=('fx', 'skew', 'fy', 'distortion'))[0]
+    found = solve.solve(ensemble(), with_method(setup, '', ('fx', 'skew', 'fy', 'distortion')))[0]
     maps, correlation = found.maps, found.correlation
     assert maps is not None and correlation is not None
     assert maps.stars.shape == (8, 10) and maps.stars.sum() == found.stars_used
@@ -124,7 +124,7 @@ def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
 
 @pytest.mark.slow
 def test_method_and_names_can_be_said_for_one_solution(setup: Setup) -> None:
-    found = solve.solve(ensemble(), setup, method='single', estimate=['fx', 'fy', 'k1'])[0]
+    found = solve.solve(ensemble(), with_method(setup, 'single', ['fx', 'fy', 'k1']))[0]
     assert (found.method, found.estimated) == ('single', ('fx', 'fy', 'k1'))
     prior, after = setup.prior.camera.parameters, found.geometry.camera.parameters
     changed = [n for n, a, b in zip(PARAMETER_NAMES, prior, after, strict=True) if a != b]
@@ -133,9 +133,9 @@ def test_method_and_names_can_be_said_for_one_solution(setup: Setup) -> None:
     assert options['method'] == 'single' and options['estimate'] == ['fx', 'fy', 'k1']
     assert setup.calibration.method == CalibrationOptions().method
     with pytest.raises(OptionError, match="method: 'best' is not one of"):
-        solve.solve(ensemble(), setup, method='best')
+        with_method(setup, 'best', [])
     with pytest.raises(OptionError, match=r"estimate\[0\]: 'fz' is not one of fx, skew"):
-        solve.solve(ensemble(), setup, estimate=['fz'])
+        with_method(setup, '', ['fz'])
 
 
 def test_too_few_images_cannot_be_solved(setup: Setup) -> None:
