@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import cv2
 import numpy as np
@@ -119,14 +118,14 @@ def observe_next(
             track.taken,
             assumed_tracker_sigma_rad(setup.calibration),
         )
-        known |= _known_of(found[0]) | {'catalog_digest': setup.catalog.digest}
+        known |= vars(found[0]) | {'catalog_digest': setup.catalog.digest}
         saturation_dn = setup.centroid.saturation_dn
         screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
         hot = (track.hot or setup.hot).index
         exposure = Exposure(
             flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
             found[0].icrf_from_star_tracker_xyzw,
-            found[0].gap_s,
+            found[0].attitude_gap_s,
             velocity,
             setup.site,
             hot,
@@ -139,18 +138,6 @@ def observe_next(
             image.time_ns, width, height, refused.reason, refused.detail, **known
         )
         return observations, remembered
-
-
-def _known_of(attitude: Attitude) -> dict[str, Any]:
-    """Fields of observations that an attitude gives."""
-    return {
-        'icrf_from_star_tracker_xyzw': attitude.icrf_from_star_tracker_xyzw,
-        'attitude_gap_s': attitude.gap_s,
-        'star_tracker': attitude.star_tracker,
-        'first_from_star_tracker_xyzw': attitude.first_from_star_tracker_xyzw,
-        'star_tracker_rate_rad_s': attitude.rate_rad_s,
-        'star_tracker_rate_sigma_rad_s': attitude.rate_sigma_rad_s,
-    }
 
 
 def _with_any(
@@ -207,10 +194,10 @@ def _with_one(
     exposure = dataclasses.replace(
         exposure,
         icrf_from_star_tracker_xyzw=attitude.icrf_from_star_tracker_xyzw,
-        attitude_gap_s=attitude.gap_s,
+        attitude_gap_s=attitude.attitude_gap_s,
     )
     observations, after = _stars(exposure, setup, before)
-    observations = dataclasses.replace(observations, **_known_of(attitude))
+    observations = dataclasses.replace(observations, **vars(attitude))
     if observations.refusal:
         return observations, track
     first = _first_with_same_attitude(observations, before.first_with_same_attitude, setup)

@@ -376,13 +376,15 @@ class Attitude:
     """
     Attitude of the first star tracker at an image, from any star tracker by its mounting.
 
+    The fields have the names of those of `StarObservations`.
+
     Attributes
     ----------
     icrf_from_star_tracker_xyzw : (4,)
         Orientation of the first star tracker.
-    gap_s : float
+    attitude_gap_s : float
         Gap between the two samples around the image.
-    rate_rad_s, rate_sigma_rad_s : (3,)
+    star_tracker_rate_rad_s, star_tracker_rate_sigma_rad_s : (3,)
         Angular rate of the first star tracker in its frame, and its 1-sigma; NaN where it is not
         known.
     star_tracker : str
@@ -392,9 +394,9 @@ class Attitude:
     """
 
     icrf_from_star_tracker_xyzw: Floats
-    gap_s: float
-    rate_rad_s: Floats
-    rate_sigma_rad_s: Floats
+    attitude_gap_s: float
+    star_tracker_rate_rad_s: Floats
+    star_tracker_rate_sigma_rad_s: Floats
     star_tracker: str = ''
     first_from_star_tracker_xyzw: Floats = field(default_factory=lambda: IDENTITY_XYZW)
 

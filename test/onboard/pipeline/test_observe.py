@@ -424,7 +424,7 @@ def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> 
         held.add(round(time_s * S), attitude_sample(round(time_s * S), turned, 'st_to_inertial'))
     mounted = Mounting('second', Rotation.from_euler('z', 90, degrees=True).as_quat())
     (found,) = attitudes_at(S // 2, AttitudeHistory(), [held], [mounted], 2.0, {}, np.ones(3))
-    np.testing.assert_allclose(found.rate_rad_s, [0.0, 0.01, 0.0], atol=1e-12)
+    np.testing.assert_allclose(found.star_tracker_rate_rad_s, [0.0, 0.01, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
