@@ -312,9 +312,6 @@ class PlayerOptions:
     wait_for_topic: str = option(
         '', 'another topic that needs a subscriber before the playback starts'
     )
-    images_in_flight: int = option(
-        4, 'images sent ahead of their observations if a star observer is running', low=1
-    )
     clock: bool = option(False, 'publish the bag time on /clock, for use_sim_time')
 
 

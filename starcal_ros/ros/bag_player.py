@@ -29,6 +29,7 @@ NAME = 'bag_player'
 # are acknowledged within 10 ms, small messages only with the next heartbeat, after up to 3 s.
 _IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
 _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
+_IMAGES_AHEAD = 4  # of their observations: a star observer queues twenty
 _SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other work
 _ACK_S = 30.0
 _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS down
@@ -175,7 +176,7 @@ class BagPlayer(printable_log.PrintableLog):
             return
         with self._observed:
             before, since_s = self._observed_count, time.monotonic()
-            while sent - self._observed_count >= self.own.images_in_flight:
+            while sent - self._observed_count >= _IMAGES_AHEAD:
                 self._observed.wait(_POLL_S)
                 self._check_shutdown()
                 if self._observed_count != before:
