@@ -38,7 +38,6 @@ from starcal_ros.pipeline.setup import (
     aligned,
     files_of,
     load_setup,
-    NODE_OPTION_CLASSES,
     option_groups,
     paths_from,
     Setup,
@@ -111,10 +110,10 @@ class Given:
             )
         with self.with_place():
             if self.is_by_stars or not self.states_camera:
-                frames = option_groups(self.options, NODE_OPTION_CLASSES)['frames']
+                frames = option_groups(self.options)['frames']
                 setup = None
             else:
-                setup = load_setup(self.options, others=NODE_OPTION_CLASSES)
+                setup = load_setup(self.options)
                 frames = setup.frames
         return setup, [*filter(None, [self.params]), *files_of(frames).values()]
 
@@ -252,7 +251,7 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
         )
     topic = choose_image_topic(given.paths, given.topics)
     # The gate counts all images of the bags; these are the first ones.
-    stated = option_groups(given.options, NODE_OPTION_CLASSES)['calibration'].min_images
+    stated = option_groups(given.options)['calibration'].min_images
     few = {**given.options, 'min_images': min(stated, FEWEST_IMAGES)}
     stars = night_sky.camera_of_bags(given.paths, topic, few, _LOOKED_AT, given.lens)
     make_folder(folder)
@@ -261,9 +260,7 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     options['camera_info_url'] = str(folder / CAMERA_FILE)
     words = f'images of {topic}: {stars.in_a_sentence()}'
     ways = [options['attitude_direction']] if 'attitude_direction' in options else _DIRECTIONS
-    setups = [
-        load_setup({**options, 'attitude_direction': way}, NODE_OPTION_CLASSES) for way in ways
-    ]
+    setups = [load_setup({**options, 'attitude_direction': way}) for way in ways]
     for setup in setups:
         if setup.is_aligned:  # stated; a wrong direction is named where no image matches
             return setup, (words,)

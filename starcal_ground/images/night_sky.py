@@ -44,7 +44,7 @@ from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.identification.blind.images import FEWEST_SOURCES
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.diagnosis.bags import refusals
-from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, option_groups, Setup
+from starcal_ros.pipeline.setup import load_setup, option_groups, Setup
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
@@ -113,7 +113,7 @@ def from_images(
     ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
     the stars give no camera.
     """
-    option_groups(values, NODE_OPTION_CLASSES)  # before a long search
+    option_groups(values)  # before a long search
     photographs = image_paths(paths)
     if not photographs:
         return from_bags(paths, topics, values, folder, lens), reader.mcap_files(paths)
@@ -284,7 +284,7 @@ def _found(
         hint = read_camera_info(url)
     path = str(values.get('catalog', ''))
     catalog = load_catalog(Path(path) if path else None)
-    least = option_groups(values, NODE_OPTION_CLASSES)['calibration'].min_images
+    least = option_groups(values)['calibration'].min_images
     return from_stars(images, catalog, hint, least)
 
 
@@ -308,7 +308,7 @@ def _set_up(
     prior = CameraGeometry(stars.camera, np.array([0.0, 0.0, 0.0, 1.0]))
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
-    setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
+    setup = load_setup({**stated, **options_of(values)}, prior=prior)
     setup = dataclasses.replace(setup, times_of=times_of)
     notes = [*notes, stars.in_a_sentence()]
     notes += [f'the time is that {times_of}'] if times_of else []

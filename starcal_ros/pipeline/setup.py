@@ -323,12 +323,11 @@ def read_setup(params: Path) -> Setup:
     """
     Setup of a ROS parameter file, which may also set parameters of the nodes.
 
-    Raises OptionError for an unknown name or a bad value; the message begins with the file. Raises
-    ProductError or CatalogError when the prior camera or the catalog cannot be read.
+    Raises as `load_setup`; the message on an option begins with the file.
     """
     values = read_values(params)
     try:
-        return load_setup(values, others=NODE_OPTION_CLASSES)
+        return load_setup(values)
     except OptionError as error:
         raise OptionError(f'{params}: {error}') from error
 
@@ -383,14 +382,13 @@ def _check_relative(files: Mapping[str, Path]) -> None:
             )
 
 
-def option_groups(values: Mapping[str, object], others: Sequence[type] = ()) -> dict[str, Any]:
+def option_groups(values: Mapping[str, object]) -> dict[str, Any]:
     """
     Options of every stage, by the names of `Setup`, checked as far as that needs no camera.
 
-    ``others`` are further option classes whose names are also allowed. Raises OptionError for an
-    unknown name or a bad value.
+    Options of the nodes are passed over. Raises OptionError for an unknown name or a bad value.
     """
-    known = options.names_of(*OPTION_CLASSES, *others)
+    known = options.names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
     for name in values:
         if name not in known and not options.is_of_ros(name):
             raise OptionError(options.unknown_option(name, known))
@@ -404,18 +402,15 @@ def option_groups(values: Mapping[str, object], others: Sequence[type] = ()) -> 
     return groups
 
 
-def load_setup(
-    values: Mapping[str, object], others: Sequence[type] = (), prior: CameraGeometry | None = None
-) -> Setup:
+def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None) -> Setup:
     """
     Setup from a mapping of option names to values, all checked.
 
-    ``others`` are further option classes whose names are also allowed; ``prior`` replaces the
-    camera file and alignment of the options. Raises OptionError for an unknown name
-    or a bad value. Raises ProductError or CatalogError when the prior camera or the catalog cannot
-    be read.
+    ``prior`` replaces the camera file and alignment of the options. Raises OptionError for an
+    unknown name or a bad value. Raises ProductError or CatalogError when the prior camera or the
+    catalog cannot be read.
     """
-    groups = option_groups(values, others)
+    groups = option_groups(values)
     frames: SetupOptions = groups['frames']
     is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
@@ -437,9 +432,7 @@ def load_setup(
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
         hot=with_bad_pixels(hot_in_dark(dark), bad, flat),
         is_aligned=is_aligned,
-        camera_name=camera_yaml.read_camera_name(frames.camera_info_url)
-        if frames.camera_info_url
-        else camera_yaml.DEFAULT_CAMERA_NAME,
+        camera_name=camera_yaml.read_camera_name(frames.camera_info_url),
         flat=flat,
         mountings=_mountings(groups['attitude'], frames, prior, is_aligned),
     )

@@ -287,7 +287,7 @@ class ModelChecks:
     ``field_rms_px`` and ``field_worst_px`` are RMS per axis and largest length of the residual
     field over the detector.  ``image_variation_px`` is the 1-sigma change of the camera between
     images at a corner, included in the covariance.  ``predictions`` are empty with fewer than four
-    images, and in older calibrations.
+    images.
 
     >>> import starcal_ros
     >>> checks = starcal_ros.read_calibration('out').model_checks

@@ -89,7 +89,7 @@ class Calibrator(node.StarcalNode):
         """Load the prior camera, options and state folder, create the latched publishers."""
         values = self.options.values()
         self._own = from_mapping(CalibratorOptions, values)
-        self._setup = load_setup(values, self.options.classes)
+        self._setup = load_setup(values)
         self._state.open(self._setup, self._own)
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)

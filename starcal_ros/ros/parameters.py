@@ -36,7 +36,6 @@ class OptionParameters:
     def __init__(self, node: Node, option_classes: Sequence[type[Any]]) -> None:
         self.frozen = False
         self.folders: dict[tuple[str, object], Path] = {}
-        self.classes = tuple(option_classes)
         self._node = node
         self._fields = {field.name: field for field in options.option_fields(*option_classes)}
         node.add_on_set_parameters_callback(self._on_set)

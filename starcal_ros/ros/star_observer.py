@@ -72,7 +72,7 @@ class StarObserver(StarcalNode):
         """Load the prior camera and the catalog, create the publishers."""
         values = self.options.values()
         self._own = from_mapping(setup.ObserverOptions, values)
-        self._setup = setup.load_setup(values, self.options.classes)
+        self._setup = setup.load_setup(values)
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
         self._observations = self.publisher(

@@ -299,7 +299,7 @@ def test_a_parameter_file_of_a_document_is_one(document: Path, text: str, tmp_pa
     params.write_text(text)
     values = read_parameter_file(params, ('star_observer', 'calibrator'))
     camera = ROOT / 'bags' / 'tiny' / 'camera.yaml'
-    setup = load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
+    setup = load_setup({**values, 'camera_info_url': str(camera)})
     assert setup.prior.camera.width > 0
 
 

@@ -39,7 +39,7 @@ from starcal_ros.formats.products.product_files import (
 )
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, NODES
+from starcal_ros.pipeline.setup import load_setup, NODES
 from starcal_ros.records import Activation, Calibration, Ensemble, Image
 from starcal_ros.ros.archive import Archive
 
@@ -70,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def calibration(folder: Path) -> Calibration:
-    setup = load_setup(read_parameter_file(folder / 'params.yaml', NODES), NODE_OPTION_CLASSES)
+    setup = load_setup(read_parameter_file(folder / 'params.yaml', NODES))
     return solve.solve(true_observations(SCENARIO), setup)[0]
 
 
@@ -89,12 +89,12 @@ def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60)
 
 def test_parameter_files(folder: Path, tmp_path: Path) -> None:
     values = read_parameter_file(folder / 'params.yaml', NODES)
-    setup = load_setup(values, NODE_OPTION_CLASSES)
+    setup = load_setup(values)
     flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup.options().items()}
     lines = [f'    {name}: {json.dumps(value)}' for name, value in flow.items()]
 
     def read(path: Path) -> None:
-        load_setup(read_parameter_file(path, NODES), NODE_OPTION_CLASSES, setup.prior)
+        load_setup(read_parameter_file(path, NODES), setup.prior)
 
     text = '\n'.join(['/**:', '  ros__parameters:', *lines])
     spoils(text, tmp_path / 'params.yaml', read)
@@ -187,7 +187,7 @@ def test_observations() -> None:
 
     images = true_observations(SCENARIO).images
     brightest = images[0].select(np.argsort(np.argsort(-images[0].flux_dn)) < 20)
-    setup = load_setup({}, NODE_OPTION_CLASSES, SCENARIO.prior)
+    setup = load_setup({}, SCENARIO.prior)
     answers = {'refused': 0, 'saved': 0}
 
     @drawn(60)

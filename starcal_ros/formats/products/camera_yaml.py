@@ -153,7 +153,9 @@ def read_camera_info(location: str | Path) -> CameraModel:
 
 
 def read_camera_name(location: str | Path) -> str:
-    """The ``camera_name`` in a ROS camera YAML that `read_camera_info` accepts."""
+    """The ``camera_name`` in a ROS camera YAML that `read_camera_info` accepts, or the default."""
+    if not location:
+        return DEFAULT_CAMERA_NAME
     path = resolve_url(location) if isinstance(location, str) else location
     name = _camera_info_values(read_text(path, PARAMETER_BYTES)).get('camera_name')
     return name if isinstance(name, str) and name else DEFAULT_CAMERA_NAME

@@ -18,7 +18,6 @@ from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline.setup import (
     check_field_of_stars,
     load_setup,
-    NODE_OPTION_CLASSES,
     OPTION_CLASSES,
     read_setup,
     Setup,
@@ -101,10 +100,9 @@ def test_a_rounded_alignment_is_made_unit(camera_yaml: Path) -> None:
 
 
 def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> None:
-    both = values(camera_yaml, autostart=False)
-    load_setup(both, NODE_OPTION_CLASSES)
-    with pytest.raises(OptionError, match='autostart: no such parameter'):
-        load_setup(both)
+    load_setup(values(camera_yaml, autostart=False))
+    with pytest.raises(OptionError, match='autstart: no such parameter .did you mean autostart'):
+        load_setup(values(camera_yaml, autstart=False))
 
 
 def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
