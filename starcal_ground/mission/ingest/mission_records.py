@@ -63,17 +63,11 @@ class Attitudes:
     icrf_from_star_tracker_xyzw : (n, 4)
     notes : tuple of str
         What a reader of the bag must know of them, one line each.
-    by_stars : bool
-        The star tracker is the camera itself, and the attitudes are by its own stars.
-    rows_upward : bool
-        The attitudes are for FITS images with the order of their rows reversed.
     """
 
     time_ns: NDArray[np.int64]
     icrf_from_star_tracker_xyzw: Floats
     notes: tuple[str, ...] = ()
-    by_stars: bool = False
-    rows_upward: bool = False
 
 
 @dataclass(frozen=True)
