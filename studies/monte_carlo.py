@@ -33,7 +33,6 @@ from studies.trials import ESTIMATED, rms, StarField
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02
-ENOUGH = 1.01  # limit on the residual of unused images relative to that with the true camera
 CONFIDENCE = 0.99
 
 

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-from xml.etree import ElementTree
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
@@ -29,7 +28,7 @@ from starcal_ros.errors import StarcalError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.records import CameraGeometry
 from studies import __main__ as studies
-from studies import monte_carlo, study_figures, trials
+from studies import monte_carlo, trials
 from studies.monte_carlo import Design, Row, StudyResult
 from studies.workers import run_each
 
@@ -154,7 +153,7 @@ def test_a_trial_hangs_on_nothing_but_seed_study_and_number() -> None:
 
 
 @each_study
-def test_results_and_figure(study: str) -> None:
+def test_results_and_their_table(study: str) -> None:
     found = here(small(study))
     content = json.loads(monte_carlo.content(found, 'starcal 0'))
     assert content['study'] == study and content['parameters']['trials'] == found.design.trials
@@ -162,9 +161,7 @@ def test_results_and_figure(study: str) -> None:
     assert len(content['summary']) == len(found.summary)
     header, rows = monte_carlo.table(found)
     assert len(rows) == len(found.summary) and {len(row) for row in rows} == {len(header)}
-    drawn = study_figures.svg(found)
-    ElementTree.fromstring(drawn)
-    assert 'nan' not in drawn and all(method in drawn for method in found.design.methods)
+    assert {row['method'] for row in found.summary} == {*found.design.methods}
 
 
 def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
