@@ -3,7 +3,7 @@
 The tasks of a fleet: found below a root, answered where their files are, counted into the table.
 
 A task is a calibration to read or a bag to calibrate.  Its answer is made in this process or by a
-worker of Dask: a row, or the key of the one that the table has.
+worker of Dask.
 """
 
 from __future__ import annotations
@@ -90,8 +90,6 @@ class Task:
         Files that decide about the result of a bag as well.
     spacecraft, camera : str
         From the table or the pattern of cameras; empty: from the metadata of the bag.
-    known : tuple of str
-        Keys in the table of which one may be that of this content.
     """
 
     url: str
@@ -103,7 +101,6 @@ class Task:
     settings: tuple[str, ...] = ()
     spacecraft: str = ''
     camera: str = ''
-    known: tuple[str, ...] = ()
 
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
@@ -298,21 +295,11 @@ def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
 @dataclass(frozen=True)
 class Answer:
     """
-    The answer to a task.
+    The row that a task gives, None where none is due, and ``calibration.json`` of a bag.
 
-    Attributes
-    ----------
-    key : str
-        Of the row that the table has; empty where none is due.
-    row : Row or None
-        New row.
-    calibration : str
-        Content of ``calibration.json`` of a bag.
-    is_silence : bool
-        True if the store of the file did not answer.
+    ``is_silence`` is True if the store of the file did not answer.
     """
 
-    key: str = ''
     row: trend_table.Row | None = None
     calibration: str = ''
     is_silence: bool = False
@@ -361,17 +348,10 @@ def _answer(task: Task, path: Path) -> Answer:
         # By content: a copy counts once, a tree may move, and what is repaired is another task.
         files = reader.files_of_bags([path]) if task.is_bag else (path,)
         key = digest((*files, *settings), version)
-        if key in task.known:
-            return Answer(key)
         if not task.is_bag:
             made, temperature = _recorded(path)
-            return Answer(
-                key,
-                _of_task(
-                    trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature),
-                    task,
-                ),
-            )
+            row = trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature)
+            return Answer(_of_task(row, task))
         setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
         campaign = calibrate_bags([path], setup, Topics())
         made, records = campaign.calibration, campaign.observations
@@ -379,7 +359,7 @@ def _answer(task: Task, path: Path) -> Answer:
             made, key, task.url, trend_table.COMPUTED, _mean_temperature(records)
         )
         text = product_files.calibration_text(made)
-        return Answer(key, _of_task(row, task, path), text)
+        return Answer(_of_task(row, task, path), text)
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
@@ -394,7 +374,6 @@ def _of_task(row: trend_table.Row, task: Task, bag: Path = Path()) -> trend_tabl
     return dataclasses.replace(
         row,
         stamp=task.stamp,
-        size_bytes=max(task.size, 0),
         spacecraft=task.spacecraft or names.get('spacecraft', ''),
         camera=task.camera or names.get('camera', ''),
     )
@@ -476,8 +455,8 @@ class Done:
         """Put an answer into the table, and count it."""
         row = answer.row
         if row is None or table.has(row):
-            table.add_seen(task.stamp, answer.key)
-            self.known += bool(answer.key)
+            table.add_seen(task.stamp, row.key if row else '')
+            self.known += row is not None
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
@@ -541,8 +520,6 @@ def _not_known(
         if key is not None:
             done.known += bool(key)
             continue
-        likely = table.likely(task.size, task.spacecraft, task.camera)
-        task = dataclasses.replace(task, known=likely)
         if is_again:
             again.append(task)
         else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from pathlib import Path
 import shutil
 import time
@@ -39,17 +38,6 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(fleet, 'compute', unread)
     assert trend(mission) == 0
     assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypatch) -> None:
-    shutil.copytree(TINY, tmp_path / 'fleet/one')
-    cameras = Cameras(params=str(TINY / 'params.yaml'))
-    fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
-    os.utime(tmp_path / 'fleet/one/tiny_0.mcap', (5, 5))
-    monkeypatch.setattr(fleet, 'calibrate_bags', lambda *_: pytest.fail('calibrated again'))
-    done = fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
-    assert done == fleet.Done(known=1)
 
 
 @pytest.mark.slow
@@ -145,11 +133,3 @@ def test_an_unknown_protocol_is_one_line(tmp_path: Path, capsys) -> None:
     assert main(['trend', 'nowhere://fleet', '-o', str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert 'nowhere' in error and error.count('\n') == 1
-
-
-def test_content_that_the_table_has_is_no_new_row(mission: Path) -> None:
-    first, *_ = fleet.find(str(mission), Cameras())
-    answer = fleet.compute(first)
-    assert answer.row and answer.row.stamp == first.stamp and answer.row.key == answer.key
-    known = dataclasses.replace(first, known=(answer.key,))
-    assert fleet.compute(known) == Answer(answer.key)
