@@ -8,13 +8,11 @@ worker of Dask.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 import contextlib
-import csv
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import errno
-import fnmatch
 import functools
 import hashlib
 import itertools
@@ -51,8 +49,6 @@ KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
-_COLUMNS = ('path', *_KEYS, 'params')
-_MOST_BYTES = 8 * 2**20
 _TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
 _NO_ANSWER = (errno.EIO, errno.ETIMEDOUT)  # of a store; other errors are answers
@@ -89,7 +85,7 @@ class Task:
     settings : tuple of str
         Files that decide about the result of a bag as well.
     spacecraft, camera : str
-        From the table or the pattern of cameras; empty: from the metadata of the bag.
+        From the pattern of cameras; empty: from the metadata of the bag.
     """
 
     url: str
@@ -216,80 +212,51 @@ class Cameras:
     ----------
     pattern : regular expression or None
         Of the start of a path, with groups for spacecraft and camera.
-    table : tuple of mappings
-        Rows of a table with the columns path (a pattern of shell), spacecraft, camera and params;
-        the first that matches counts.
     params : str
         Parameter file, in which ``{spacecraft}`` and ``{camera}`` are replaced; may be empty.
     """
 
     pattern: re.Pattern[str] | None = None
-    table: tuple[Mapping[str, str], ...] = field(default=(), repr=False)
     params: str = ''
 
     def of(self, name: str) -> tuple[str, str]:
         """Spacecraft and camera of a path below the root, empty if nothing names them."""
-        names = self._row(name)
-        if self.pattern and (match := self.pattern.match(name)):
-            names = {**match.groupdict(), **names}
+        match = self.pattern.match(name) if self.pattern else None
+        names = match.groupdict() if match else {}
         return names.get(_KEYS[0], ''), names.get(_KEYS[1], '')
 
     def params_of(self, name: str) -> str:
         """Absolute path of the parameters of a bag; empty if there are none."""
-        own = self._row(name).get('params', '')
-        if own or not self.params:
-            return own
+        if not self.params:
+            return ''
         spacecraft, camera = self.of(name)
         text = self.params.replace('{spacecraft}', spacecraft).replace('{camera}', camera)
         return os.path.abspath(text)
 
-    def _row(self, name: str) -> Mapping[str, str]:
-        return next((row for row in self.table if fnmatch.fnmatchcase(name, row['path'])), {})
 
-
-def read_cameras(text: str, params: str) -> Cameras:
+def read_cameras(pattern: str, params: str) -> Cameras:
     """
-    Cameras by a pattern such as ``{spacecraft}/{camera}/*.mcap``, or by the path of a CSV table.
+    Cameras by a pattern such as ``{spacecraft}/{camera}/*.mcap``, empty for none.
 
-    Raises StarcalError in one line, for a pattern without a name or a table that cannot be read.
+    The expression is of the start of a path, up to the segment of the last name.  Raises
+    OptionError in one line, for a pattern without a name.
     """
-    if '{' in text:
-        return Cameras(pattern=_compiled(text), params=params)
-    return Cameras(table=_rows(Path(text)) if text else (), params=params)
-
-
-def _compiled(pattern: str) -> re.Pattern[str]:
-    """Expression for the start of a path, up to the segment of the last name."""
-    start = pattern[: pattern.rindex('}') + 1] if '}' in pattern else pattern
+    if not pattern:
+        return Cameras(params=params)
+    start = pattern[: pattern.rfind('}') + 1]
     start += pattern[len(start) :].partition('/')[0]
     expression, names = '', []
     for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
         if other or (name and name not in _KEYS) or name in names:
-            raise OptionError(
-                f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and'
-                ' {camera}'
-            )
+            break
         names += [name] if name else []
         expression += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
-    return re.compile(f'{expression}(?:/|$)')
-
-
-def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
-    text = product_files.read_text(path, _MOST_BYTES)
-    rows = csv.DictReader(text.splitlines(), restval='')
-    if 'path' not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= {*_COLUMNS}:
-        raise OptionError(f'{path}: the first line does not name columns of {", ".join(_COLUMNS)}')
-    cameras = []
-    for row in rows:
-        if None in row:
-            raise OptionError(f'{path}:{rows.line_num}: more values than columns')
-        values = {name: value.strip() for name, value in row.items() if value.strip()}
-        if 'path' not in values:
-            raise OptionError(f'{path}:{rows.line_num}: no path')
-        if 'params' in values:
-            values['params'] = os.path.abspath(path.parent / values['params'])
-        cameras.append(values)
-    return tuple(cameras)
+    else:
+        if names:
+            return Cameras(re.compile(f'{expression}(?:/|$)'), params)
+    raise OptionError(
+        f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and {{camera}}'
+    )
 
 
 @dataclass(frozen=True)
