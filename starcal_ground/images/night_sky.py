@@ -182,7 +182,7 @@ def camera_of_photographs(
     """
     first = photographs[0]
     focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
-    hint = by_stars.pinhole((first.width, first.height), focal_px) if focal_px < 1e9 else None
+    hint = by_stars.ideal_camera((first.width, first.height), focal_px) if focal_px < 1e9 else None
     refusals = image_files.Refusals()
     try:
         return _found(_images(photographs, refusals), values, hint), refusals.lines()
@@ -237,7 +237,7 @@ def camera_of_bags(
     first, hint = next(images, None), None
     if first is not None and all(lens):
         height, width = first.pixels.shape
-        hint = by_stars.pinhole((width, height), 1000.0 * lens[0] / lens[1])
+        hint = by_stars.ideal_camera((width, height), 1000.0 * lens[0] / lens[1])
     try:
         stars = _found(itertools.chain([first] if first else [], images), values, hint)
     except NotFromStars as error:

@@ -173,7 +173,6 @@ def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
 def write_bag(
     scenario: synthetic.Scenario,
     path: Path,
-    camera_url: str = '',
     on_image: Callable[[int], None] = lambda index: None,
     mistakes: Mistakes = NO_MISTAKES,
 ) -> SimulatedBag:
@@ -186,8 +185,6 @@ def write_bag(
 
     Parameters
     ----------
-    camera_url : str
-        URL of the prior camera in the parameter file; default: a ``file://`` URL.
     on_image : callable
         Called with the index of each image written.
     mistakes : Mistakes
@@ -206,7 +203,7 @@ def write_bag(
     scenario = dataclasses.replace(
         scenario, prior=mistakes.prior(scenario.prior), turn_rad=(0.0, turn_rad, 0.0)
     )
-    content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
+    content = parameters(scenario, f'file://{camera.resolve()}')
     if scenario.table is not None:
         content['/**']['ros__parameters'] |= {
             'catalog': str(table.resolve().with_suffix('.npz')),
