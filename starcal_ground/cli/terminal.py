@@ -34,9 +34,9 @@ def discard_stdout() -> None:
         os.close(devnull)
 
 
-def print_text(text: str = '', end: str = '\n', file: TextIO | None = None) -> None:
+def print_text(text: str = '', file: TextIO | None = None) -> None:
     """Print lines with characters that act on a terminal escaped (`printable`)."""
-    print('\n'.join(map(printable, text.split('\n'))), end=end, file=file)
+    print('\n'.join(map(printable, text.split('\n'))), file=file)
 
 
 def print_wrapped(text: str, indent: int = 2, file: TextIO | None = None) -> None:

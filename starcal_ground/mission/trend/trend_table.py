@@ -54,33 +54,13 @@ class Row:
 
     Raises ValueError in one line, for a row that the page could not show.
 
-    Attributes
-    ----------
-    key : str
-        Digest of what the row was made from.
-    path, kind, error : str
-        Source; ``recorded`` (read from a file), ``computed`` (from a bag by this version) or
-        ``failed`` with its error.
-    software : str
-        That made the calibration, or that failed to.
-    time_ns, first_ns, last_ns : int
-        Middle, first and last image.
-    active_since_ns : int
-        0 where it was not activated.
-    residual_rms_px, temperature_degc : float
-        NaN where not known.
-    names : tuple of str
-        Camera parameters; ``sigmas`` has the three alignment angles (rad) too.
-    values, sigmas, star_tracker_from_camera_xyzw : tuple of float
-    boresight_sigma_arcsec : tuple of float
-        About the x and the y axis of the camera, of the middle of the detector, in the star
-        tracker frame.
-    spacecraft, camera : str
-        Empty where nothing names them.
-    stamp : str
-        Digest of name, size and time, or etag, of the file when it was read.
-    is_passing : bool
-        A failure that may pass: the file could not be reached.
+    ``key`` is the digest of what the row was made from, ``stamp`` that of name, size and time, or
+    etag, of the file when it was read.  ``kind`` is ``recorded`` (read from a file), ``computed``
+    (from a bag by this version) or ``failed``, which may pass (``is_passing``): the file could
+    not be reached.  Times are of the middle, first and last image; ``active_since_ns`` is 0 where
+    it was not activated.  ``sigmas`` has those of ``values``, then of three alignment angles
+    (rad); ``boresight_sigma_arcsec`` is about x and y of the camera, of the middle of the
+    detector, in the star tracker frame.
     """
 
     key: str
