@@ -8,8 +8,10 @@ parts or multiples of the same draws, so that their difference has little sampli
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -217,6 +219,6 @@ def calibration_options(method: str, tracker_arcsec: float, **other: object) -> 
     return dataclasses.replace(options, **other)  # type: ignore[arg-type]
 
 
-def rms(values: Floats) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
+def rms(values: Floats | Sequence[float]) -> float:
+    """Root of the mean square; NaN without values."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan

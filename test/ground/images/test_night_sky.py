@@ -112,7 +112,9 @@ def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('camera', [44, 109, 137])
-def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(camera: int) -> None:
+def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(
+    tmp_path: Path, camera: int
+) -> None:
     """
     As a pinhole, the corners of 44 without stars were off by 22 of their sigmas, and accepted.
 
@@ -120,7 +122,7 @@ def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(camera: i
     The stars of 137 hardly separate the coefficients of its lens, nor without a prior anything.
     """
     given, _ = camera_of(camera)
-    found = calibrated(given)
+    found = calibrated(given, tmp_path, {}).calibration
     error_arcsec, sigma_arcsec = off_arcsec(found, given.truth.camera)
     assert found.accepted and found.geometry.camera.model == given.truth.camera.model
     assert error_arcsec < 5.0 * sigma_arcsec
