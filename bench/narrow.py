@@ -221,13 +221,7 @@ def bound_px(given: Scenario) -> float:
     """
     camera = given.truth.camera
     names = list(camera.parameter_names)
-    information = np.zeros((len(names), len(names)))
-    for shown in synthetic.scenes(given):
-        covariance, _, keep = centroids.scene_bound(given, shown)
-        in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
-        information += centroids.camera_information(
-            camera, in_camera, covariance[keep], range(len(names))
-        )
+    information = centroids.scenario_information(given, range(len(names)))
     for name in ('cx', 'cy'):
         information[names.index(name), names.index(name)] += _CENTRE_SIGMA_PX**-2.0
     bound = np.zeros((len(names) + 3, len(names) + 3))
