@@ -19,6 +19,7 @@ from collections.abc import Iterator
 import dataclasses
 import math
 from pathlib import Path
+import subprocess
 import tempfile
 import time
 
@@ -27,15 +28,18 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import load_set_up, observed, render_frame
 from bench.night_sky import calibrated, off_arcsec
+from bench.peers import scamp
+from bench.peers.campaigns import Campaign
 from bench.table import Table
-from bench.trials import in_processes
+from bench.trials import in_processes, shape_errors_arcsec
 from starcal_ground.mission.ingest.deep_catalog import catalog_file, integer_columns
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.deep_sky import deep_sky, disc, log10_density
 from starcal_ground.simulation.scenario import Inertial, Scenario
-from starcal_ros.camera import CameraModel
+from starcal_ros.assessment.lookup import GRID
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline import solve
@@ -82,6 +86,46 @@ def run(quick: bool) -> Iterator[Table]:
         )
         print(*table.rows[-1], flush=True)
     yield table
+    if scamp.INSTALLED:
+        yield _peer(seeds)
+    else:
+        print('Source Extractor and SCAMP are not installed: left out')
+
+
+def _peer(seeds: int) -> Table:
+    """Errors of SCAMP with the images and attitudes of `_with_attitudes`."""
+    columns = ('field deg', 'solved', 'error / bound', 'median', 'heads', 'sources', 's an image')
+    table = Table('Source Extractor and SCAMP, given attitudes', columns)
+    for field_deg in FIELDS_DEG:
+        trials = in_processes(by_scamp, range(seeds), [field_deg] * seeds)
+        solved = np.array([row for row in trials if math.isfinite(row[0])]).reshape(-1, 4)
+        if len(solved):
+            means = np.mean(solved[:, 1:], axis=0).tolist()
+            error = solved[:, 0]
+            table.add(field_deg, len(solved), rms(error), float(np.median(error)), *means)
+        else:
+            table.add(field_deg, 0, *[math.nan] * 5)
+        print(*table.rows[-1], flush=True)
+    return table
+
+
+def by_scamp(seed: int, field_deg: float) -> tuple[float, float, float, float]:
+    """Error over bound of SCAMP (NaN: it failed), its images, sources and s an image."""
+    given = scenario_of(field_deg, seed)
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        setup = load_set_up(given, **_write_catalog(given, Path(name)))
+    frames = tuple(render_frame(given, index) for index in range(IMAGES))
+    camera = given.truth.camera
+    pixels = pixel_grid(camera, GRID, GRID)
+    true = line_of_sight(camera, pixels)
+    campaign = Campaign('narrow', given, setup, Ensemble(), pixels, true, frames)
+    try:
+        result = scamp.whole(campaign, 3.0 * mounting_sigma_rad(seed))
+    except subprocess.SubprocessError:
+        return math.nan, 0.0, 0.0, math.nan
+    error_rad = rms(shape_errors_arcsec(true, result.directions)) * ARCSECOND_RAD
+    error = error_rad * float(camera.parameters[0]) / bound_px(given)
+    return error, float(result.frames), float(result.stars), result.processor_s / IMAGES
 
 
 @dataclasses.dataclass(frozen=True)
