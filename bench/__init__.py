@@ -1,11 +1,11 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Benches of time, memory, accuracy and identification, some against other packages."""
 
-NAMES = ('solver', 'measure', 'calibrate', 'observer', 'gate', 'onboard')
+NAMES = ('solver', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that yields its tables."""
 
 LONG = (
     *('coverage', 'trust', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
-    *('soak', 'fleet', 'plan', 'peers'),
+    *('soak', 'fleet', 'peers'),
 )
 """Those that take some minutes: run when they are named."""

@@ -26,13 +26,7 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import (
-    Exposure,
-    IdentificationOptions,
-    observe_stars,
-    realigned,
-    StarSearch,
-)
+from starcal_ros.identification import star_finder
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
@@ -71,7 +65,7 @@ def scrambled(images: int, attitudes: int) -> Table:
             'limit: Clopper and Pearson, one-sided; with none accepted it is 3 in those tried.'
         ],
     )
-    catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
+    catalog = load_catalog(None, star_finder.IdentificationOptions().magnitude_limit)
     every = []
     for seed, (name, kind) in enumerate(SCRAMBLES.items()):
         rng = np.random.default_rng([SEED, seed])
@@ -102,7 +96,7 @@ def to_be_found(fields: int) -> Table:
         'Fields to be found, off by up to 1.5 degrees and 5 degrees of roll',
         ('field', 'tried', 'found', 'refused', 'wrong', 'median ms', 'worst ms'),
     )
-    catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
+    catalog = load_catalog(None, star_finder.IdentificationOptions().magnitude_limit)
     for seed, (name, (detector, missing, strange)) in enumerate(DIFFICULTIES.items()):
         rng = np.random.default_rng([SEED, 100 + seed])
         scenario = with_detector(random_fields(rng, fields), detector)
@@ -128,14 +122,14 @@ def trial(
     catalog: StarCatalog,
 ) -> Found:
     """Search or track one image, and compare its stars with the true ones."""
-    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.0)
-    search = StarSearch(catalog)
+    exposure = star_finder.Exposure(image, icrf_from_star_tracker_xyzw, 0.0)
+    search = star_finder.StarSearch(catalog)
     start_s = time.process_time()
     try:
         if isinstance(known, TrackedCamera):
             stars, _ = track_stars(exposure, known, search)
         else:
-            stars, _ = observe_stars(exposure, known, search)
+            stars, _ = star_finder.observe_stars(exposure, known, search)
     except ImageRefused:
         return Found(accepted=False, wrong=False, seconds=time.process_time() - start_s)
     seconds = time.process_time() - start_s
@@ -152,9 +146,9 @@ def tracked_from(
     image: Image, drawn: Scene, prior: CameraGeometry, catalog: StarCatalog
 ) -> TrackedCamera | CameraGeometry:
     """Track from an image with the right attitude, to measure other images with."""
-    exposure = Exposure(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
-    stars, instrument = observe_stars(exposure, prior, StarSearch(catalog))
-    return start_tracking(realigned(prior, stars), stars, instrument) or prior
+    exposure = star_finder.Exposure(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
+    stars, instrument = star_finder.observe_stars(exposure, prior, star_finder.StarSearch(catalog))
+    return start_tracking(star_finder.realigned(prior, stars), stars, instrument) or prior
 
 
 def random_fields(rng: np.random.Generator, count: int) -> Scenario:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from bench import trials
 from bench.frames import load_set_up
 from bench.table import Table
-from bench.trials import rms, Score
+from bench.trials import Score
 from starcal_ground.simulation.centroids import camera_information, scaled_inverse
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid
@@ -33,6 +33,7 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import MapCovariance
 from starcal_ros.sky.catalog import load_catalog
 from studies import worlds
+from studies.trials import rms
 from studies.worlds import Campaign, simulate, World, WORLDS
 
 _MISSIONS = 92  # random stream (seed, purpose, mission)

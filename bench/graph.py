@@ -8,7 +8,6 @@ import contextlib
 import os
 from pathlib import Path
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from typing import Any
 from bench.frames import Frame
 from bench.trials import environment
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
+from starcal_ground.cli.node_processes import free_domain
 from starcal_ros.ros.node import make_message
 
 PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
@@ -26,21 +26,7 @@ START_S = 60.0  # a node starts in 2 s; much slower on a busy machine
 
 def own_domain() -> None:
     """Move this process and its children to an unused ROS domain."""
-    os.environ['ROS_DOMAIN_ID'] = str(_free_domain())
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-
-
-def _free_domain() -> int:
-    """ROS domain without participants on this machine."""
-    for domain in range(1 + os.getpid() % 100, 201):
-        with (
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
-            contextlib.suppress(OSError),
-        ):
-            # The first participant of a domain holds this port (RTPS 9.6.1.1).
-            probe.bind(('', 7410 + 250 * domain))
-            return domain
-    raise RuntimeError('no free ROS domain on this machine')
+    os.environ.update(free_domain())
 
 
 def profile(name: str) -> contextlib.AbstractContextManager[None]:

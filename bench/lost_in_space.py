@@ -2,8 +2,7 @@
 """
 Lost in space: how often the stars of a frame are identified without attitude, and how fast.
 
-Beside it tetra3 in its fork cedar-solve on the same frames, and how often random points are taken
-for stars.
+Beside it how often random points are taken for stars.
 
 A frame is a list of sources: the brightest stars of the catalog in the field, every tenth missing,
 their brightnesses off by 0.3 mag and their places by 0.3 px, and false sources of like
@@ -13,15 +12,10 @@ not at all.  Seeds are fixed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 import functools
-import json
 import math
-from pathlib import Path
-import subprocess
-import sys
-import tempfile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +42,6 @@ KINDS = {
     '6 stars, 12 false, prior off': (6, 12, 1.0),
 }
 """Name -> true and false sources, and how far the camera is off in parts of what is promised."""
-CEDAR = 'cedar-solve==0.5.1'
-CEDAR_WIDTHS_DEG = (15, 25)  # its own database covers 10 to 30 degrees
-CEDAR_FOLDER = Path(__file__).parents[1] / 'build' / 'cedar-solve'
 RIGHT = 0.8  # share of its stars that a match has right
 
 
@@ -70,66 +61,36 @@ class Frame:
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """Frames to be found, beside tetra3, then random points; half a day, or some minutes."""
+    """Frames to be found, then random points; half a day, or some minutes."""
     count, scrambled = (5, 20) if quick else (FRAMES, SCRAMBLED)
     catalog = load_catalog()
     yield found(catalog, count)
-    yield beside_tetra3(catalog, count)
     yield random_points(scrambled)
 
 
-def _rates(
-    title: str,
-    note: str,
-    catalog: StarCatalog,
-    widths_deg: Sequence[int],
-    count: int,
-    search: Callable[[list[Frame], float], list[tuple[bool | None, float]]],
-) -> Table:
-    """
-    Rate and time of a search for each width and kind of frame.
-
-    The search returns for each frame whether it is right, or None without a match, and its time.
-    """
-    columns = ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s')
-    table = Table(title, columns, notes=[note])
+def found(catalog: StarCatalog, count: int) -> Table:
+    """Rate and time for each width and kind of frame."""
+    table = Table(
+        'Frames identified without attitude',
+        ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s'),
+        notes=['Processor time of one thread; the index, made once, is not in it.'],
+    )
     for name, kind in KINDS.items():
-        for width_deg in widths_deg:
-            found = search(list(frames(catalog, width_deg, *kind, count)), width_deg)
-            verdicts = [verdict for verdict, _ in found]
-            median_s, p95_s = np.percentile([s for _, s in found], [50, 95]).tolist()
+        for width_deg in WIDTHS_DEG:
+            made = list(frames(catalog, width_deg, *kind, count))
+            _judged(made[0], catalog)  # makes the index
+            verdicts, took_s = zip(*(_judged(frame, catalog) for frame in made), strict=True)
+            median_s, p95_s = np.percentile(took_s, [50, 95]).tolist()
             rates = (verdicts.count(True), verdicts.count(False))
             table.add(name, width_deg, count, *rates, median_s, p95_s)
             print(*table.rows[-1], flush=True)
     return table
 
 
-def found(catalog: StarCatalog, count: int) -> Table:
-    """Rate and time for each width and kind of frame."""
-
-    def search(made: list[Frame], width_deg: float) -> list[tuple[bool | None, float]]:
-        warm = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
-        find_sky(warm.xy_px, warm.prior, catalog)
-        return [judged(frame) for frame in made]
-
-    def judged(frame: Frame) -> tuple[bool | None, float]:
-        sky, took_s = timed(lambda: find_sky(frame.xy_px, frame.prior, catalog))
-        return _is_right(frame, sky, catalog) if isinstance(sky, SkyMatch) else None, took_s
-
-    note = 'Processor time of one thread; the index, made once, is not in it.'
-    title = 'Frames identified without attitude'
-    return _rates(title, note, catalog, WIDTHS_DEG, count, search)
-
-
-def beside_tetra3(catalog: StarCatalog, count: int) -> Table:
-    """The same frames for cedar-solve, which is installed in a folder of its own."""
-    title = 'The same frames for tetra3 (cedar-solve, its default database, 10 to 30 degrees)'
-    note = 'Told the field to 25 %, 5 s for each frame; its other options as they come.'
-    python = _cedar_python()
-    if python is None:
-        return Table(title, (), notes=[note, 'cedar-solve could not be installed.'])
-    search = functools.partial(_cedar, python)
-    return _rates(title, note, catalog, CEDAR_WIDTHS_DEG, count, search)
+def _judged(frame: Frame, catalog: StarCatalog) -> tuple[bool | None, float]:
+    """True for a right match, None without one, and the processor time, s."""
+    sky, took_s = timed(lambda: find_sky(frame.xy_px, frame.prior, catalog))
+    return _is_right(frame, sky, catalog) if isinstance(sky, SkyMatch) else None, took_s
 
 
 def random_points(count: int) -> Table:
@@ -220,55 +181,3 @@ def _is_right(frame: Frame, sky: SkyMatch, catalog: StarCatalog) -> bool:
     apart = np.linalg.norm(places[rows] - places[sky.catalog_index], axis=1)
     near = apart * float(frame.prior.parameters[0]) < 2.0
     return float(np.mean((rows >= 0) & near)) >= RIGHT
-
-
-_CEDAR_SCRIPT = """
-import json, sys, time
-import numpy as np
-import tetra3
-solver = tetra3.Tetra3('default_database')
-frames, answers = json.load(open(sys.argv[1])), []
-for k, frame in enumerate([frames['frames'][0], *frames['frames']]):
-    start = time.process_time()
-    found = solver.solve_from_centroids(
-        np.array(frame)[:, ::-1], tuple(frames['size'][::-1]), fov_estimate=frames['width_deg'],
-        fov_max_error=0.25 * frames['width_deg'], solve_timeout=5000)
-    seconds = time.process_time() - start
-    if k:
-        answers.append([found['RA'], found['Dec'], seconds])
-print(json.dumps(answers))
-"""
-
-
-def _cedar(python: Path, made: list[Frame], width_deg: float) -> list[tuple[bool | None, float]]:
-    """True for each frame whose middle cedar-solve finds, None without a match; its seconds."""
-    with tempfile.NamedTemporaryFile('w', suffix='.json') as file:
-        content = {'frames': [frame.xy_px.tolist() for frame in made], 'size': SIZE}
-        json.dump({**content, 'width_deg': width_deg}, file)
-        file.flush()
-        command = [str(python), '-c', _CEDAR_SCRIPT, file.name]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    rows: list[tuple[bool | None, float]] = []
-    answers = json.loads(done.stdout.splitlines()[-1])
-    for frame, (ra_deg, dec_deg, took_s) in zip(made, answers, strict=True):
-        is_right = None
-        if ra_deg is not None:
-            ra, dec = math.radians(ra_deg), math.radians(dec_deg)
-            z = [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
-            cosine = float(frame.camera_from_icrf.as_matrix()[2] @ z)
-            # Its boresight is that of the middle of the image: the centre may be 5 % off.
-            is_right = cosine > math.cos(math.radians(0.1 * width_deg))
-        rows.append((is_right, float(took_s)))
-    return rows
-
-
-def _cedar_python() -> Path | None:
-    """The interpreter of a venv with cedar-solve, made at the first use; None: it cannot be."""
-    python = CEDAR_FOLDER / 'bin' / 'python'
-    try:
-        if not python.exists():
-            subprocess.run([sys.executable, '-m', 'venv', str(CEDAR_FOLDER)], check=True)
-        subprocess.run([str(python), '-m', 'pip', 'install', '-q', CEDAR], check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return python

@@ -26,31 +26,26 @@ import time
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.frames import earth_velocity_m_s, load_set_up, observed, render_frame
-from bench.night_sky import off_arcsec
+from bench.frames import load_set_up, observed, render_frame
+from bench.night_sky import calibrated, off_arcsec
 from bench.peers import scamp
 from bench.peers.campaigns import Campaign
 from bench.table import Table
-from bench.trials import in_processes, rms, shape_errors_arcsec
-from starcal_ground.bag_writer import BagWriter
-from starcal_ground.images import night_sky
+from bench.trials import in_processes, shape_errors_arcsec
 from starcal_ground.mission.ingest.deep_catalog import catalog_file, integer_columns
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.deep_sky import deep_sky, disc, log10_density
-from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import Inertial, Scenario
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble, MapCovariance
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog
-from studies.trials import map_bound_px
+from studies.trials import map_bound_px, rms
 
 SIZE, IMAGES, SEEDS = (800, 640), 14, 10
 FIELDS_DEG = (0.3, 0.5, 1.0, 2.5, 5.0)  # of the width
@@ -258,14 +253,7 @@ def _from_images(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:
     camera = folder / 'camera.yaml'
     write_camera_info(given.prior.camera.replace(fx=fx, fy=fx), camera)
     values = {**_write_catalog(given, folder), 'camera_info_url': f'file://{camera}'}
-    bag = folder / 'images.mcap'
-    with BagWriter(bag) as writer:
-        for image in images(given):
-            velocity_m_s = earth_velocity_m_s(image.time_ns)
-            writer.write_velocity('/spacecraft/velocity', image.time_ns, velocity_m_s, 'icrf')
-            writer.write_image('/camera/image_raw', image, 'camera')
-    found = night_sky.from_bags([bag], Topics(), values, folder)
-    campaign = calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)
+    campaign = calibrated(given, folder, values, has_velocity=True)
     return campaign.calibration, campaign.ensemble
 
 
@@ -277,13 +265,7 @@ def bound_px(given: Scenario) -> float:
     """
     camera = given.truth.camera
     names = list(camera.parameter_names)
-    information = np.zeros((len(names), len(names)))
-    for shown in synthetic.scenes(given):
-        covariance, _, keep = centroids.scene_bound(given, shown)
-        in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
-        information += centroids.camera_information(
-            camera, in_camera, covariance[keep], range(len(names))
-        )
+    information = centroids.scenario_information(given, range(len(names)))
     for name in ('cx', 'cy'):
         information[names.index(name), names.index(name)] += _CENTRE_SIGMA_PX**-2.0
     bound = np.zeros((len(names) + 3, len(names) + 3))

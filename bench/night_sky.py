@@ -18,8 +18,9 @@ import time
 
 import numpy as np
 
+from bench.frames import earth_velocity_m_s
 from bench.table import Table
-from bench.trials import rms, shape_errors_arcsec
+from bench.trials import shape_errors_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import night_sky
 from starcal_ground.simulation.rendering import images
@@ -28,9 +29,10 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import StarcalError
-from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.campaign import calibrate_bags, Campaign
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry
+from studies.trials import rms
 
 SIZE, IMAGES, CAMERAS = (800, 640), 12, 200
 FIELDS_DEG = (5.0, 120.0)  # of the diagonal
@@ -49,7 +51,8 @@ def run(quick: bool) -> Iterator[Table]:
         start_s = time.process_time()
         error, sigma, outcome = math.nan, math.nan, ''
         try:
-            found = calibrated(given)
+            with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+                found = calibrated(given, Path(folder), {}).calibration
             error, sigma = off_arcsec(found, given.truth.camera)
             outcome = 'accepted' if found.accepted else f'refused: {found.reasons[0][:60]}'
             wrong += found.accepted and error > WRONG * sigma
@@ -112,16 +115,19 @@ def camera_of(seed: int) -> tuple[Scenario, float]:
     ), half_deg
 
 
-def calibrated(given: Scenario) -> Calibration:
-    """The calibration from a bag of the images alone."""
-    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
-        bag = Path(name) / 'images.mcap'
-        with BagWriter(bag) as writer:
-            for image in images(given):
-                writer.write_image('/camera/image_raw', image, 'camera')
-        found = night_sky.from_bags([bag], Topics(), {}, Path(name))
-        campaign = calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)
-        return campaign.calibration
+def calibrated(
+    given: Scenario, folder: Path, options: dict[str, object], has_velocity: bool = False
+) -> Campaign:
+    """The campaign of a bag, in a folder, of the images alone or with the velocity then."""
+    bag = folder / 'images.mcap'
+    with BagWriter(bag) as writer:
+        for image in images(given):
+            if has_velocity:
+                velocity_m_s = earth_velocity_m_s(image.time_ns)
+                writer.write_velocity('/spacecraft/velocity', image.time_ns, velocity_m_s, 'icrf')
+            writer.write_image('/camera/image_raw', image, 'camera')
+    found = night_sky.from_bags([bag], Topics(), options, folder)
+    return calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)
 
 
 def off_arcsec(found: Calibration, truth: CameraModel) -> tuple[float, float]:

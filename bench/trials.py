@@ -24,6 +24,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import CameraGeometry, Ensemble
+from studies.trials import rms
 from studies.workers import processors
 
 ResultT = TypeVar('ResultT')
@@ -85,11 +86,6 @@ def shape_errors_arcsec(true: Floats, estimated: Floats) -> Floats:
     """Angles (n,) between unit vectors (n, 3), the best common rotation removed."""
     common, _ = Rotation.align_vectors(true, estimated)
     return np.asarray(np.linalg.norm(common.apply(estimated) - true, axis=1) / ARCSECOND_RAD)
-
-
-def rms(values: Floats | Sequence[float]) -> float:
-    """Root of the mean square; NaN without values."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
 
 
 def in_processes(function: Callable[..., ResultT], *arguments: Sequence[Any]) -> list[ResultT]:

@@ -17,11 +17,12 @@ from collections.abc import Iterator
 
 from bench.frames import load_set_up, observed
 from bench.table import Table
-from bench.trials import in_processes, rms, Score, score
+from bench.trials import in_processes, Score, score
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
 from studies.rendered_worlds import frames, scenario_of, true_directions, World, WORLDS
+from studies.trials import rms
 
 SEEDS = 10
 _HONEST = (0.7, 1.5)

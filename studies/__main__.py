@@ -23,7 +23,7 @@ from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.formats.products.product_files import write_atomically
-from studies import monte_carlo, paper, study_figures
+from studies import monte_carlo, paper
 from studies.monte_carlo import Design, Row
 from studies.workers import processors, run_each
 
@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     what = '; '.join(f'{name}: {title}' for name, (title, _) in monte_carlo.STUDIES.items())
     what += '; paper: its night from pixels, with its figures and Table 1'
     made.add_argument('study', metavar='STUDY', choices=NAMES, help=what)
-    what = 'folder for STUDY.json and STUDY.svg, or for paper.md with its figures'
+    what = 'folder for STUDY.json, or for paper.md with its figures'
     made.add_argument('-o', '--output', type=Path, metavar='DIR', required=True, help=what)
     what = 'number of trials (default: depends on the study)'
     made.add_argument('--trials', type=int, metavar='N', help=what)
@@ -93,13 +93,12 @@ def _monte_carlo(args: argparse.Namespace) -> None:
     result = monte_carlo.conclude(design, _rows(design, args))
     path = args.output / f'{design.study}.json'
     write_atomically(path, monte_carlo.content(result, _software()))
-    write_atomically(path.with_suffix('.svg'), study_figures.svg(result))
     print(
         f'{design.study}: {title}; {design.trials} trials, seed {design.seed},'
         f' {time.monotonic() - start_s:.1f} s'
     )
     terminal.print_table(*monte_carlo.table(result), left=0)
-    print(f'written to {path} and {path.with_suffix(".svg").name}')
+    print(f'written to {path}')
 
 
 def _rows(design: Design, args: argparse.Namespace) -> list[Row]:

@@ -33,7 +33,6 @@ from studies.trials import ESTIMATED, rms, StarField
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02
-ENOUGH = 1.01  # limit on the residual of unused images relative to that with the true camera
 CONFIDENCE = 0.99
 
 
@@ -43,7 +42,6 @@ class Design:
     Design of a study, which has one cell for each combination of the lists.
 
     ``assumed_arcsec`` is the star tracker sigma that the calibration assumes; None: the true one.
-    ``unused`` images are not calibrated with; their residual is measured.
     """
 
     study: str
@@ -53,22 +51,16 @@ class Design:
     tracker_arcsec: tuple[float, ...]
     methods: tuple[str, ...]
     outlier_shares: tuple[float, ...] = (0.0,)
-    unused: int = 0
     assumed_arcsec: float | None = None
     seed: int = 1
 
 
-_COUNTS = (2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 60)
 _METHODS = ('per_image', 'single', 'hierarchical')  # in the order of the paper
 _TWO = ('per_image', 'hierarchical')
 STUDIES: Mapping[str, tuple[str, Design]] = {
     'table1': (
         'map error of each method against star tracker noise (Table 1)',
         Design('table1', 200, (16,), (8, 80), (0.0, 5.0, 10.0, 20.0, 40.0, 60.0), _METHODS),
-    ),
-    'images': (
-        'number of images needed (Fig. 7)',
-        Design('images', 100, _COUNTS, (80,), (20.0,), _TWO, unused=20),
     ),
     'coverage': (
         'errors relative to the reported covariance',
@@ -84,7 +76,6 @@ _SHOWN: Mapping[str, tuple[str, ...]] = {
         *('to_own_bound', 'to_per_image_bound'),
         *('pointing_arcsec', 'pointing_to_bound', 'normalised'),
     ),
-    'images': ('unused_px', 'unused_to_true'),
     'coverage': (
         *('to_reported', 'normalised', 'low', 'high', 'inside'),
         *('worst_bias', 'worst_bias_sigmas', 'widest', 'widest_rms_sigmas'),
@@ -123,18 +114,16 @@ def check(design: Design) -> None:
 def run_trial(design: Design, trial: int) -> tuple[Row, ...]:
     """Rows of one trial, one for each cell and method; none if no calibration was possible."""
     rng = np.random.default_rng([design.seed, zlib.crc32(design.study.encode()), trial])
-    most = max(design.images)
-    field = trials.draw_star_field(rng, most + design.unused, max(design.stars))
+    field = trials.draw_star_field(rng, max(design.images), max(design.stars))
     rows: list[Row] = []
     for images, stars in itertools.product(design.images, design.stars):
-        part = field.part(0, images, stars)
-        unused = field.part(most, design.unused, stars) if design.unused else None
+        part = field.part(images, stars)
         cell: Row = {'trial': trial, 'images': images, 'stars': stars}
-        rows += [{**cell, **row} for row in _cell(design, part, unused)]
+        rows += [{**cell, **row} for row in _cell(design, part)]
     return tuple(rows)
 
 
-def _cell(design: Design, part: StarField, unused: StarField | None) -> Iterator[Row]:
+def _cell(design: Design, part: StarField) -> Iterator[Row]:
     """Errors of each method at each star tracker noise, and the bounds of its assumptions."""
     camera, blocks = part.truth.camera, trials.information_blocks(part)
     own = {
@@ -156,7 +145,7 @@ def _cell(design: Design, part: StarField, unused: StarField | None) -> Iterator
                 'tracker_arcsec': tracker,
                 'outlier_share': share,
                 'method': method,
-                **_errors(estimate, part, unused),
+                **_errors(estimate, part),
                 'own_bound_px': own[method],
                 'per_image_bound_px': own['per_image'],
                 'bound_px': own['hierarchical'],
@@ -164,13 +153,13 @@ def _cell(design: Design, part: StarField, unused: StarField | None) -> Iterator
             }
 
 
-def _errors(estimate: Estimate, part: StarField, unused: StarField | None) -> Row:
+def _errors(estimate: Estimate, part: StarField) -> Row:
     """Errors of an estimate, those of its parameters in units of their reported sigmas."""
     found, truth = estimate.geometry, part.truth
     sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
     error = parameter_difference(found, truth)[ESTIMATED]
     names = found.camera.parameter_names + ALIGNMENT_NAMES
-    row: Row = {
+    return {
         'map_px': map_error_px(found.camera, truth.camera),
         'pointing_arcsec': trials.pointing_error_arcsec(found, truth),
         'normalised': trials.normalised_error_squared(estimate, truth),
@@ -182,10 +171,6 @@ def _errors(estimate: Estimate, part: StarField, unused: StarField | None) -> Ro
             for k, e, s in zip(ESTIMATED, error, sigma, strict=True)
         },
     }
-    if unused:
-        row['unused_px'] = trials.unused_residual_px(found.camera, unused)
-        row['unused_true_px'] = trials.unused_residual_px(truth.camera, unused)
-    return row
 
 
 @dataclass(frozen=True)
@@ -282,9 +267,6 @@ def _summary(rows: Sequence[Row]) -> Iterator[Row]:
             **{f'bias_{name}': value for name, value in bias.items()},
             **{f'rms_{name}': value for name, value in spread.items()},
         }
-        if 'unused_px' in cell[0]:
-            row['unused_px'] = rms(column(cell, 'unused_px'))
-            row['unused_to_true'] = _ratio(cell, 'unused_px', 'unused_true_px')
         yield row
 
 

@@ -94,8 +94,8 @@ class PaperStudy:
 
     Attributes
     ----------
-    camera, true_camera : CameraModel
-        Estimated by ``per_image``, the paper's Method 1, from `CALIBRATED_WITH` images; and true.
+    camera : CameraModel
+        Estimated by ``per_image``, the paper's Method 1, from `CALIBRATED_WITH` images.
     used, others : tuple of int
         Indices of those images, evenly spread over the night, and of the other measured ones.
     judged : Judged
@@ -115,7 +115,6 @@ class PaperStudy:
     refused: int
     stars: int
     camera: CameraModel
-    true_camera: CameraModel
     used: tuple[int, ...]
     others: tuple[int, ...]
     judged: Judged
@@ -226,7 +225,6 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
         refused=len(observations) - count,
         stars=sum(len(observed) for observed in images),
         camera=camera,
-        true_camera=truth.camera,
         used=used,
         others=rest(used),
         judged=judge(camera, images, limit),

@@ -8,6 +8,7 @@ parts or multiples of the same draws, so that their difference has little sampli
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -21,7 +22,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import chi_squared, lines_of_sight, parameter_difference
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.assessment.observability import map_sigma_px
-from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
+from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
@@ -71,9 +72,9 @@ class StarField:
     outlier_draw: Floats
     outlier_px: Floats
 
-    def part(self, first: int, count: int, stars: int) -> StarField:
-        """Consecutive images with the first stars of each."""
-        m, n = slice(first, first + count), slice(stars)
+    def part(self, images: int, stars: int) -> StarField:
+        """The first images with the first stars of each."""
+        m, n = slice(images), slice(stars)
         by_star = ('pixel_px', 'direction_icrf', 'centroid_error_px', 'outlier_draw', 'outlier_px')
         return dataclasses.replace(
             self,
@@ -195,21 +196,6 @@ def normalised_error_squared(estimate: Estimate, true: CameraGeometry) -> float:
     return chi_squared(error[ESTIMATED], covariance).value
 
 
-def unused_residual_px(camera: CameraModel, field: StarField) -> float:
-    """
-    RMS residual per axis of images that were not used in a calibration, px.
-
-    Each image gets its best-fit rotation (as in the paper's Fig. 7), so that only errors of the
-    camera remain.
-    """
-    squares = 0.0
-    measured = field.pixel_px + field.centroid_error_px
-    for pixels, directions in zip(measured, field.direction_icrf, strict=True):
-        rotation, _ = Rotation.align_vectors(line_of_sight(camera, pixels), directions)
-        squares += float(((pixels - project(camera, rotation.apply(directions))) ** 2).sum())
-    return math.sqrt(squares / measured.size)
-
-
 def calibration_options(method: str, tracker_arcsec: float, **other: object) -> CalibrationOptions:
     """
     Options of the paper's model, for few images and stars.
@@ -233,6 +219,6 @@ def calibration_options(method: str, tracker_arcsec: float, **other: object) -> 
     return dataclasses.replace(options, **other)  # type: ignore[arg-type]
 
 
-def rms(values: Floats) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
+def rms(values: Floats | Sequence[float]) -> float:
+    """Root of the mean square; NaN without values."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan

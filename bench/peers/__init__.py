@@ -19,8 +19,9 @@ from bench.competitors import solve_ceres, solve_scipy
 from bench.peers import giant, solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
-from bench.trials import rms, shape_errors_arcsec
+from bench.trials import shape_errors_arcsec
 from starcal_ros.processes import one_blas_thread
+from studies.trials import rms
 
 
 class Tool(NamedTuple):

@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 from bench.frames import earth_velocity_m_s, Frame, history
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
-from bench.trials import rms
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad
 from starcal_ros.constants import AU_M
 from starcal_ros.records import MapCovariance
 from starcal_ros.sky.astrometry import tt_julian_date
 from starcal_ros.sky.catalog import cone
+from studies.trials import rms
 
 INSTALLED = importlib.util.find_spec('giant') is not None
 # Its names of the camera parameters, in the order of starcal.

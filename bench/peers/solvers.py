@@ -23,10 +23,10 @@ from bench import competitors, mrcal_process
 from bench.competitors import Answer, Case
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
-from bench.trials import rms
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import line_of_sight
 from starcal_ros.records import MapCovariance
+from studies.trials import rms
 
 CERES = importlib.util.find_spec('pyceres') is not None
 MRCAL = Path('/usr/lib/python3/dist-packages/mrcal')  # of Debian's python3-mrcal

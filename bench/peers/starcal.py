@@ -10,12 +10,12 @@ from bench.calibrate import cost, TOOL
 from bench.frames import observed, write_bag, write_set_up
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
-from bench.trials import rms
-from starcal_ground.images.from_stars import from_stars, pinhole
+from starcal_ground.images.from_stars import from_stars, ideal_camera
 from starcal_ros.api import read_calibration
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import Calibration
+from studies.trials import rms
 
 
 def whole(campaign: Campaign) -> list[Result]:
@@ -51,6 +51,6 @@ def tracked(campaign: Campaign) -> tuple[int, int]:
 def identified(campaign: Campaign) -> tuple[int, int]:
     """Number of frames found by the patterns of their stars, and 0: none is measured."""
     camera = campaign.scenario.truth.camera
-    hint = pinhole((camera.width, camera.height), float(camera.parameters[0]))
+    hint = ideal_camera((camera.width, camera.height), float(camera.parameters[0]))
     found = from_stars([image for image, _ in campaign.frames], campaign.setup.catalog, hint)
     return len(found.icrf_from_camera), 0

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Record = TypeVar('Record', bound='DataclassInstance')
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
 BAGS = 'an .mcap file or a bag folder'
-BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
+_BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
 _TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
 
 
@@ -90,17 +90,6 @@ def add_output(command: argparse.ArgumentParser, metavar: str, what: str, **sett
     command.add_argument('-o', '--output', type=path, metavar=metavar, help=what, **settings)
 
 
-def add_bags(command: argparse.ArgumentParser, what: str = BAGS) -> None:
-    """Add bags, at least one."""
-    command.add_argument('bags', type=path, metavar='BAG', nargs='+', help=what)
-
-
-def add_params(command: argparse.ArgumentParser, what: str = '') -> None:
-    """Add the option of a parameter file, needed where no other meaning is given."""
-    text = what or 'ROS parameter file: prior camera, mounting and options'
-    command.add_argument('--params', type=path, metavar='FILE', help=text, required=not what)
-
-
 def _setting(text: str) -> tuple[str, object]:
     from starcal_ros.untrusted import yaml_value
 
@@ -115,9 +104,9 @@ def _setting(text: str) -> tuple[str, object]:
 
 def add_inputs(command: argparse.ArgumentParser) -> None:
     """Add bags or images, and the options that state what is known of them, for `given`."""
-    add_bags(command, BAGS_OR_IMAGES)
+    command.add_argument('bags', type=path, metavar='BAG', nargs='+', help=_BAGS_OR_IMAGES)
     what = 'ROS parameter file: prior camera, mounting and options (default: found or assumed)'
-    add_params(command, what)
+    command.add_argument('--params', type=path, metavar='FILE', help=what)
     what = 'state an option of a parameter file, such as observer=ground; may be repeated'
     command.add_argument(
         '--set', type=_setting, action='append', default=[], metavar='NAME=VALUE', help=what

@@ -158,10 +158,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return arguments.complain(explained(error))
     except BrokenPipeError:
         # The reader of our output has ended (starcal ... | head).
-        terminal.discard('stdout')
+        terminal.discard_stdout()
         return arguments.EXIT_BAD_INPUT
     except OSError as error:
-        terminal.discard('stdout')
+        terminal.discard_stdout()
         return arguments.complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except (KeyboardInterrupt, Exception) as error:
         if arguments.is_interrupt(error):

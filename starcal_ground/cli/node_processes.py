@@ -82,7 +82,8 @@ def calibrate_with_nodes(
     params, *_ = outputs(folder)
     content = {'/**': {'ros__parameters': dict(parameters)}}
     write_atomically(params, yaml.safe_dump(content, sort_keys=False))
-    environment = {**os.environ, **_own_domain()}
+    own_domain = {} if 'ROS_DOMAIN_ID' in os.environ else free_domain()
+    environment = {**os.environ, **own_domain}
     with contextlib.ExitStack() as stack:
         stack.enter_context(_ended_like_interrupted())
         state = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -220,10 +221,8 @@ def _stop(process: Process) -> None:
                 process.wait(5.0)
 
 
-def _own_domain() -> dict[str, str]:
-    """Environment of a ROS domain unused on this machine; empty if ROS_DOMAIN_ID is set."""
-    if 'ROS_DOMAIN_ID' in os.environ:
-        return {}
+def free_domain() -> dict[str, str]:
+    """Environment of a ROS domain unused on this machine; raises NodeError if there is none."""
     first = os.getpid() % 100
     for domain in (1 + (first + k) % 100 for k in range(100)):
         # The first participant of a domain holds UDP port 7400 + 250 domain + 10 (RTPS 9.6.1.1).

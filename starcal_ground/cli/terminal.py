@@ -26,18 +26,17 @@ def open_missing_streams() -> None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
-def discard(*names: str) -> None:
-    """Discard unwritten output of standard streams whose reader has ended."""
-    for name in names:
-        with contextlib.suppress(OSError, ValueError):  # in tests they are no files
-            devnull = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(devnull, getattr(sys, name).fileno())
-            os.close(devnull)
+def discard_stdout() -> None:
+    """Discard unwritten output on stdout, whose reader has ended."""
+    with contextlib.suppress(OSError, ValueError):  # in tests it is no file
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(devnull, sys.stdout.fileno())
+        os.close(devnull)
 
 
-def print_text(text: str = '', end: str = '\n', file: TextIO | None = None) -> None:
+def print_text(text: str = '', file: TextIO | None = None) -> None:
     """Print lines with characters that act on a terminal escaped (`printable`)."""
-    print('\n'.join(map(printable, text.split('\n'))), end=end, file=file)
+    print('\n'.join(map(printable, text.split('\n'))), file=file)
 
 
 def print_wrapped(text: str, indent: int = 2, file: TextIO | None = None) -> None:

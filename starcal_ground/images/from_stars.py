@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera.lens import ideal_points
+from starcal_ros.camera.lens import COEFFICIENTS, ideal_points
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
@@ -238,27 +238,17 @@ def _noise(pixels: Pixels) -> Floats:
     return np.asarray(noise.ravel() / length if length > 0 else np.zeros(noise.size))
 
 
-def pinhole(size: tuple[int, int], focal_px: float) -> CameraModel:
-    """A camera without distortion of this size (width, height), its axis in the middle."""
-    width, height = size
-    middle = (width - 1) / 2, (height - 1) / 2
-    return CameraModel(
-        width, height, np.array([focal_px, 0.0, focal_px, *middle, 0.0, 0.0, 0.0, 0.0, 0.0])
-    )
+def ideal_camera(size: tuple[int, int], focal_px: float, model: str = _PINHOLE) -> CameraModel:
+    """A camera of this size (width, height) without distortion, its axis in the middle."""
+    middle = (size[0] - 1) / 2, (size[1] - 1) / 2
+    none = np.zeros(len(COEFFICIENTS[model]))
+    return CameraModel(*size, np.array([focal_px, 0.0, focal_px, *middle, *none]), model)
 
 
 def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -> CameraModel:
     """A camera of a model without distortion, of this half diagonal."""
     half_ideal = math.tan(half_rad) if model == _PINHOLE else half_rad
-    return _without_distortion(size, half_px / half_ideal, model)
-
-
-def _without_distortion(size: tuple[int, int], focal_px: float, model: str) -> CameraModel:
-    """A camera of a model and size, its axis in the middle."""
-    camera = pinhole(size, focal_px)
-    if model == _PINHOLE:
-        return camera
-    return CameraModel(*size, camera.parameters[:9], model)
+    return ideal_camera(size, half_px / half_ideal, model)
 
 
 def _first_match(
@@ -287,7 +277,7 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
         return sky
     # Without distortion: coefficients fitted to a perspective lens bend corners without stars.
     size, focal_px = (sky.camera.width, sky.camera.height), _focal_px(sky.camera, _EQUIDISTANT)
-    camera = _without_distortion(size, focal_px, _EQUIDISTANT)
+    camera = ideal_camera(size, focal_px, _EQUIDISTANT)
     cx, cy = sky.camera.parameters[3:5].tolist()
     camera = camera.replace(cx=cx, cy=cy)
     if sky.mirrored:

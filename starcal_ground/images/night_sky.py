@@ -18,23 +18,8 @@ import tempfile
 
 import numpy as np
 
-from starcal_ground.images.from_stars import (
-    count_of_stars,
-    from_stars,
-    FromStars,
-    options_of,
-    pinhole,
-)
-from starcal_ground.images.photographs import (
-    by_camera,
-    image_paths,
-    in_order,
-    look_at,
-    Photograph,
-    pixels_of_photograph,
-    Refusals,
-    without_copies,
-)
+from starcal_ground.images import from_stars as by_stars
+from starcal_ground.images import photographs as image_files
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import NotFromStars
@@ -114,7 +99,7 @@ def from_images(
     the stars give no camera.
     """
     option_groups(values)  # before a long search
-    photographs = image_paths(paths)
+    photographs = image_files.image_paths(paths)
     if not photographs:
         return from_bags(paths, topics, values, folder, lens), reader.mcap_files(paths)
     chosen, notes = photographs_of(photographs, *lens)
@@ -124,25 +109,25 @@ def from_images(
 
 def photographs_of(
     paths: Sequence[Path], focal_length_mm: float = 0.0, pixel_um: float = 0.0
-) -> tuple[list[Photograph], list[str]]:
+) -> tuple[list[image_files.Photograph], list[str]]:
     """
     Photographs of one camera in order of time, and notes on the omitted files.
 
     Raises NotFromStars when no file can be read.
     """
-    looked: list[Photograph] = []
-    refusals = Refusals()
-    for path in image_paths(paths):
+    looked: list[image_files.Photograph] = []
+    refusals = image_files.Refusals()
+    for path in image_files.image_paths(paths):
         with refusals.of(path):
-            looked.append(look_at(path, focal_length_mm, pixel_um))
-    groups = by_camera(looked)
+            looked.append(image_files.look_at(path, focal_length_mm, pixel_um))
+    groups = image_files.by_camera(looked)
     if not groups:
         raise NotFromStars('; '.join(['no image can be read', *refusals.lines()]))
     if len(groups) > 1:
         with_stars = {name: _shows_stars(group) for name, group in groups.items()}
         groups = dict(sorted(groups.items(), key=lambda item: not with_stars[item[0]]))
     (name, group), *others = groups.items()
-    chosen = without_copies(group, refusals)
+    chosen = image_files.without_copies(group, refusals)
     notes = refusals.lines()
     if others:
         left = ', '.join(
@@ -150,18 +135,18 @@ def photographs_of(
             for other, group in others
         )
         notes.append(f'{len(chosen)} images of {name} are used; left out: {left}')
-    return in_order(chosen), notes
+    return image_files.in_order(chosen), notes
 
 
-def _shows_stars(group: Sequence[Photograph]) -> bool:
+def _shows_stars(group: Sequence[image_files.Photograph]) -> bool:
     """True if one of a few images of a group, from its first to its last, shows stars."""
     few = [group[k * (len(group) - 1) // (_FEW - 1)] for k in range(min(_FEW, len(group)))]
-    images = _images(few, Refusals())
-    return any(count_of_stars(image.pixels) >= FEWEST_SOURCES for image in images)
+    images = _images(few, image_files.Refusals())
+    return any(by_stars.count_of_stars(image.pixels) >= FEWEST_SOURCES for image in images)
 
 
 def from_photographs(
-    photographs: Sequence[Photograph], values: Mapping[str, object], folder: Path
+    photographs: Sequence[image_files.Photograph], values: Mapping[str, object], folder: Path
 ) -> NightSky:
     """
     Set-up of a calibration of photographs, whose bags are written into a folder.
@@ -173,7 +158,7 @@ def from_photographs(
     stars, notes = camera_of_photographs(photographs, values)
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
-        for image in _images(photographs, Refusals()):
+        for image in _images(photographs, image_files.Refusals()):
             if stars.mirrored:
                 image = Image(image.time_ns, image.pixels[:, ::-1].copy())
             writer.write_image('/camera/image_raw', image, 'camera')
@@ -187,8 +172,8 @@ def from_photographs(
 
 
 def camera_of_photographs(
-    photographs: Sequence[Photograph], values: Mapping[str, object]
-) -> tuple[FromStars, list[str]]:
+    photographs: Sequence[image_files.Photograph], values: Mapping[str, object]
+) -> tuple[by_stars.FromStars, list[str]]:
     """
     Camera and rotations of photographs, and notes on files that turned out to be damaged.
 
@@ -197,19 +182,21 @@ def camera_of_photographs(
     """
     first = photographs[0]
     focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
-    hint = pinhole((first.width, first.height), focal_px) if focal_px < 1e9 else None
-    refusals = Refusals()
+    hint = by_stars.ideal_camera((first.width, first.height), focal_px) if focal_px < 1e9 else None
+    refusals = image_files.Refusals()
     try:
         return _found(_images(photographs, refusals), values, hint), refusals.lines()
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *refusals.lines()])) from error
 
 
-def _images(photographs: Sequence[Photograph], refusals: Refusals) -> Iterator[Image]:
+def _images(
+    photographs: Sequence[image_files.Photograph], refusals: image_files.Refusals
+) -> Iterator[Image]:
     """Images of the files that can be decoded."""
     for one in photographs:
         with refusals.of(one.path):
-            yield Image(one.time_ns, pixels_of_photograph(one.path))
+            yield Image(one.time_ns, image_files.pixels_of_photograph(one.path))
 
 
 def from_bags(
@@ -238,7 +225,7 @@ def camera_of_bags(
     values: Mapping[str, object],
     most: int | None = None,
     lens: tuple[float, float] = (0.0, 0.0),
-) -> FromStars:
+) -> by_stars.FromStars:
     """
     Camera and rotations of the images of bags, at most the first few; ``lens`` as `from_images`.
 
@@ -250,7 +237,7 @@ def camera_of_bags(
     first, hint = next(images, None), None
     if first is not None and all(lens):
         height, width = first.pixels.shape
-        hint = pinhole((width, height), 1000.0 * lens[0] / lens[1])
+        hint = by_stars.ideal_camera((width, height), 1000.0 * lens[0] / lens[1])
     try:
         stars = _found(itertools.chain([first] if first else [], images), values, hint)
     except NotFromStars as error:
@@ -278,18 +265,18 @@ def _of_one_size(
 
 def _found(
     images: Iterator[Image], values: Mapping[str, object], hint: CameraModel | None
-) -> FromStars:
+) -> by_stars.FromStars:
     """Camera and rotations; the camera file of the options has priority over a hint."""
     if url := str(values.get('camera_info_url', '')):
         hint = read_camera_info(url)
     path = str(values.get('catalog', ''))
     catalog = load_catalog(Path(path) if path else None)
     least = option_groups(values)['calibration'].min_images
-    return from_stars(images, catalog, hint, least)
+    return by_stars.from_stars(images, catalog, hint, least)
 
 
 def _set_up(
-    stars: FromStars,
+    stars: by_stars.FromStars,
     bags: Sequence[Path],
     values: Mapping[str, object],
     folder: Path,
@@ -308,7 +295,7 @@ def _set_up(
     prior = CameraGeometry(stars.camera, np.array([0.0, 0.0, 0.0, 1.0]))
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
-    setup = load_setup({**stated, **options_of(values)}, prior=prior)
+    setup = load_setup({**stated, **by_stars.options_of(values)}, prior=prior)
     setup = dataclasses.replace(setup, times_of=times_of)
     notes = [*notes, stars.in_a_sentence()]
     notes += [f'the time is that {times_of}'] if times_of else []
@@ -326,7 +313,7 @@ def _set_up(
     )
 
 
-def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:
+def site_of(photographs: Sequence[image_files.Photograph]) -> dict[str, object]:
     """Options of the site, if all files have a position and a date."""
     sites = [one.site for one in photographs if one.site is not None and one.dated and one.utc]
     if len(sites) < len(photographs):

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ground.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
-from starcal_ground.images.time_systems import middle_of_exposure, number, TimeError
+from starcal_ground.images.time_systems import middle_of_exposure, number
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
@@ -453,7 +453,7 @@ def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Ph
         if re.search('dark|flat|bias', kind):
             raise IngestError(f'{path}: no image of the sky: {key} is {kind[:40]!r}')
     time_ns, dated = _time_of_file(path), False
-    with contextlib.suppress(TimeError, ValueError, OverflowError):
+    with contextlib.suppress(ValueError, OverflowError):
         stated_ns = middle_of_exposure(header, '')
         if _FIRST_NS <= stated_ns < _LAST_NS:
             time_ns, dated = stated_ns, True
@@ -624,5 +624,5 @@ def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> i
         raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
     try:
         return middle_of_exposure(header, options.time_key)
-    except (TimeError, ValueError, OverflowError) as error:
+    except (ValueError, OverflowError) as error:
         raise IngestError(f'{path}: {error}') from error

@@ -18,7 +18,6 @@ import re
 import erfa
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import StarcalError
 from starcal_ros.formats.image_files import Card
 
 _DAY_S = 86400
@@ -44,16 +43,12 @@ _TIME = re.compile(
 )
 
 
-class TimeError(StarcalError):
-    """A time cannot be converted; the text names it."""
-
-
 def system_of(name: str) -> str:
-    """One of `SYSTEMS` by its name; raises TimeError for another, as local time, MET or UT1."""
+    """One of `SYSTEMS` by its name; raises ValueError for another, as local time, MET or UT1."""
     known = name.strip().upper()
     known = _OTHER_NAMES.get(known, known)
     if known not in SYSTEMS:
-        raise TimeError(f'time system {name!r} is not one of {", ".join(SYSTEMS)}')
+        raise ValueError(f'time system {name!r} is not one of {", ".join(SYSTEMS)}')
     return known
 
 
@@ -61,21 +56,21 @@ def from_text(text: str, system: str) -> int:
     """
     Stamp of a date and time, ``2026-05-15T07:20:00.5`` or ``2026-135T07:20:00.5``.
 
-    Raises TimeError for other text, a date alone, or a time before 1972.
+    Raises ValueError for other text, a date alone, or a time before 1972.
     """
     match = _TIME.fullmatch(text.strip())
     if not match:
-        raise TimeError(f'{text!r} is not a date and time, as 2026-05-15T07:20:00.5')
+        raise ValueError(f'{text!r} is not a date and time, as 2026-05-15T07:20:00.5')
     day, hour, minute, second, fraction = match.groups()
     if hour is None:
-        raise TimeError(f'{text!r} has no time of day')  # midnight would be a guess
+        raise ValueError(f'{text!r} has no time of day')  # midnight would be a guess
     if second == '60' and (system, hour, minute) != ('UTC', '23', '59'):
-        raise TimeError(f'{text!r} is not a leap second')
+        raise ValueError(f'{text!r} is not a leap second')
     try:
         day_form = '%Y-%m-%d' if day.count('-') == 2 else '%Y-%j'
         days = datetime.strptime(day, day_form).toordinal() - _UNIX_DAY
     except ValueError as error:
-        raise TimeError(f'{text!r} is not a date: {error}') from error
+        raise ValueError(f'{text!r} is not a date: {error}') from error
     in_day_s = int(hour) * 3600 + int(minute) * 60 + int(second or 0)
     count_ns = (days * _DAY_S + in_day_s) * NANOSECONDS_PER_SECOND
     return to_utc_ns(count_ns + round(float(f'0.{fraction or 0}') * 1e9), system)
@@ -94,14 +89,14 @@ def to_utc_ns(count_ns: int, system: str) -> int:
     """
     Stamp of a count of nanoseconds in a time system since its own 1970-01-01T00:00:00.
 
-    Raises TimeError for another system than `SYSTEMS`, or a time before 1972 or after 2038.
+    Raises ValueError for another system than `SYSTEMS`, or a time before 1972 or after 2038.
     """
     system = system_of(system)
     if count_ns >= _LAST_STAMP_NS:
-        raise TimeError('a time after 2038-01-19, where stamps of ROS end (32 bit)')
+        raise ValueError('a time after 2038-01-19, where stamps of ROS end (32 bit)')
     if system == 'UTC':
         if count_ns < _leap_seconds()[0][0]:
-            raise TimeError(f'{count_ns / 1e9:.3f} s since 1970 is before 1972, where UTC begins')
+            raise ValueError(f'{count_ns / 1e9:.3f} s since 1970 is before 1972, where UTC begins')
         return count_ns
     if system == 'TDB':
         days = count_ns / (_DAY_S * NANOSECONDS_PER_SECOND)
@@ -111,7 +106,7 @@ def to_utc_ns(count_ns: int, system: str) -> int:
     table = _leap_seconds()
     k = bisect_right(table, tai_ns, key=sum) - 1  # a row begins at the TAI of its stamp
     if k < 0:
-        raise TimeError(f'{count_ns / 1e9:.3f} s since 1970 {system} is before 1972')
+        raise ValueError(f'{count_ns / 1e9:.3f} s since 1970 {system} is before 1972')
     return tai_ns - table[k][1]
 
 
@@ -152,11 +147,11 @@ def middle_of_exposure(header: Mapping[str, Card], key: str) -> int:
     """
     Stamp of the middle of the exposure; that of ``key`` unless it is empty.
 
-    Raises TimeError when there is none, or a keyword is ambiguous; the text names the remedy.
+    Raises ValueError when there is none, or a keyword is ambiguous; the text names the remedy.
     """
     if key:
         if key not in header:
-            raise TimeError(f'no keyword {key} (see --time-key)')
+            raise ValueError(f'no keyword {key} (see --time-key)')
         return _stamp(header, key)
     for name in ('DATE-AVG', 'MJD-AVG'):
         if name in header:
@@ -165,18 +160,18 @@ def middle_of_exposure(header: Mapping[str, Card], key: str) -> int:
         if start in header and end in header:
             first_ns, last_ns = _stamp(header, start), _stamp(header, end)
             if last_ns < first_ns:
-                raise TimeError(f'{end} is before {start}: {_INSTEAD}')
+                raise ValueError(f'{end} is before {start}: {_INSTEAD}')
             return (first_ns + last_ns) // 2
     exposure_s = _exposure_s(header)
     for name in ('DATE-BEG', 'DATE-OBS', 'MJD-OBS'):
         if name in header:
             if exposure_s is None:
-                raise TimeError(
+                raise ValueError(
                     f'{name} is the start, and no exposure time is given: --time-key {name} '
                     'takes it as the middle'
                 )
             return _stamp(header, name) + round(exposure_s * NANOSECONDS_PER_SECOND / 2)
-    raise TimeError(f'no time (DATE-AVG, DATE-BEG, DATE-OBS): {_INSTEAD}')
+    raise ValueError(f'no time (DATE-AVG, DATE-BEG, DATE-OBS): {_INSTEAD}')
 
 
 def _stamp(header: Mapping[str, Card], name: str) -> int:
@@ -195,7 +190,7 @@ def _stamp(header: Mapping[str, Card], name: str) -> int:
     }
     if len(stamps) != 1:
         clocks_found = f'{", ".join(clocks)} differ' if clocks else 'no keyword has one'
-        raise TimeError(f'{name} = {text!r} has no time of day, and {clocks_found}: {_INSTEAD}')
+        raise ValueError(f'{name} = {text!r} has no time of day, and {clocks_found}: {_INSTEAD}')
     return stamps.pop()
 
 
@@ -214,7 +209,7 @@ def _exposure_s(header: Mapping[str, Card]) -> float | None:
         unit = str(header['TIMEUNIT'].value)
     scale_s = _UNITS_S.get(unit.strip()) or _UNITS_S.get(unit.strip().lower().removesuffix('s'))
     if scale_s is None:
-        raise TimeError(
+        raise ValueError(
             f'{key} is in {unit.strip()!r}, expected a unit as [s] or [ms]: {_INSTEAD}'
         )
     try:
@@ -222,7 +217,7 @@ def _exposure_s(header: Mapping[str, Card]) -> float | None:
     except (TypeError, ValueError):
         exposure_s = math.nan
     if not 0.0 < exposure_s < math.inf:
-        raise TimeError(f'{key} = {value} is not the duration of an exposure: {_INSTEAD}')
+        raise ValueError(f'{key} = {value} is not the duration of an exposure: {_INSTEAD}')
     return exposure_s
 
 

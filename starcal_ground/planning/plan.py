@@ -243,7 +243,6 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _FAINTEST = 0.99  # share of the stars observed so far that are brighter than those predicted
 _HELPS = 0.01  # an image that lowers the sigma by less has ceased to help
 _SAME_COSINE = 1e-12  # rounding: a pointing can be reached from itself
-_MOST_IMAGES = 1000
 
 
 def _direction(ra_deg: float, dec_deg: float) -> Floats:
@@ -303,12 +302,6 @@ class Request:
         for one in (*self.avoid, self.within):
             if not 0.0 <= one.radius_deg <= 180.0:
                 raise OptionError(f'{one}: the radius is not within 0 to 180 deg')
-        if not 1 <= self.images <= _MOST_IMAGES:
-            raise OptionError(f'images: {self.images} is not within 1 to {_MOST_IMAGES}')
-        if not 0.0 < self.largest_slew_deg <= 180.0:
-            raise OptionError(
-                f'largest slew: {self.largest_slew_deg:g} deg is not within 0 to 180'
-            )
 
 
 @dataclass(frozen=True)

@@ -40,12 +40,10 @@ def residuals_of_images(residuals: Residuals) -> svg.Chart:
     )  # fmt: skip
 
 
-def outline(
-    values: Floats, edges: Floats, colour: str, name: str, width: float = 1.5
-) -> svg.Curve:
+def outline(values: Floats, edges: Floats, colour: str, name: str) -> svg.Curve:
     """Histogram of a density, as the outline of its bars; values outside are in the end bins."""
     density, _ = np.histogram(np.clip(values, *edges[[0, -1]]), edges, density=True)
-    return svg.Curve(np.repeat(edges, 2)[1:-1], np.repeat(density, 2), colour, name, width=width)
+    return svg.Curve(np.repeat(edges, 2)[1:-1], np.repeat(density, 2), colour, name)
 
 
 def histogram(residuals: Residuals) -> svg.Chart:

@@ -23,7 +23,6 @@ from markupsafe import Markup
 import numpy as np
 
 from starcal_ground import outputs, products
-from starcal_ground.products import CAMERA_INFO_FILE
 from starcal_ground.report import detector_figures, figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
 from starcal_ground.report.thumbnails import star_of, Thumbnail
@@ -230,12 +229,6 @@ def used_images(
     ]
 
 
-_PRODUCTS = (
-    product_files.CALIBRATION_FILE,
-    CAMERA_INFO_FILE,
-    products.RESIDUALS_FILE,
-    outputs.OBSERVATIONS_FILE,
-)
 PDF_FILE = 'report.pdf'
 
 
@@ -313,7 +306,11 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     observations = contents.observations or ()
     prior = products.prior_of(calibration)
     refused = calibration.images_refused
-    written = [name for name in _PRODUCTS if (folder / name).is_file()]
+    written = [
+        name
+        for name in products.PRODUCT_FILES
+        if name != outputs.REPORT_FILE and (folder / name).is_file()
+    ]
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),

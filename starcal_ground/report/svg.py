@@ -36,9 +36,7 @@ _MARKS = {
     'square': 'M-{r},-{r}H{r}V{r}H-{r}Z',
     'triangle': 'M0,-{r}L{r},{r}H-{r}Z',
     'cross': 'M-{r},-{r}L{r},{r}M-{r},{r}L{r},-{r}',
-    'ring': 'M{r},0A{r},{r} 0 1 1 -{r},0A{r},{r} 0 1 1 {r},0Z',
 }
-_OPEN = ('cross', 'ring')
 _PALETTE = re.compile(r':root \{(.*?)\}', re.DOTALL)
 _VARIABLE = re.compile(r'--([\w-]+): (#[0-9a-f]+)')
 
@@ -382,8 +380,9 @@ def _rectangle(box: Sequence[float], colour: str, opacity: float) -> str:
 
 def _mark(x: float, y: float, colour: str, shape: str, size: float, title: str) -> str:
     path = _MARKS[shape].replace('{r}', f'{size:g}')
-    is_open = shape in _OPEN
-    style = f'fill="none" stroke="{colour}" stroke-width="1.5"' if is_open else f'fill="{colour}"'
+    style = f'fill="{colour}"'
+    if shape == 'cross':
+        style = f'fill="none" stroke="{colour}" stroke-width="1.5"'
     inside = f'<title>{html.escape(title)}</title>' if title else ''
     return f'<path transform="translate({x:.1f} {y:.1f})" d="{path}" {style}>{inside}</path>'
 

@@ -184,12 +184,19 @@ def cramer_rao_covariance(scenario: synthetic.Scenario) -> Floats:
     """
     camera = scenario.truth.camera
     columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
+    return scaled_inverse(scenario_information(scenario, columns))
+
+
+def scenario_information(scenario: synthetic.Scenario, columns: Sequence[int]) -> Floats:
+    """Information (k, k) of all images on the camera parameters of some columns."""
     information = np.zeros((len(columns), len(columns)))
     for shown in synthetic.scenes(scenario):
         covariance, _, keep = scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
-        information += camera_information(camera, in_camera, covariance[keep], columns)
-    return scaled_inverse(information)
+        information += camera_information(
+            scenario.truth.camera, in_camera, covariance[keep], columns
+        )
+    return information
 
 
 def camera_information(

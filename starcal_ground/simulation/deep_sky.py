@@ -12,13 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.sky.catalog import (
-    BUNDLED_MAGNITUDE,
-    cone,
-    load_catalog,
-    MotionSource,
-    StarCatalog,
-)
+from starcal_ros.sky import catalog
 
 _MOTION_MAS = 8.0  # a year, 1-sigma of each axis
 _V_LESS_G = 0.15  # of a star without a colour, as `deep_catalog.johnson_v` has it
@@ -36,21 +30,21 @@ def log10_density(magnitude: NDArray[np.floating]) -> Floats:
 
 def deep_sky(
     axis: Floats, radius_rad: float, faintest: float, rng: np.random.Generator, spread: float = 0.3
-) -> StarCatalog:
+) -> catalog.StarCatalog:
     """
     The bundled catalog, and stars below it about an axis (3,), sorted by magnitude.
 
     ``spread`` is the 1-sigma of the logarithm of the density: the densest tenth of the sky has
     three times the mean, the emptiest a third.
     """
-    depth = np.linspace(BUNDLED_MAGNITUDE, faintest, 500)
+    depth = np.linspace(catalog.BUNDLED_MAGNITUDE, faintest, 500)
     area_deg2 = 2 * math.pi * (1.0 - math.cos(radius_rad)) * math.degrees(1.0) ** 2
     number = area_deg2 * 10 ** log10_density(depth) * math.exp(spread * rng.normal())
     count = rng.poisson(number[-1] - number[0])
     magnitude = np.interp(rng.uniform(number[0], number[-1], count), number, depth)
     direction = disc(axis, count, radius_rad, rng)
     motion = rng.normal(0.0, 1e-3 * _MOTION_MAS * ARCSECOND_RAD, (count, 2))
-    bundled, ra_rad = load_catalog(), np.arctan2(direction[:, 1], direction[:, 0])
+    bundled, ra_rad = catalog.load_catalog(), np.arctan2(direction[:, 1], direction[:, 0])
     drawn = {
         'id': np.arange(count) + 1,
         'ra_rad': ra_rad % (2 * math.pi),
@@ -60,7 +54,7 @@ def deep_sky(
         'parallax_rad': np.zeros(count),
         'magnitude': magnitude,
         'colour_bp_rp': rng.normal(1.0, 0.3, count),
-        'motion_source': np.full(count, MotionSource.GAIA, np.uint8),
+        'motion_source': np.full(count, catalog.MotionSource.GAIA, np.uint8),
         'close_pair': np.zeros(count, np.bool_),
     }
     columns = {name: np.concatenate([getattr(bundled, name), drawn[name]]) for name in drawn}
@@ -80,9 +74,9 @@ def disc(axis: Floats, count: int, radius_rad: float, rng: np.random.Generator) 
     return np.asarray(turn.apply(local))
 
 
-def archive_table(sky: StarCatalog, axis: Floats, radius_rad: float) -> str:
+def archive_table(sky: catalog.StarCatalog, axis: Floats, radius_rad: float) -> str:
     """CSV with the stars about an axis (3,) that have a number, as the Gaia archive writes it."""
-    stars = sky.select(cone(sky, axis, radius_rad))
+    stars = sky.select(catalog.cone(sky, axis, radius_rad))
     stars = stars.select(stars.id > 0)
     mas_rad = 1e-3 * ARCSECOND_RAD
     columns = (

@@ -23,13 +23,8 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.outputs import check_outputs
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
+from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
-from starcal_ground.simulation.scenario import (
-    attitude_samples,
-    MOUNTING_SIGMA_RAD,
-    Scenario,
-    scenes,
-)
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -131,11 +126,11 @@ class SimulatedBag:
     camera: Path
 
 
-def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
+def truth_content(scenario: synthetic.Scenario, bag_name: str) -> dict[str, object]:
     """Content of the truth file of a bag, a JSON object."""
     true, prior = scenario.truth, scenario.prior
     stars = stars_above = 0
-    for shown in scenes(scenario):
+    for shown in synthetic.scenes(scenario):
         _, snr, _ = centroids.scene_bound(scenario, shown)
         stars += len(snr)
         stars_above += int((snr > centroids.BOUND_SNR).sum())
@@ -176,9 +171,8 @@ def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
 
 
 def write_bag(
-    scenario: Scenario,
+    scenario: synthetic.Scenario,
     path: Path,
-    camera_url: str = '',
     on_image: Callable[[int], None] = lambda index: None,
     mistakes: Mistakes = NO_MISTAKES,
 ) -> SimulatedBag:
@@ -191,8 +185,6 @@ def write_bag(
 
     Parameters
     ----------
-    camera_url : str
-        URL of the prior camera in the parameter file; default: a ``file://`` URL.
     on_image : callable
         Called with the index of each image written.
     mistakes : Mistakes
@@ -211,12 +203,12 @@ def write_bag(
     scenario = dataclasses.replace(
         scenario, prior=mistakes.prior(scenario.prior), turn_rad=(0.0, turn_rad, 0.0)
     )
-    content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
+    content = parameters(scenario, f'file://{camera.resolve()}')
     if scenario.table is not None:
         content['/**']['ros__parameters'] |= {
             'catalog': str(table.resolve().with_suffix('.npz')),
             'magnitude_limit': scenario.magnitude_limit,
-            'prior_alignment_sigma_deg': math.degrees(MOUNTING_SIGMA_RAD),
+            'prior_alignment_sigma_deg': math.degrees(synthetic.MOUNTING_SIGMA_RAD),
         }
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
     true = truth_content(scenario, writer.file.name)
@@ -225,7 +217,7 @@ def write_bag(
     truth_text = json.dumps(true, indent=1) + '\n'
     with writer:
         for index, image in enumerate(images(scenario)):
-            samples = attitude_samples(scenario, index)
+            samples = synthetic.attitude_samples(scenario, index)
             for sample in (s for s in samples if s.time_ns <= image.time_ns):
                 _write_telemetry(writer, sample, mistakes)
             writer.write_image(IMAGE_TOPIC, mistakes.image(image), 'camera')
@@ -249,7 +241,9 @@ def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistak
     writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
 
 
-def parameters(scenario: Scenario, camera_url: str) -> dict[str, dict[str, dict[str, Any]]]:
+def parameters(
+    scenario: synthetic.Scenario, camera_url: str
+) -> dict[str, dict[str, dict[str, Any]]]:
     """Content of the ROS parameter file with the prior of a scenario."""
     values = {
         'camera_info_url': camera_url,

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-from xml.etree import ElementTree
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
@@ -29,7 +28,7 @@ from starcal_ros.errors import StarcalError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.records import CameraGeometry
 from studies import __main__ as studies
-from studies import monte_carlo, study_figures, trials
+from studies import monte_carlo, trials
 from studies.monte_carlo import Design, Row, StudyResult
 from studies.workers import run_each
 
@@ -40,7 +39,6 @@ METHODS = ('per_image', 'single', 'hierarchical')
 ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
 SMALL = {
     'table1': {'trials': 2, 'images': (4,), 'stars': (20, 30), 'tracker_arcsec': (0.0, 20.0)},
-    'images': {'trials': 2, 'images': (2, 5), 'stars': (30,)},
     'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},
 }
 each_study = pytest.mark.parametrize('study', SMALL)
@@ -154,7 +152,7 @@ def test_a_trial_hangs_on_nothing_but_seed_study_and_number() -> None:
 
 
 @each_study
-def test_results_and_figure(study: str) -> None:
+def test_results_and_their_table(study: str) -> None:
     found = here(small(study))
     content = json.loads(monte_carlo.content(found, 'starcal 0'))
     assert content['study'] == study and content['parameters']['trials'] == found.design.trials
@@ -162,9 +160,7 @@ def test_results_and_figure(study: str) -> None:
     assert len(content['summary']) == len(found.summary)
     header, rows = monte_carlo.table(found)
     assert len(rows) == len(found.summary) and {len(row) for row in rows} == {len(header)}
-    drawn = study_figures.svg(found)
-    ElementTree.fromstring(drawn)
-    assert 'nan' not in drawn and all(method in drawn for method in found.design.methods)
+    assert {row['method'] for row in found.summary} == {*found.design.methods}
 
 
 def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
@@ -239,15 +235,6 @@ def test_a_prior_far_off_leads_to_the_same_minimum(method: str, outlier_share: f
         assert int((far.kept & wild).sum()) <= 1
 
 
-def test_unused_images_fit_better_the_more_are_used() -> None:
-    found = here(Design('images', 10, (2, 15), (80,), (20.0,), ('per_image',), unused=20))
-    few, many = (float(only(found.summary, images=m)['unused_to_true']) for m in (2, 15))
-    # 8 parameters from 2 n residuals add 8 / 2n to the variance, here 0.2 % to the rms at 15
-    # images and 1.3 % at two; a map weighs the corners more than the stars do.
-    assert 1.005 < few < 1.03
-    assert 1.0 < many < 1.005
-
-
 def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
     field = trials.draw_star_field(np.random.default_rng(1), 3, 20)
     N = trials.information_blocks(field)
@@ -306,7 +293,7 @@ def test_map_error_leaves_out_a_common_turn() -> None:
 
 
 def test_one_trial_and_unsolvable_cells_are_taken() -> None:
-    design = Design('images', 1, (2, 4), (4,), (20.0,), ('per_image',))
+    design = Design('coverage', 1, (2, 4), (4,), (20.0,), ('per_image',))
     found = here(design)
     # Eight stars are under the ten that a calibration takes.
     assert [row['images'] for row in found.rows] == [4]

@@ -53,7 +53,7 @@ ELSEWHERE = {
     *('kalibr_calibrate_imu_camera', 'target.yaml', '--scale-low', '--scale-high'),
 }
 # Hypothetical files of a user, and modules that were rejected.
-NOT_OURS = {'rotation.py', 'env.sh', 'STUDY.json', 'STUDY.svg', '00000012.mcap'}
+NOT_OURS = {'rotation.py', 'env.sh', 'STUDY.json', '00000012.mcap'}
 SUFFIXES = (
     *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'png'),
     *('sh', 'sqlite', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),

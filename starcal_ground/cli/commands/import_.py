@@ -3,16 +3,14 @@
 Make a bag from images and attitudes in the formats of a mission.
 
 Images are FITS (also tiled, scaled or floating point), TIFF or PNG. Attitudes of one or more star
-trackers are CCSDS AEM, CSV, SPICE CK with SCLK and LSK, or the WCS of a program such as
-astrometry.net. Velocities are CCSDS OEM, CSV or SPK. Times in UTC, TAI, TT, TDB and GPS are
-converted to UTC. With --camera it also writes a parameter file to calibrate the bag.
+trackers are CCSDS AEM, CSV, or SPICE CK with SCLK and LSK. Velocities are CCSDS OEM, CSV or SPK.
+Times in UTC, TAI, TT, TDB and GPS are converted to UTC. With --camera it also writes a parameter
+file to calibrate the bag.
 
   # FITS and an attitude ephemeris
   starcal import --images 'night/*.fits' --attitude attitude.aem -o bag --camera prior.yaml
   # SPICE kernels for attitude and velocity
   starcal import --images 'night/*.fits' --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
-  # FITS solved by astrometry.net, which writes NAME.wcs for NAME.fits
-  starcal import --images 'night/*.fits' --attitude 'night/*.wcs' -o bag --camera prior.yaml
   # PNG with a table of times and one of attitudes
   starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag
 """
@@ -32,11 +30,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     what = 'image files; a pattern in quotes is expanded here'
     add('--images', nargs='+', required=True, metavar='FILE', help=what)
-    what = (
-        'AEM, CSV, SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK), or FITS with the'
-        ' WCS of each image: the images, or files with the same names'
-    )
-    add('--attitude', nargs='+', required=True, metavar='FILE', help=what)
+    what = 'AEM, CSV, or SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK)'
+    add('--attitude', nargs='+', type=Path, required=True, metavar='FILE', help=what)
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
     add('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
     what = 'bag folder or .mcap file to write'
@@ -87,8 +82,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.camera:  # the images take their time
         read_camera_info(args.camera)
-    paths, solved = _expanded(args.images), _expanded(args.attitude, '--attitude')
-    inputs = [args.times, args.camera, *solved, *(args.velocity or ())]
+    paths = _expanded(args.images)
+    inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
     with Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
         if args.times:
@@ -101,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
             return arguments.EXIT_BAD_INPUT
         stamps = [file.time_ns for file in files]
         attitudes, *others = (
-            guard.call(_names(solved), sources.attitudes, solved, frame, stamps, files)
+            guard.call(_names(args.attitude), sources.attitudes, args.attitude, frame, stamps)
             for frame in (args.star_tracker, *args.more_star_trackers)
         )
         further = dict(
@@ -126,12 +121,12 @@ def _names(paths: Sequence[Path]) -> str:
     return ', '.join(map(str, paths))
 
 
-def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
+def _expanded(patterns: Sequence[str]) -> list[Path]:
     """Files of patterns, each once, in order of their names."""
     files: dict[Path, None] = {}
     for pattern in patterns:
         names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
         if not names:
-            raise OptionError(f'{option}: no file matches {pattern}')
+            raise OptionError(f'--images: no file matches {pattern}')
         files |= dict.fromkeys(map(Path, names))
     return list(files)

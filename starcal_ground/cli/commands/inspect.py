@@ -24,14 +24,7 @@ from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import (
-    print_table,
-    print_text,
-    print_verdict,
-    print_wrapped,
-    progress_bar,
-)
+from starcal_ground.cli import arguments, terminal
 from starcal_ros.constants import utc_text
 from starcal_ros.errors import BagError, NotFromStars, OptionError
 from starcal_ros.text import significant
@@ -72,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
             bags, topics, setup = first.bags, first.topics, first.setup
             through_air = first.through_air
         total = max((t.count for t in reader.topics(bags) if t.type_name in kinds), default=0)
-        with progress_bar(total, 'images') as advance:
+        with terminal.progress_bar(total, 'images') as advance:
             inspection = inspect.inspect(bags, topics, setup, advance, through_air, problem)
     arguments.print_notes(inspection.notes)
     if args.json:
@@ -87,7 +80,7 @@ def _print(inspection: Inspection) -> None:
     from starcal_ground.report import verdict
     from starcal_ros.records import ALIGNMENT_NAMES
 
-    print_table(
+    terminal.print_table(
         ('topic', 'type', 'messages', 'rate', 'longest gap'),
         [
             (
@@ -102,13 +95,13 @@ def _print(inspection: Inspection) -> None:
         left=2,
     )
     for topic in inspection.topics:
-        print_wrapped(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
+        terminal.print_wrapped(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
     for text in inspection.damage:
-        print_text(f'damage: {text}')
+        terminal.print_text(f'damage: {text}')
     if inspection.images:
         _print_images(inspection)
     if inspection.status is not None:
-        print_table(
+        terminal.print_table(
             ('predicted', '1-sigma'),
             [
                 (name, verdict.sigma_text(name, value))
@@ -121,11 +114,11 @@ def _print(inspection: Inspection) -> None:
             ],
         )
     if inspection.problems:
-        print_verdict(False, 'cannot be calibrated: ' + '; '.join(inspection.problems))
+        terminal.print_verdict(False, 'cannot be calibrated: ' + '; '.join(inspection.problems))
     elif inspection.by_stars:
-        print_verdict(True, 'can be calibrated: the camera alone, without attitudes')
+        terminal.print_verdict(True, 'can be calibrated: the camera alone, without attitudes')
     else:
-        print_verdict(True, 'can be calibrated')
+        terminal.print_verdict(True, 'can be calibrated')
 
 
 def _print_images(inspection: Inspection) -> None:
@@ -133,20 +126,22 @@ def _print_images(inspection: Inspection) -> None:
     chosen = inspection.chosen
     assert chosen is not None  # images come from a chosen topic
     attitudes = ', '.join(filter(None, (chosen.attitude, *chosen.more_attitudes)))
-    print_wrapped(
+    terminal.print_wrapped(
         f'{inspection.images - bad} of {inspection.images} images of '
         f'{chosen.image or chosen.observations} can be used'
         + (f', with the attitudes of {attitudes}' if attitudes else '')
     )
     if math.isfinite(inspection.longest_attitude_gap_s):
         gap_s = significant(inspection.longest_attitude_gap_s, 3)
-        print_text(f'longest attitude gap around an image: {gap_s} s')
+        terminal.print_text(f'longest attitude gap around an image: {gap_s} s')
     for group in inspection.refused:
         first = f'first {_clock(group.first_ns)}: {group.detail}'
-        print_wrapped(f'{group.count} refused as {group.reason}: {group.meaning}; {first}')
+        terminal.print_wrapped(
+            f'{group.count} refused as {group.reason}: {group.meaning}; {first}'
+        )
     if inspection.stars_per_image:
         stars = inspection.stars_per_image
-        print_wrapped(
+        terminal.print_wrapped(
             f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
             f'refused: {_counted(inspection.refused_stars)}'
         )

@@ -43,10 +43,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         'in its path are replaced'
     )
     add('--params', default='', metavar='FILE', help=what)
-    what = (
-        "names of spacecraft and cameras: a pattern, e.g. '{spacecraft}/{camera}/*.mcap', or a "
-        'CSV file with columns path, spacecraft, camera, params'
-    )
+    what = "pattern with the names of spacecraft and cameras, e.g. '{spacecraft}/{camera}/*.mcap'"
     add('--cameras', default='', metavar='PATTERN', help=what)
     what = 'write the table as trend.parquet too, for other tools'
     add('--parquet', action='store_true', help=what)

@@ -29,7 +29,7 @@ from starcal_ground.images.time_systems import from_text, system_of
 from starcal_ground.mission.ingest import mission_records
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import errors_as, IngestError
 from starcal_ros.sky.astrometry import tt_julian_date
 
 _KM = 1000.0
@@ -64,7 +64,7 @@ def read_aem(path: Path, star_tracker: str = '') -> mission_records.Attitudes:
     that cannot be converted.
     """
     segments = read_segments(path, 'AEM')
-    with mission_records.naming(path):
+    with errors_as(IngestError, path):
         bodies = dict.fromkeys(_frames(segment)[1] for segment in segments)
         chosen = star_tracker.upper() or next(iter(bodies))
         if chosen not in bodies or (len(bodies) > 1 and not star_tracker):
@@ -101,7 +101,7 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
     from scipy.interpolate import CubicHermiteSpline  # a fifth of the start of a short command
 
     segments = read_segments(path, 'OEM')
-    with mission_records.naming(path):
+    with errors_as(IngestError, path):
         at = np.array(at_ns, np.int64)
         velocities = np.full((len(at), 3), np.nan)
         notes: list[str] = []

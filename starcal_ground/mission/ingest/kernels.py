@@ -18,10 +18,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.ingest import mission_records
-from starcal_ground.mission.ingest.mission_records import Attitudes, naming, Velocities
+from starcal_ground.mission.ingest.mission_records import Attitudes, Velocities
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import IngestError, needing
+from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.untrusted import read_bytes
 
 _TEXT = b'KPL/'
@@ -53,7 +53,7 @@ def read_ck(paths: Sequence[Path], frame: str, at_ns: Sequence[int]) -> Attitude
     """
     stamps: list[int] = []
     quaternions: list[Floats] = []
-    with naming(_names(paths)), loaded(paths) as spice:
+    with errors_as(IngestError, _names(paths)), loaded(paths) as spice:
         if not frame:
             raise ValueError('name the star tracker frame of the CK with --star-tracker')
         for time_ns in sorted({t + beside for t in at_ns for beside in _BESIDE_NS}):
@@ -77,7 +77,7 @@ def read_spk(paths: Sequence[Path], body: str, at_ns: Sequence[int]) -> Velociti
     covered.
     """
     velocities = []
-    with naming(_names(paths)), loaded(paths) as spice:
+    with errors_as(IngestError, _names(paths)), loaded(paths) as spice:
         if not body:
             raise ValueError('name the spacecraft of the SPK with --spacecraft')
         for time_ns in at_ns:
@@ -143,7 +143,7 @@ def _text_of(path: Path) -> bytes:
     start = mission_records.start_of(path)
     if not start.startswith(_MAGIC):
         raise IngestError(f'{path}: not a SPICE kernel: it begins with none of KPL/, DAF/, DAS/')
-    with naming(path):
+    with errors_as(IngestError, path):
         return read_bytes(path, _TEXT_BYTES) if start.startswith(_TEXT) else b''
 
 

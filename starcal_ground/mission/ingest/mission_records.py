@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator
-import contextlib
 import csv
 from dataclasses import dataclass
 import functools
@@ -32,7 +31,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcal_ground.images.time_systems import from_text, SYSTEMS, TimeError, to_utc_ns
+from starcal_ground.images.time_systems import from_text, SYSTEMS, to_utc_ns
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.errors import errors_as, IngestError, StarcalError
 from starcal_ros.processes import ChildProcess, ProcessEnded
@@ -63,17 +62,11 @@ class Attitudes:
     icrf_from_star_tracker_xyzw : (n, 4)
     notes : tuple of str
         What a reader of the bag must know of them, one line each.
-    by_stars : bool
-        The star tracker is the camera itself, and the attitudes are by its own stars.
-    rows_upward : bool
-        The attitudes are for FITS images with the order of their rows reversed.
     """
 
     time_ns: NDArray[np.int64]
     icrf_from_star_tracker_xyzw: Floats
     notes: tuple[str, ...] = ()
-    by_stars: bool = False
-    rows_upward: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,25 +78,15 @@ class Velocities:
     notes: tuple[str, ...] = ()
 
 
-@contextlib.contextmanager
-def naming(where: object) -> Iterator[None]:
-    """Raise IngestError naming a file, for what its reader raises about its content."""
-    try:
-        with errors_as(IngestError, where):
-            yield
-    except TimeError as error:
-        raise IngestError(f'{where}: {error}') from error
-
-
 def text_of(path: Path) -> str:
     """Text of a file in UTF-8; raises IngestError when it cannot be read or is too large."""
-    with naming(path):
+    with errors_as(IngestError, path):
         return read_text(path, _TEXT_BYTES).removeprefix('\ufeff')  # byte-order mark
 
 
 def start_of(path: Path) -> bytes:
     """First 2 kB of a regular file, by which its format is known; raises as `text_of`."""
-    with naming(path), regular_file(path) as file:
+    with errors_as(IngestError, path), regular_file(path) as file:
         return file.read(_START_BYTES)
 
 
@@ -149,7 +132,7 @@ _VELOCITY = ('vx_m_s', 'vy_m_s', 'vz_m_s')
 def read_attitudes(path: Path) -> Attitudes:
     """Attitudes of a CSV file; raises IngestError naming the line that is wrong."""
     stamps, quaternions = _stamps_and_numbers(path, _QUATERNION)
-    with naming(path):
+    with errors_as(IngestError, path):
         return in_order(stamps, quaternions)
 
 
@@ -192,7 +175,7 @@ def _rows(
             yield _stamp(row), read(row)
     except csv.Error as error:
         raise IngestError(f'{path}: not a table of text: {error}') from error
-    except (TimeError, ValueError) as error:
+    except ValueError as error:
         raise IngestError(f'{path} line {number}: {error}') from error
 
 

@@ -21,12 +21,10 @@ import yaml
 from starcal_ground import outputs
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import photographs
-from starcal_ground.images.from_stars import options_of
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.files import same_as_one_of
-from starcal_ros.formats.image_files import is_fits
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Image
@@ -158,9 +156,7 @@ def write_bag(
     }
     prior_files = {}
     if prior is not None:
-        prior_files = _prior_files(
-            prior, params, copied, files, scale, attitudes.by_stars, tuple(others)
-        )
+        prior_files = _prior_files(prior, params, copied, files, scale, tuple(others))
     with writer:
         trackers = {ATTITUDE_TOPIC: attitudes}
         trackers |= {f'/{frame}/attitude': one for frame, one in others.items()}
@@ -246,7 +242,6 @@ def _write_messages(
 ) -> None:
     """Write images and telemetry in order of time; at one stamp the attitude is first."""
     messages: list[Iterable[tuple[int, int, Any]]] = [((file.time_ns, 2, file) for file in files)]
-    rows_upward = any(attitudes.rows_upward for attitudes in trackers.values())
     for topic, attitudes in trackers.items():
         near = _near(attitudes, files)
         to_topic = zip(repeat(topic), near.icrf_from_star_tracker_xyzw)
@@ -265,8 +260,6 @@ def _write_messages(
                 )
             wanted = _options_of(content.path, options)
             pixels = guard.call(content.path, photographs.pixels_of, content.path, wanted, scale)
-            if rows_upward and is_fits(content.path):
-                pixels = pixels[::-1]
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
             on_image()
         else:
@@ -279,7 +272,6 @@ def _prior_files(
     copied: Path,
     files: Sequence[photographs.ImageFile],
     scale: photographs.Scale,
-    by_stars: bool,
     others: Sequence[str],
 ) -> dict[Path, str]:
     """Texts of the parameter file and of the copy of the prior camera."""
@@ -295,8 +287,6 @@ def _prior_files(
         'star_tracker_frame': 'star_tracker',
         'camera_frame': 'camera',
     }
-    if by_stars:
-        values = options_of({**values, 'prior_alignment': [0.0, 0.0, 0.0, 1.0]})
     if others:
         values['more_star_trackers'] = list(others)
         values['more_alignments'] = list(prior.alignments_xyzw[4:])

@@ -3,18 +3,16 @@
 The tasks of a fleet: found below a root, answered where their files are, counted into the table.
 
 A task is a calibration to read or a bag to calibrate.  Its answer is made in this process or by a
-worker of Dask: a row, or the key of the one that the table has.
+worker of Dask.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 import contextlib
-import csv
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import errno
-import fnmatch
 import functools
 import hashlib
 import itertools
@@ -51,8 +49,6 @@ KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
-_COLUMNS = ('path', *_KEYS, 'params')
-_MOST_BYTES = 8 * 2**20
 _TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
 _NO_ANSWER = (errno.EIO, errno.ETIMEDOUT)  # of a store; other errors are answers
@@ -89,9 +85,7 @@ class Task:
     settings : tuple of str
         Files that decide about the result of a bag as well.
     spacecraft, camera : str
-        From the table or the pattern of cameras; empty: from the metadata of the bag.
-    known : tuple of str
-        Keys in the table of which one may be that of this content.
+        From the pattern of cameras; empty: from the metadata of the bag.
     """
 
     url: str
@@ -103,7 +97,6 @@ class Task:
     settings: tuple[str, ...] = ()
     spacecraft: str = ''
     camera: str = ''
-    known: tuple[str, ...] = ()
 
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
@@ -219,100 +212,61 @@ class Cameras:
     ----------
     pattern : regular expression or None
         Of the start of a path, with groups for spacecraft and camera.
-    table : tuple of mappings
-        Rows of a table with the columns path (a pattern of shell), spacecraft, camera and params;
-        the first that matches counts.
     params : str
         Parameter file, in which ``{spacecraft}`` and ``{camera}`` are replaced; may be empty.
     """
 
     pattern: re.Pattern[str] | None = None
-    table: tuple[Mapping[str, str], ...] = field(default=(), repr=False)
     params: str = ''
 
     def of(self, name: str) -> tuple[str, str]:
         """Spacecraft and camera of a path below the root, empty if nothing names them."""
-        names = self._row(name)
-        if self.pattern and (match := self.pattern.match(name)):
-            names = {**match.groupdict(), **names}
+        match = self.pattern.match(name) if self.pattern else None
+        names = match.groupdict() if match else {}
         return names.get(_KEYS[0], ''), names.get(_KEYS[1], '')
 
     def params_of(self, name: str) -> str:
         """Absolute path of the parameters of a bag; empty if there are none."""
-        own = self._row(name).get('params', '')
-        if own or not self.params:
-            return own
+        if not self.params:
+            return ''
         spacecraft, camera = self.of(name)
         text = self.params.replace('{spacecraft}', spacecraft).replace('{camera}', camera)
         return os.path.abspath(text)
 
-    def _row(self, name: str) -> Mapping[str, str]:
-        return next((row for row in self.table if fnmatch.fnmatchcase(name, row['path'])), {})
 
-
-def read_cameras(text: str, params: str) -> Cameras:
+def read_cameras(pattern: str, params: str) -> Cameras:
     """
-    Cameras by a pattern such as ``{spacecraft}/{camera}/*.mcap``, or by the path of a CSV table.
+    Cameras by a pattern such as ``{spacecraft}/{camera}/*.mcap``, empty for none.
 
-    Raises StarcalError in one line, for a pattern without a name or a table that cannot be read.
+    The expression is of the start of a path, up to the segment of the last name.  Raises
+    OptionError in one line, for a pattern without a name.
     """
-    if '{' in text:
-        return Cameras(pattern=_compiled(text), params=params)
-    return Cameras(table=_rows(Path(text)) if text else (), params=params)
-
-
-def _compiled(pattern: str) -> re.Pattern[str]:
-    """Expression for the start of a path, up to the segment of the last name."""
-    start = pattern[: pattern.rindex('}') + 1] if '}' in pattern else pattern
+    if not pattern:
+        return Cameras(params=params)
+    start = pattern[: pattern.rfind('}') + 1]
     start += pattern[len(start) :].partition('/')[0]
     expression, names = '', []
     for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
         if other or (name and name not in _KEYS) or name in names:
-            raise OptionError(
-                f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and'
-                ' {camera}'
-            )
+            break
         names += [name] if name else []
         expression += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
-    return re.compile(f'{expression}(?:/|$)')
-
-
-def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
-    text = product_files.read_text(path, _MOST_BYTES)
-    rows = csv.DictReader(text.splitlines(), restval='')
-    if 'path' not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= {*_COLUMNS}:
-        raise OptionError(f'{path}: the first line does not name columns of {", ".join(_COLUMNS)}')
-    cameras = []
-    for row in rows:
-        if None in row:
-            raise OptionError(f'{path}:{rows.line_num}: more values than columns')
-        values = {name: value.strip() for name, value in row.items() if value.strip()}
-        if 'path' not in values:
-            raise OptionError(f'{path}:{rows.line_num}: no path')
-        if 'params' in values:
-            values['params'] = os.path.abspath(path.parent / values['params'])
-        cameras.append(values)
-    return tuple(cameras)
+    else:
+        if names:
+            return Cameras(re.compile(f'{expression}(?:/|$)'), params)
+    raise OptionError(
+        f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and {{camera}}'
+    )
 
 
 @dataclass(frozen=True)
 class Answer:
     """
-    The answer to a task.
+    The row that a task gives, None where none is due, and ``calibration.json`` of a bag.
 
-    Attributes
-    ----------
-    key : str
-        Of the row that the table has; empty where none is due.
-    row : Row or None
-        New row.
-    calibration : str
-        Content of ``calibration.json`` of a bag.
-    is_silence : bool
-        True if the store of the file did not answer.
+    ``is_silence`` is True if the store of the file did not answer.
     """
 
-    key: str = ''
     row: trend_table.Row | None = None
     calibration: str = ''
     is_silence: bool = False
@@ -361,17 +315,10 @@ def _answer(task: Task, path: Path) -> Answer:
         # By content: a copy counts once, a tree may move, and what is repaired is another task.
         files = reader.files_of_bags([path]) if task.is_bag else (path,)
         key = digest((*files, *settings), version)
-        if key in task.known:
-            return Answer(key)
         if not task.is_bag:
             made, temperature = _recorded(path)
-            return Answer(
-                key,
-                _of_task(
-                    trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature),
-                    task,
-                ),
-            )
+            row = trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature)
+            return Answer(_of_task(row, task))
         setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
         campaign = calibrate_bags([path], setup, Topics())
         made, records = campaign.calibration, campaign.observations
@@ -379,7 +326,7 @@ def _answer(task: Task, path: Path) -> Answer:
             made, key, task.url, trend_table.COMPUTED, _mean_temperature(records)
         )
         text = product_files.calibration_text(made)
-        return Answer(key, _of_task(row, task, path), text)
+        return Answer(_of_task(row, task, path), text)
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
@@ -394,7 +341,6 @@ def _of_task(row: trend_table.Row, task: Task, bag: Path = Path()) -> trend_tabl
     return dataclasses.replace(
         row,
         stamp=task.stamp,
-        size_bytes=max(task.size, 0),
         spacecraft=task.spacecraft or names.get('spacecraft', ''),
         camera=task.camera or names.get('camera', ''),
     )
@@ -476,8 +422,8 @@ class Done:
         """Put an answer into the table, and count it."""
         row = answer.row
         if row is None or table.has(row):
-            table.add_seen(task.stamp, answer.key)
-            self.known += bool(answer.key)
+            table.add_seen(task.stamp, row.key if row else '')
+            self.known += row is not None
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
@@ -541,8 +487,6 @@ def _not_known(
         if key is not None:
             done.known += bool(key)
             continue
-        likely = table.likely(task.size, task.spacecraft, task.camera)
-        task = dataclasses.replace(task, known=likely)
         if is_again:
             again.append(task)
         else:

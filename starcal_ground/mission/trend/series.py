@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from starcal_ground.mission.trend.trend_table import COMPUTED, Row
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight, movement
 from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
@@ -402,9 +402,7 @@ def _images(row: Row) -> tuple[int, int]:
     return row.first_ns, row.last_ns
 
 
-_ALIKE = 0.1  # largest difference to another camera, as a fraction of the step to it
 _OPEN = 'too few to tell'
-_SIGMAS = 5.0  # with ten parameters of a thousand cameras, chance does not reach it
 
 
 @dataclass(frozen=True)
@@ -412,32 +410,13 @@ class Overview:
     """
     A camera as a line among others.
 
-    Attributes
-    ----------
-    name : str
-    kinds : tuple of str
-        Kinds of its terms; temperature asks for nothing to be done.
-    is_stable : bool or None
-        False if the newest calibration differs from the active one; None if too few tell.
-    after : int
-        Index of the calibration before its most significant step; -1 without a step.
-    time_ns : int array (n,)
-    values : array (n, p)
-        Camera parameters of its n calibrations, those of the alignment left out.
-    sigma : array (p,)
-        Of the calibration after the step.
-    model : tuple
-        Lens model and image size; only cameras with the same are compared.
+    ``kinds`` are those of its terms; temperature asks for nothing to be done.  ``is_stable`` is
+    False if the newest calibration differs from the active one; None if too few tell.
     """
 
     name: str
-    kinds: tuple[str, ...]
+    kinds: frozenset[str]
     is_stable: bool | None
-    after: int
-    time_ns: Indices
-    values: Floats
-    sigma: Floats
-    model: tuple[str, int, int]
 
     @property
     def needs_attention(self) -> bool:
@@ -447,45 +426,12 @@ class Overview:
     @property
     def verdict(self) -> str:
         """Stepped, drifting, changed since the active calibration; too few to tell; or sound."""
-        words = {'step': 'stepped', 'drift': 'drifting'}
-        reasons = [words[kind] for kind in self.kinds if kind in words]
+        words = {'drift': 'drifting', 'step': 'stepped'}
+        reasons = [word for kind, word in words.items() if kind in self.kinds]
         reasons += ['changed'] if self.is_stable is False else []
         return ', '.join(reasons) or (_OPEN if self.is_stable is None else 'sound')
 
 
-def overview_of(
-    name: str, rows: Sequence[Row], shown: Sequence[Series], is_stable: bool | None
-) -> Overview:
-    """Overview of the different calibrations of a camera, in order of time."""
-    terms = findings(shown)
-    steps = [(abs(t.size) / t.sigma, one.row[t.after]) for one, t in terms if t.kind == 'step']
-    after = max(steps)[1] if steps else -1
-    return Overview(
-        name=name,
-        kinds=tuple(sorted({term.kind for _, term in terms})),
-        is_stable=is_stable,
-        after=after,
-        time_ns=np.array([row.time_ns for row in rows], np.int64),
-        values=np.array([row.values for row in rows], np.float64),
-        sigma=np.array(rows[after + 1].sigmas[: len(rows[0].names)], np.float64),
-        model=(rows[0].lens_model, rows[0].width, rows[0].height),
-    )
-
-
-def swapped_with(one: Overview, cameras: Sequence[Overview]) -> str:
-    """
-    Name of the camera whose parameters a camera has since its step; empty if there is none.
-
-    Compared is the newest calibration of the other camera before the step, since the other one
-    may have been swapped at the same time.
-    """
-    if one.after < 0:
-        return ''
-    before, after = one.values[one.after], one.values[one.after + 1]
-    sigma = np.where(one.sigma > 0, one.sigma, np.inf)
-    distances = [(max(_SIGMAS, _ALIKE * float(np.max(np.abs(after - before) / sigma))), '')]
-    for other in cameras:
-        k = int(np.searchsorted(other.time_ns, one.time_ns[one.after], 'right')) - 1
-        if other is not one and other.model == one.model and k >= 0:
-            distances.append((float(np.max(np.abs(after - other.values[k]) / sigma)), other.name))
-    return min(distances)[1]
+def overview_of(name: str, shown: Sequence[Series], is_stable: bool | None) -> Overview:
+    """Overview of a camera with these series."""
+    return Overview(name, frozenset(term.kind for _, term in findings(shown)), is_stable)

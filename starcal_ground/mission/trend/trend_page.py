@@ -80,13 +80,11 @@ def write_page(
             times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, one], key=_order)[:_DRAWN]
     lines.sort(key=lambda line: not line[0].needs_attention)
-    overviews = [overview for overview, _ in lines]
-    swaps = {one.name: trends.swapped_with(one, overviews) for one in overviews}
     text = page_template('trend.html').render(
         root=printable(root),
-        lines=[(o, swaps[o.name], *line) for o, line in lines] if len(lines) > 1 else (),
-        attention=sum(one.needs_attention for one in overviews),
-        cameras=[_camera(one, swaps[one.overview.name]) for one in drawn],
+        lines=[(overview, *line) for overview, line in lines] if len(lines) > 1 else (),
+        attention=sum(overview.needs_attention for overview, _ in lines),
+        cameras=[_camera(one) for one in drawn],
         failures=[(row.path, row.error) for row in failures],
         failure_count=failed,
         count=count,
@@ -115,11 +113,11 @@ def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
     is_stable, verdict = verdict_of(rows, group, active, new, shown)
     px = new[-1].line_of_sight_px if new else math.nan
     line = (len(rows), utc_text(rows[-1].time_ns)[:10], px, verdict[1])
-    return _Judged(trends.overview_of(name, rows, shown, is_stable), group, shown, line)
+    return _Judged(trends.overview_of(name, shown, is_stable), group, shown, line)
 
 
 @np.errstate(all='ignore')
-def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
+def _camera(judged: _Judged) -> dict[str, object]:
     """The part of the page on one camera."""
     group, shown = judged.group, judged.shown
     rows = trends.newest_of_each(group)
@@ -131,10 +129,7 @@ def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
     return {
         'name': judged.overview.name,
         'headline': _HEADLINES[is_stable],
-        'verdict': (
-            *verdict,
-            f'Since its step it has the parameters of {swapped}.' * bool(swapped),
-        ),
+        'verdict': verdict,
         'rows': rows,
         'findings': [_finding(one, term, rows) for one, term in trends.findings(shown)],
         'charts': charts,

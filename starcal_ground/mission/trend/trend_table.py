@@ -35,7 +35,7 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import replacing
-from starcal_ros.record_fields import check_shape, Count, Finite, json_object, read_record, Stamp
+from starcal_ros.record_fields import check_shape, Finite, json_object, read_record, Stamp
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable
 from starcal_ros.text import printable
 from starcal_ros.untrusted import check_text, json_value, regular_file
@@ -54,34 +54,13 @@ class Row:
 
     Raises ValueError in one line, for a row that the page could not show.
 
-    Attributes
-    ----------
-    key : str
-        Digest of what the row was made from.
-    path, kind, error : str
-        Source; ``recorded`` (read from a file), ``computed`` (from a bag by this version) or
-        ``failed`` with its error.
-    software : str
-        That made the calibration, or that failed to.
-    time_ns, first_ns, last_ns : int
-        Middle, first and last image.
-    active_since_ns : int
-        0 where it was not activated.
-    residual_rms_px, temperature_degc : float
-        NaN where not known.
-    names : tuple of str
-        Camera parameters; ``sigmas`` has the three alignment angles (rad) too.
-    values, sigmas, star_tracker_from_camera_xyzw : tuple of float
-    boresight_sigma_arcsec : tuple of float
-        About the x and the y axis of the camera, of the middle of the detector, in the star
-        tracker frame.
-    spacecraft, camera : str
-        Empty where nothing names them.
-    stamp : str
-        Digest of name, size and time, or etag, of the file when it was read.
-    size_bytes : int
-    is_passing : bool
-        A failure that may pass: the file could not be reached.
+    ``key`` is the digest of what the row was made from, ``stamp`` that of name, size and time, or
+    etag, of the file when it was read.  ``kind`` is ``recorded`` (read from a file), ``computed``
+    (from a bag by this version) or ``failed``, which may pass (``is_passing``): the file could
+    not be reached.  Times are of the middle, first and last image; ``active_since_ns`` is 0 where
+    it was not activated.  ``sigmas`` has those of ``values``, then of three alignment angles
+    (rad); ``boresight_sigma_arcsec`` is about x and y of the camera, of the middle of the
+    detector, in the star tracker frame.
     """
 
     key: str
@@ -114,7 +93,6 @@ class Row:
     spacecraft: str = ''
     camera: str = ''
     stamp: str = ''
-    size_bytes: Count = 0
     is_passing: bool = False
 
     def __post_init__(self) -> None:
@@ -215,7 +193,6 @@ def _boresight_sigma(calibration: Calibration) -> Floats:
 
 TABLE_FILE, PARQUET_FILE = 'trend.sqlite', 'trend.parquet'
 _WAIT_S = 60.0  # for the transaction of another run
-_MOST_LIKELY = 1000  # keys sent with a task: with more of one size, the content is used again
 _COLUMNS: dict[str, Any] = get_type_hints(Row)
 _TYPES = {int: 'integer', bool: 'integer', float: 'real', str: 'text'}
 _LISTS = [name for name, kind in _COLUMNS.items() if kind not in _TYPES]  # as JSON
@@ -227,7 +204,6 @@ _SCHEMA = (
     ),
     'CREATE TABLE seen (stamp text PRIMARY KEY, key text NOT NULL) STRICT',
     'CREATE INDEX of_camera ON calibration (spacecraft, camera, time_ns, key)',
-    'CREATE INDEX of_size ON calibration (size_bytes)',
     "CREATE UNIQUE INDEX of_stamp ON calibration (stamp) WHERE stamp != ''",
 )
 
@@ -261,16 +237,6 @@ class Table:
                 (stamp,),
             ).fetchone()
         return keys and str(keys[0])
-
-    def likely(self, size_bytes: int, spacecraft: str, camera: str) -> tuple[str, ...]:
-        """Keys of rows whose content may be that of a file; an empty name may be any."""
-        with self._naming():
-            keys = self._db.execute(
-                "SELECT key FROM calibration WHERE size_bytes = ? AND error = '' "
-                "AND ? IN ('', spacecraft) AND ? IN ('', camera) LIMIT ?",
-                (size_bytes, spacecraft, camera, _MOST_LIKELY + 1),
-            ).fetchall()
-        return tuple(key for (key,) in keys) if len(keys) <= _MOST_LIKELY else ()
 
     def has(self, row: Row) -> bool:
         """True if a row of the same content and camera is there that is no failure."""

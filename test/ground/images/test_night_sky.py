@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
-from starcal_ground.images.from_stars import _of_one_lens, from_stars, pinhole
+from starcal_ground.images.from_stars import _of_one_lens, from_stars, ideal_camera
 from starcal_ground.images.night_sky import calibrate_images, NightSky, photographs_of
 from starcal_ground.simulation.rendering import images
 import starcal_ros
@@ -112,7 +112,9 @@ def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('camera', [44, 109, 137])
-def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(camera: int) -> None:
+def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(
+    tmp_path: Path, camera: int
+) -> None:
     """
     As a pinhole, the corners of 44 without stars were off by 22 of their sigmas, and accepted.
 
@@ -120,7 +122,7 @@ def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(camera: i
     The stars of 137 hardly separate the coefficients of its lens, nor without a prior anything.
     """
     given, _ = camera_of(camera)
-    found = calibrated(given)
+    found = calibrated(given, tmp_path, {}).calibration
     error_arcsec, sigma_arcsec = off_arcsec(found, given.truth.camera)
     assert found.accepted and found.geometry.camera.model == given.truth.camera.model
     assert error_arcsec < 5.0 * sigma_arcsec
@@ -341,7 +343,13 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
     none = np.empty(0, np.int64)
     matches = {
         time_ns: SkyMatch(
-            Rotation.identity(), pinhole((640, 512), px), none, np.empty((0, 2)), False, -9.0, 0.3
+            Rotation.identity(),
+            ideal_camera((640, 512), px),
+            none,
+            np.empty((0, 2)),
+            False,
+            -9.0,
+            0.3,
         )
         for time_ns, px in enumerate(focal_px)
     }
@@ -355,7 +363,7 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
 
 
 def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
-    prior = CameraGeometry(pinhole((640, 512), 1800.0), np.array([0.0, 0.0, 0.0, 1.0]))
+    prior = CameraGeometry(ideal_camera((640, 512), 1800.0), np.array([0.0, 0.0, 0.0, 1.0]))
     setup = load_setup({}, prior=prior)
     sky = NightSky((), setup, (), True, Topics(), identified_ns=frozenset({1, 2}))
     detail = 'stars match in one part of the image only'

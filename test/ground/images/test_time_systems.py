@@ -6,7 +6,7 @@ from __future__ import annotations
 from astropy.time import Time
 import pytest
 
-from starcal_ground.images.time_systems import from_mjd, from_text, system_of, SYSTEMS, TimeError
+from starcal_ground.images.time_systems import from_mjd, from_text, system_of, SYSTEMS
 
 DATES = (
     '1999-01-01T00:00:00',
@@ -62,7 +62,7 @@ def test_a_modified_julian_date_is_exact_to_a_microsecond() -> None:
 
 @pytest.mark.parametrize('name', ['LOCAL', 'MET', 'SCLK', 'UT1', 'TCB'])
 def test_other_systems_are_refused(name: str) -> None:
-    with pytest.raises(TimeError, match=f'{name}.* is not one of UTC, TAI'):
+    with pytest.raises(ValueError, match=f'{name}.* is not one of UTC, TAI'):
         system_of(name)
 
 
@@ -73,7 +73,7 @@ def test_other_systems_are_refused(name: str) -> None:
      '2038-01-19T03:14:08', '２０２６-05-15T00:00:00'],
 )  # fmt: skip
 def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(TimeError):
+    with pytest.raises(ValueError, match='is not a|no time of day|1972|2038'):
         from_text(text, 'UTC')
 
 

@@ -12,7 +12,7 @@ import pytest
 from random_pointings import honesty  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.images.from_stars import options_of, pinhole
+from starcal_ground.images.from_stars import ideal_camera, options_of
 from starcal_ground.images.unknown_air import refracted, with_air, zenith_of
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
@@ -30,7 +30,7 @@ from starcal_ros.sky.astrometry import (
 from starcal_ros.sky.catalog import load_catalog
 
 SITE = SiteOptions(observer='ground', latitude_deg=47.0, longitude_deg=11.0, height_m=500.0)
-CAMERA = pinhole((1200, 900), 2000.0).replace(k1=-0.05, cx=611.0, p1=4e-4)
+CAMERA = ideal_camera((1200, 900), 2000.0).replace(k1=-0.05, cx=611.0, p1=4e-4)
 START_NS = 1_700_000_000_000_000_000
 NOISE_PX = 0.08
 

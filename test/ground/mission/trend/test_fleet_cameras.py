@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Spacecraft, camera and parameters from a pattern or a table."""
+"""Spacecraft, camera and parameters from a pattern."""
 
 from __future__ import annotations
 
@@ -34,30 +34,18 @@ def test_a_pattern_names_spacecraft_and_camera(pattern, name, expected) -> None:
     assert read_cameras(pattern, '').of(name) == expected
 
 
-def test_a_table_names_them_and_their_parameters(tmp_path: Path) -> None:
-    table = tmp_path / 'cameras.csv'
-    table.write_text('path,spacecraft,camera,params\nA/*,A,nav,a.yaml\n*,B,nav,\n')
-    cameras = read_cameras(str(table), str(tmp_path / '{spacecraft}.yaml'))
-    assert cameras.of('A/x/y.mcap') == ('A', 'nav') and cameras.of('C/y.mcap') == ('B', 'nav')
-    assert cameras.params_of('A/x/y.mcap') == str(tmp_path / 'a.yaml')
-    assert cameras.params_of('C/y.mcap') == str(tmp_path / 'B.yaml')
+def test_the_names_are_replaced_in_the_path_of_the_parameters(tmp_path: Path) -> None:
+    cameras = read_cameras('{spacecraft}/*', str(tmp_path / '{spacecraft}.yaml'))
+    assert cameras.params_of('B/y.mcap') == str(tmp_path / 'B.yaml')
     assert Cameras().params_of('x') == ''
 
 
 @pytest.mark.parametrize(
-    'text', ['{camera', '{other}/x', '{camera}/{camera}', '{spacecraft}/{camera}}']
+    'text', ['cameras.csv', '{camera', '{other}/x', '{camera}/{camera}', '{spacecraft}/{camera}}']
 )
 def test_a_bad_pattern_is_one_line(text: str) -> None:
     with pytest.raises(StarcalError, match='not a pattern with') as caught:
         read_cameras(text, '')
-    assert '\n' not in str(caught.value)
-
-
-@pytest.mark.parametrize('text', ['', 'a,b\n', 'path,camera\n,x\n', 'path,camera\na,b,c\n'])
-def test_a_bad_table_is_one_line(tmp_path: Path, text: str) -> None:
-    (tmp_path / 'cameras.csv').write_text(text)
-    with pytest.raises(StarcalError, match=r'cameras\.csv') as caught:
-        read_cameras(str(tmp_path / 'cameras.csv'), '')
     assert '\n' not in str(caught.value)
 
 

@@ -71,7 +71,7 @@ def test_a_place_for_calibrations_that_cannot_be_written_ends_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / KEPT_FOLDER).touch()
-    bag = Answer('a', failure('/bag', ''), '{}')
+    bag = Answer(failure('/bag', ''), '{}')
     monkeypatch.setattr(fleet, 'compute', lambda _: bag)
     with pytest.raises(ProductError, match='cannot be created'):
         fleet.update(Table(tmp_path), [Task('/bag', '1', ())])

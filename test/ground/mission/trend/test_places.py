@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from pathlib import Path
 import shutil
 import time
@@ -39,17 +38,6 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(fleet, 'compute', unread)
     assert trend(mission) == 0
     assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypatch) -> None:
-    shutil.copytree(TINY, tmp_path / 'fleet/one')
-    cameras = Cameras(params=str(TINY / 'params.yaml'))
-    fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
-    os.utime(tmp_path / 'fleet/one/tiny_0.mcap', (5, 5))
-    monkeypatch.setattr(fleet, 'calibrate_bags', lambda *_: pytest.fail('calibrated again'))
-    done = fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
-    assert done == fleet.Done(known=1)
 
 
 @pytest.mark.slow
@@ -126,18 +114,13 @@ def test_bags_and_products_by_url(tmp_path: Path, capsys) -> None:
     assert 'results are written to a local folder, no URL' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(('together', 'lists'), [(100, [13]), (5, [1, 4, 4, 4])])
-def test_a_store_is_listed_by_folders_where_it_has_many_files(
-    monkeypatch: pytest.MonkeyPatch, together: int, lists: list[int]
-) -> None:
+def test_a_store_is_listed_whole() -> None:
     memory = fsspec.filesystem('memory')
     for camera, day in itertools.product(range(3), range(4)):
         memory.pipe(f'/years/fleet/{camera}/{day}/calibration.json', b'1')
     memory.pipe('/years/fleet/readme', b'1')
-    monkeypatch.setattr(places, '_TOGETHER', together)
-    found = list(places.listings('memory://years'))
-    assert [len(one) for one in found] == lists
-    names = sorted(entry.name for entry in itertools.chain(*found))
+    (entries,) = places.listings('memory://years')
+    names = sorted(entry.name for entry in entries)
     assert names == sorted(path.removeprefix('/years/') for path in memory.find('/years'))
 
 
@@ -145,11 +128,3 @@ def test_an_unknown_protocol_is_one_line(tmp_path: Path, capsys) -> None:
     assert main(['trend', 'nowhere://fleet', '-o', str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert 'nowhere' in error and error.count('\n') == 1
-
-
-def test_content_that_the_table_has_is_no_new_row(mission: Path) -> None:
-    first, *_ = fleet.find(str(mission), Cameras())
-    answer = fleet.compute(first)
-    assert answer.row and answer.row.stamp == first.stamp and answer.row.key == answer.key
-    known = dataclasses.replace(first, known=(answer.key,))
-    assert fleet.compute(known) == Answer(answer.key)

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""A simulated fleet: each camera that drifted, stepped or was swapped is named, and no other."""
+"""A simulated fleet: each camera that drifted or stepped is named, and no other."""
 
 from __future__ import annotations
 
@@ -13,15 +13,8 @@ import numpy as np
 import pytest
 
 from bench.fleet import simulated_rows, simulated_truth, Truth
-from starcal_ground.mission.trend.series import (
-    findings,
-    Overview,
-    overview_of,
-    series_of,
-    swapped_with,
-)
+from starcal_ground.mission.trend.series import findings, series_of
 from starcal_ground.mission.trend.trend_page import write_page
-from starcal_ground.mission.trend.trend_table import Row
 from starcal_ros.arrays import Floats
 
 MONTHS = 24
@@ -41,19 +34,18 @@ def test_of_200_cameras_those_that_changed_are_named(seed: int, tmp_path: Path) 
     rng = np.random.default_rng([30, seed])
     names = [f'sat{k:03d}' for k in range(200)]
     truths = {name: simulated_truth(rng) for name in names}
-    *drifted, stepped, shaken, swapped, other = rng.choice(names, 9, replace=False).tolist()
+    *drifted, stepped, shaken, _, _ = rng.choice(names, 9, replace=False).tolist()
     for name, drift in zip(drifted, DRIFTS, strict=True):
         truths[name] = dataclasses.replace(truths[name], drift_per_year=drift)
     for name, step in zip((stepped, shaken), STEPS, strict=True):
         after = int(rng.integers(3, MONTHS - 4))
         truths[name] = dataclasses.replace(truths[name], step=step, step_after=after)
     of_month = {name: months(truth) for name, truth in truths.items()}
-    of_month[swapped][13:] = of_month[other][13:]
     fleet = [simulated_rows(name, of_month[name], rng) for name in names]
     write_page(fleet, len(fleet), tmp_path, 'fleet')
     found = found_in((tmp_path / 'trend.html').read_text())
     expected = dict.fromkeys(drifted, 'drift') | dict.fromkeys((stepped, shaken), 'step')
-    assert found == expected | {swapped: f'parameters of {other}, nav'}
+    assert found == expected
 
 
 def found_in(page: str) -> dict[str, str]:
@@ -62,9 +54,7 @@ def found_in(page: str) -> dict[str, str]:
     for name, text in re.findall(
         r'<tr><td class="text">(\w+), nav.*<td class="long">(.*)</td>', page
     ):
-        if swap := re.search(r'parameters of \w+, nav', text):
-            found[name] = swap[0]
-        elif 'No step' not in text:
+        if 'No step' not in text:
             found[name] = ' '.join(kind for kind in ('drift', 'step') if f'{kind}s of' in text)
     return found
 
@@ -125,17 +115,3 @@ def test_a_drift_and_a_step_are_found_once_and_within_2_sigma(seed: int) -> None
     assert drift[0] == 'boresight about x' and abs(drift[1].size - 40.0) < 2 * drift[1].sigma
     assert (step[0], step[1].after) == ('fx', 13)
     assert abs(step[1].size - 0.5) < 2 * step[1].sigma
-
-
-def test_a_camera_is_not_swapped_with_one_that_differs() -> None:
-    rng = np.random.default_rng(33)
-    truths = [simulated_truth(rng) for _ in range(3)]
-    moved = dataclasses.replace(truths[0], step=2.0 * CX, step_after=11)
-    rows = [simulated_rows(str(k), months(one), rng) for k, one in enumerate([moved, *truths[1:]])]
-    cameras = [overview(str(k), one) for k, one in enumerate(rows)]
-    assert cameras[0].after == 11 and swapped_with(cameras[0], cameras) == ''
-    assert not cameras[1].needs_attention and swapped_with(cameras[1], cameras) == ''
-
-
-def overview(name: str, rows: list[Row]) -> Overview:
-    return overview_of(name, rows, series_of(rows), True)

@@ -33,7 +33,7 @@ def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
     is_stable, (judged, found) = verdict_of(rows, rows, active, new, [])
     assert is_stable is expected and words in judged
     assert found == f'Steps and drifts need 6 calibrations; there are {len(rows)}.'
-    overview = overview_of('camera', rows, [], is_stable)
+    overview = overview_of('camera', [], is_stable)
     assert overview.needs_attention is (expected is False)
 
 
