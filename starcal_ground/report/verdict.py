@@ -12,9 +12,8 @@ import numpy as np
 from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.assessment.gate import REMEDIES, requirement_answers, REQUIREMENTS
 from starcal_ros.assessment.observability import movement_px
-from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.assessment.requirements import answers, OPTION
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
@@ -103,7 +102,7 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], o
 
 def met_requirements(calibration: records.Calibration) -> list[str]:
     """A sentence on each requirement that is met; one that is missed is among the reasons."""
-    met = [text for text in answers(calibration) if text.endswith(': met')]
+    met = [text for text in requirement_answers(calibration) if text.endswith(': met')]
     return [f'{text[0].upper()}{text[1:]}.' for text in met]
 
 
@@ -127,9 +126,9 @@ def next_step(calibration: records.Calibration) -> str:
         f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
     )
     text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
-    if {*failed} == {OPTION}:
+    if {*failed} == {REQUIREMENTS}:
         text = 'The sigmas hold, but miss a requirement.'
-    steps = _against_sigma(calibration) if OPTION in failed else []
+    steps = _against_sigma(calibration) if REQUIREMENTS in failed else []
     return ' '.join([text, *steps])
 
 

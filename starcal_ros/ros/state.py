@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_ros.assessment import requirements
-from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.gate import judge, reasons_of, REMEDIES, requirement_answers
 from starcal_ros.errors import (
     ArchiveError,
     missing_package,
@@ -339,7 +337,7 @@ def summary(calibration: Calibration) -> str:
         f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
         f' in {calibration.images_used} images'
     )
-    return '; '.join([fit, *requirements.answers(calibration)])
+    return '; '.join([fit, *requirement_answers(calibration)])
 
 
 def _check_size(
