@@ -10,8 +10,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment import agreement
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.lookup import (
+    chi_squared,
+    ChiSquared,
+    GRID,
+    line_of_sight_table,
+    lines_of_sight,
+    parameter_difference,
+)
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
@@ -85,7 +91,7 @@ class Comparison:
     rotation_rad: float
     before: DifferenceMap
     after: DifferenceMap
-    total: agreement.ChiSquared
+    total: ChiSquared
     notes: tuple[str, ...]
 
     @property
@@ -121,7 +127,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         raise ProductError(
             f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
         )
-    difference = agreement.parameter_difference(b.geometry, a.geometry)
+    difference = parameter_difference(b.geometry, a.geometry)
     sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     rotation, _ = Rotation.align_vectors(new, old)
@@ -141,14 +147,14 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         rotation_rad=float(rotation.magnitude()),
         before=_map(new - old, a.geometry, sight_sigma_rad),
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
-        total=agreement.chi_squared(difference[:compared], covariance),
+        total=chi_squared(difference[:compared], covariance),
         notes=_notes(a, b, difference, sigma),
     )
 
 
 def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
     """Lines of sight of the grid, (GRID^2, 3), star tracker frame."""
-    directions = agreement.lines_of_sight(geometry, GRID, GRID)
+    directions = lines_of_sight(geometry, GRID, GRID)
     if not np.isfinite(directions).all():
         raise ProductError(
             'a calibration has pixels without a line of sight: its distortion folds'

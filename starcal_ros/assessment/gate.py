@@ -12,7 +12,7 @@ import re
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.camera.lens import COEFFICIENTS

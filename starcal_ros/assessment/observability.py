@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import movement
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table, movement
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,

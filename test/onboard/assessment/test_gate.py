@@ -12,8 +12,8 @@ import pytest
 from sample_records import calibration, model_checks  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.gate import GateOptions, judge, reasons_of
+from starcal_ros.assessment.lookup import movement
 from starcal_ros.camera import CameraModel
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.temperature import camera_at
