@@ -19,7 +19,7 @@ from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.estimation.problem import camera_at
 from starcal_ros.options import option
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import (

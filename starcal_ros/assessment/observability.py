@@ -23,10 +23,9 @@ from starcal_ros.estimation.equations import information_of_images, stars_alone,
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.outliers import FEWEST_STARS
-from starcal_ros.estimation.problem import image_blocks, Problem, State
+from starcal_ros.estimation.problem import image_blocks, Problem, State, why_unsupported
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
-from starcal_ros.estimation.temperature import why_unsupported
 from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
 from starcal_ros.estimation.unknowns import unknowns_in_state
 from starcal_ros.records import (

@@ -37,9 +37,11 @@ from starcal_ros.estimation.problem import (
     canonical_xyzw,
     image_parameters,
     Problem,
+    reference_degc,
     star_tracker_alignments,
     star_tracker_names,
     State,
+    why_unsupported,
 )
 from starcal_ros.estimation.rates import measured_rates
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
@@ -55,7 +57,6 @@ from starcal_ros.estimation.star_equations import (
     star_table,
     StarTable,
 )
-from starcal_ros.estimation.temperature import reference_degc, why_unsupported
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import (
     Assumptions,

@@ -32,9 +32,14 @@ from starcal_ros.estimation.options import (
     estimated_parameters,
 )
 from starcal_ros.estimation.outliers import FEWEST_STARS
-from starcal_ros.estimation.problem import image_blocks, Problem, star_tracker_names, State
+from starcal_ros.estimation.problem import (
+    image_blocks,
+    Problem,
+    reference_degc,
+    star_tracker_names,
+    State,
+)
 from starcal_ros.estimation.star_equations import Measurements, StarTable
-from starcal_ros.estimation.temperature import reference_degc
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
 from starcal_ros.records import CameraGeometry, Ensemble
 

@@ -16,7 +16,7 @@ from starcal_ros.assessment.gate import GateOptions, judge, reasons_of
 from starcal_ros.assessment.lookup import movement
 from starcal_ros.camera import CameraModel
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.estimation.problem import camera_at
 from starcal_ros.options import names_of
 from starcal_ros.records import (
     Calibration,
