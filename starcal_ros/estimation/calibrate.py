@@ -43,7 +43,6 @@ from starcal_ros.estimation.problem import (
     State,
     why_unsupported,
 )
-from starcal_ros.estimation.rates import measured_rates
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.shared_errors import (
     observation_groups,
@@ -57,7 +56,7 @@ from starcal_ros.estimation.star_equations import (
     star_table,
     StarTable,
 )
-from starcal_ros.estimation.tracker_errors import TrackerErrors
+from starcal_ros.estimation.tracker_errors import measured_rates, TrackerErrors
 from starcal_ros.estimation.unknowns import (
     Assumptions,
     FIELD_OCTAVES,

@@ -47,7 +47,7 @@ from starcal_ros.estimation.problem import (
     turn_derivatives,
     turns_chain,
 )
-from starcal_ros.estimation.rates import Rates, UNKNOWN_RATE_RAD_S
+from starcal_ros.estimation.tracker_errors import Rates, UNKNOWN_RATE_RAD_S
 from starcal_ros.records import ALIGNMENT_NAMES
 from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
 

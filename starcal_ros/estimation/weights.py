@@ -41,7 +41,6 @@ from starcal_ros.estimation.problem import (
     Problem,
     State,
 )
-from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import (
     Groups,
     pixel_variance_px2,
@@ -53,6 +52,7 @@ from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_
 from starcal_ros.estimation.tracker_errors import (
     Correlations,
     correlations_of,
+    Rates,
     tracker_errors,
     TrackerErrors,
 )
