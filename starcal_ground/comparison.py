@@ -8,21 +8,50 @@ import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import (
-    chi_squared,
-    ChiSquared,
-    GRID,
-    line_of_sight_table,
-    lines_of_sight,
-    parameter_difference,
-)
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table, lines_of_sight
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.record_fields import json_object
 from starcal_ros.records import Calibration, CameraGeometry
+
+_SINGULAR = 1e-12  # smaller eigenvalues of a correlation matrix are rounding errors
+
+
+@dataclass(frozen=True)
+class ChiSquared:
+    """A squared Mahalanobis distance and its degrees of freedom; both 0 if nothing is compared."""
+
+    value: float
+    degrees_of_freedom: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability that noise alone gives as large a value; 1 without degrees of freedom."""
+        n = self.degrees_of_freedom
+        return float(chdtrc(n, self.value)) if n else 1.0
+
+
+def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
+    """
+    Squared length of a difference (k,) in the metric of its covariance (k, k) (Mahalanobis).
+
+    Rows without a finite, positive variance are left out; directions in which the covariance is
+    singular do not count as degrees of freedom.
+    """
+    known = np.isfinite(covariance).all(axis=1) & (np.diag(covariance) > 0)
+    if not known.any():
+        return ChiSquared(0.0, 0)
+    difference, covariance = difference[known], covariance[np.ix_(known, known)]
+    # Scaled to a unit diagonal first: fx and k3 differ by many powers of ten.
+    sigma = np.sqrt(np.diag(covariance))
+    scaled, correlation = difference / sigma, covariance / np.outer(sigma, sigma)
+    inverse = np.linalg.pinv(correlation, rcond=_SINGULAR, hermitian=True)
+    rank = int(np.linalg.matrix_rank(correlation, tol=_SINGULAR, hermitian=True))
+    return ChiSquared(float(scaled @ inverse @ scaled), rank)
 
 
 @dataclass(frozen=True)
@@ -150,6 +179,19 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         total=chi_squared(difference[:compared], covariance),
         notes=_notes(a, b, difference, sigma),
     )
+
+
+def parameter_difference(a: CameraGeometry, b: CameraGeometry) -> Floats:
+    """Parameters of a less those of b, (p,): camera, then `alignment_difference_rad`."""
+    of_camera = a.camera.parameters - b.camera.parameters
+    return np.concatenate([of_camera, alignment_difference_rad(a, b)])
+
+
+def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
+    """The passive small rotation (3,) of the camera frame that takes alignment b to a."""
+    # a_from_b = exp(-[dtheta x]), so b_from_a has dtheta as its rotation vector.
+    b_from_a = b.star_tracker_from_camera.inv() * a.star_tracker_from_camera
+    return np.asarray(b_from_a.as_rotvec())
 
 
 def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:

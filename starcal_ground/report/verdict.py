@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
+from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import REMEDIES, requirement_answers, REQUIREMENTS
-from starcal_ros.assessment.lookup import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND

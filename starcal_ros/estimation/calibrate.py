@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.camera import CameraModel, project_parameters
+from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
@@ -250,14 +250,14 @@ def estimate_calibration(
 
 def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) -> Estimate:
     """Return the estimate from a start."""
-    table, camera = data.table, data.prior.camera
+    table = data.table
     judged = Judged(CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None)
     measurements = arrange(table, judged.kept, judged.covariance_px2(table))
     solution = _robust_search(problem, start, measurements)
     state, iterations = solution.state, solution.iterations
     _check_not_mirrored(state)
-    residual_px = _residuals_px(problem, state, table, None, None, camera)
-    from_sky = sky_rotations(state, table, camera)
+    residual_px = residuals_px(problem, state, table)
+    from_sky = sky_rotations(state, table, data.prior.camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
     shape_px: Floats | float = _FIRST_SHAPE_PX
     before: _Round | None = None
@@ -337,7 +337,7 @@ def _round(
     shared[layout.of(_IN_STATE)] *= share
     own = found.own - found.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
-    left_px = _residuals_px(problem, after, table, layout, found, camera)
+    left_px = residuals_px(problem, after, table, layout, found, size)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
@@ -398,15 +398,20 @@ def field_of(layout: Layout, found: Posterior, size: tuple[int, int]) -> Detecto
     return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
-def _residuals_px(
+def residuals_px(
     problem: Problem,
     state: State,
     table: StarTable,
-    layout: Layout | None,
-    found: Posterior | None,
-    camera: CameraModel,
+    layout: Layout | None = None,
+    found: Posterior | None = None,
+    size: tuple[int, int] = (0, 0),
 ) -> Floats:
-    """Measured minus predicted pixels (n, 2) of all observations at a state."""
+    """
+    Measured minus predicted pixels (n, 2) of all observations at a state.
+
+    With what is not in the state at its mean, where there is a posterior: ``size`` (width, height)
+    is that of the detector.
+    """
     own = image_parameters(problem, state)
     measured = table.measured_px
     rotations = state.camera_from_icrf.as_matrix()
@@ -417,7 +422,6 @@ def _residuals_px(
         modes = layout['shape'].camera
         assert modes is not None
         own += np.einsum('mps,ms->mp', modes, shapes_px)
-        size = camera.width, camera.height
         measured = measured - field_of(layout, found, size).displacement_px(measured)
         turned = np.zeros((3, len(table)))
         for entry in layout.entries:
