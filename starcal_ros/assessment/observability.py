@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table, movement
-from starcal_ros.camera import (
-    CameraModel,
-    line_of_sight,
-    parameter_names,
-    pixel_grid,
-    project_parameters,
-)
+from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import information_of_images, stars_alone, StarSums
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
@@ -283,16 +277,3 @@ def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
     known = np.nonzero(sigma > 0)[0]
     matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
     return Correlation(tuple(names[i] for i in known), matrix)
-
-
-def movement_px(camera: CameraModel, changes: Floats) -> Floats:
-    """
-    Largest shift (k,) of a star image over the detector, px.
-
-    For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
-    """
-    pixels = pixel_grid(camera, 25, 20)
-    directions = line_of_sight(camera, pixels)
-    moved = camera.parameters - np.diag(changes)
-    found = np.stack([project_parameters(camera.model, row, directions) for row in moved])
-    return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))

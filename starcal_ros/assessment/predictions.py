@@ -100,11 +100,11 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
     colour_bp_rp : (n,)
         Colours of the stars in the table of the estimate.
     """
-    table = estimate.table
-    seen = estimate.attitude_seen[:, None]
+    table, attitudes = estimate.table, estimate.attitudes
+    seen = attitudes.seen[:, None]
     # The estimate has the opposite sign: from the reported to the true attitude.
-    error_arcsec = -estimate.attitude_error_rad / ARCSECOND_RAD
-    sigma_rad = np.sqrt(np.einsum('mii->mi', estimate.attitude_covariance_rad2))
+    error_arcsec = -attitudes.error_rad / ARCSECOND_RAD
+    sigma_rad = np.sqrt(np.einsum('mii->mi', attitudes.covariance_rad2))
     return Residuals(
         image_time_ns=np.array([image.time_ns for image in ensemble.images], np.int64),
         image_misfit=estimate.misfit_image,

@@ -33,12 +33,10 @@ from starcal_ros.estimation.options import (
 from starcal_ros.estimation.outliers import dropped_stars
 from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
 from starcal_ros.estimation.problem import (
-    AttitudeErrors,
     canonical_xyzw,
     image_parameters,
     Problem,
     reference_degc,
-    star_tracker_alignments,
     star_tracker_names,
     State,
     why_unsupported,
@@ -56,7 +54,12 @@ from starcal_ros.estimation.star_equations import (
     star_table,
     StarTable,
 )
-from starcal_ros.estimation.tracker_errors import measured_rates, TrackerErrors
+from starcal_ros.estimation.tracker_errors import (
+    Attitudes,
+    measured_rates,
+    star_tracker_alignments,
+    TrackerErrors,
+)
 from starcal_ros.estimation.unknowns import (
     Assumptions,
     FIELD_OCTAVES,
@@ -68,7 +71,6 @@ from starcal_ros.estimation.unknowns import (
 )
 from starcal_ros.estimation.weights import (
     agree,
-    Attitudes,
     CentroidVariance,
     Data,
     degrees_of_freedom,
@@ -147,8 +149,7 @@ class Estimate:
         Stars that misfit across images and were left out of all.
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
-    attitude_error_rad, attitude_covariance_rad2, attitude_seen : (m, 3), (m, 3, 3), (m,) bool
-        Star-tracker errors as the stars show them.
+    attitudes : Attitudes
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
@@ -181,9 +182,7 @@ class Estimate:
     misfit_image: Mask
     dropped_catalog_id: NDArray[np.int64]
     alignment_scatter_arcsec: float
-    attitude_error_rad: Floats
-    attitude_covariance_rad2: Floats
-    attitude_seen: Mask
+    attitudes: Attitudes
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
@@ -473,14 +472,6 @@ def _result(
         float(np.sqrt(attitudes.error_rad[shown].var(axis=0).mean())) if shown.any() else 0.0
     )
     lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
-    star_trackers = star_tracker_names(ensemble)
-    errors = AttitudeErrors(
-        data.time_ns,
-        attitudes.error_rad,
-        np.einsum('mii->mi', attitudes.covariance_rad2),
-        noise * data.stated_rad,
-        attitudes.seen,
-    )
     mountings = layout.of(['alignment', 'mountings'])
     return Estimate(
         geometry=geometry,
@@ -505,16 +496,20 @@ def _result(
         misfit_image=attitudes.misfit | lost,
         dropped_catalog_id=dropped_stars(table, kept),
         alignment_scatter_arcsec=scatter_rad / ARCSECOND_RAD,
-        attitude_error_rad=attitudes.error_rad,
-        attitude_covariance_rad2=attitudes.covariance_rad2,
-        attitude_seen=attitudes.seen,
+        attitudes=attitudes,
         iterations=iterations,
         termination=termination,
         thermal=_thermal(after, layout, covariance, ensemble, options),
         shared_errors=judged.errors,
         tracker_errors=trackers,
         star_trackers=star_tracker_alignments(
-            star_trackers, problem, after, covariance[np.ix_(mountings, mountings)], errors
+            star_tracker_names(ensemble),
+            problem,
+            after,
+            covariance[np.ix_(mountings, mountings)],
+            attitudes,
+            data.time_ns,
+            noise * data.stated_rad,
         ),
     )
 

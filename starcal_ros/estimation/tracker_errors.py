@@ -24,11 +24,13 @@ import math
 import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtr
 
-from starcal_ros.arrays import Floats, Indices
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.amplitudes import interval_factor
-from starcal_ros.records import StarObservations
+from starcal_ros.estimation.problem import canonical_xyzw, Problem, State
+from starcal_ros.records import StarObservations, StarTrackerAlignment
 
 _SPANS = (0.3, 1.0, 3.0, 10.0)  # correlation times, in spans of the campaign
 _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a large part of the sky
@@ -45,6 +47,8 @@ _STATED_SLOW_SIGMA = 0.3  # of ln s about star_tracker_slow_arcsec
 # against correlation times of a third of it and more.  The time of an estimate stays linear.
 _MOST_GROUPS = 100
 _MOST_MEMBERS = 4  # of a group, of which the mean correlation is taken
+_FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
+_HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -344,3 +348,103 @@ def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats
     shrunk = np.linalg.solve(total, off[:, :, None])[:, :, 0] @ without_errors
     root = np.asarray(np.linalg.cholesky(own + _LEAST_RAD2_S2 * np.eye(3)))
     return Rates(mean + shrunk, root)
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Errors of the star trackers as the stars show them, and what follows from them."""
+
+    error_rad: Floats
+    covariance_rad2: Floats
+    seen: Mask
+    misfit: Mask
+    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
+    images: tuple[Indices, ...]  # of each of them, those that fit
+    correlations: tuple[Correlations, ...] = ()  # of these images
+
+
+def star_tracker_alignments(
+    names: tuple[str, ...],
+    problem: Problem,
+    state: State,
+    covariance: Floats,
+    attitudes: Attitudes,
+    time_ns: Indices,
+    sigma_rad: Floats,
+) -> tuple[StarTrackerAlignment, ...]:
+    """
+    Return the alignments to the star trackers of an ensemble; none where there is one only.
+
+    Parameters
+    ----------
+    names : tuple of str
+        From `star_tracker_names`.
+    covariance : (3 + 3 s, 3 + 3 s)
+        Covariance of the alignment and of the mountings of the s further star trackers.
+    attitudes : Attitudes
+        Of images at ``time_ns`` (m,), each about the axes of its own star tracker.
+    sigma_rad : (3,)
+        Noise of a star tracker.
+    """
+    if problem.first_from_star_tracker is None:
+        return ()
+    mountings = np.concatenate([np.zeros(3), state.mountings]).reshape(-1, 3)
+    A = state.camera_from_star_tracker
+    found = []
+    for k, name in enumerate(names):
+        here = problem.star_tracker == k
+        assumed = problem.first_from_star_tracker[here][0] if k else Rotation.identity()
+        alignment = Rotation.from_rotvec(-mountings[k]) * A * assumed
+        to_angles = np.zeros((3, len(covariance)))
+        to_mounting = np.zeros_like(to_angles)
+        if k:
+            to_mounting[:, 3 * k : 3 * k + 3] = np.eye(3)
+        to_angles[:, :3] = np.eye(3)
+        to_angles += to_mounting
+        of_mounting = to_mounting @ covariance @ to_mounting.T
+        rate, total, p_value = _drift(time_ns, attitudes, sigma_rad, here)
+        found.append(
+            StarTrackerAlignment(
+                frame=name,
+                images=int(here.sum()),
+                star_tracker_from_camera_xyzw=canonical_xyzw(alignment.inv()),
+                alignment_covariance_rad2=to_angles @ covariance @ to_angles.T,
+                first_from_star_tracker_xyzw=canonical_xyzw(A.inv() * alignment),
+                mounting_covariance_rad2=of_mounting,
+                drift_arcsec_per_hour=tuple(float(one) for one in rate),
+                drift_arcsec=total,
+                drift_p_value=p_value,
+            )
+        )
+    return tuple(found)
+
+
+def _drift(
+    time_ns: Indices, attitudes: Attitudes, sigma_rad: Floats, here: Mask
+) -> tuple[Floats, float, float]:
+    """
+    Slope (3,) of the errors in time, arcsec/h; its length over the span; p-value of none.
+
+    By the scatter about the slope: a drift raises the sigma of the star tracker that is estimated.
+    """
+    unknown = np.full(3, np.nan), math.nan, math.nan
+    used = here & attitudes.seen
+    if np.count_nonzero(used) < _FEWEST_IMAGES:
+        return unknown
+    time_ns, error_rad = time_ns[used], attitudes.error_rad[used]
+    hours = (time_ns - time_ns[0]) / (NANOSECONDS_PER_SECOND * _HOUR_S)
+    variance_rad2 = np.einsum('mii->mi', attitudes.covariance_rad2)[used]
+    weight = 1.0 / (variance_rad2 + sigma_rad**2)
+    middle = (weight * hours[:, None]).sum(axis=0) / weight.sum(axis=0)
+    from_middle = hours[:, None] - middle
+    information = (weight * from_middle**2).sum(axis=0)
+    if not (information > 0).all():
+        return unknown
+    slope = (weight * from_middle * error_rad).sum(axis=0) / information
+    mean_rad = (weight * error_rad).sum(axis=0) / weight.sum(axis=0)
+    freedom = len(hours) - 2
+    scatter = (weight * (error_rad - mean_rad - from_middle * slope) ** 2).sum(axis=0) / freedom
+    t = slope * np.sqrt(information / np.maximum(scatter, 1e-300))
+    p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # of three axes
+    rate = slope / ARCSECOND_RAD
+    return rate, float(np.linalg.norm(rate) * np.ptp(hours)), p_value

@@ -50,6 +50,7 @@ from starcal_ros.estimation.shared_errors import (
 )
 from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
+    Attitudes,
     Correlations,
     correlations_of,
     Rates,
@@ -214,19 +215,6 @@ class Data:
     velocity_sigma_m_s: Floats  # (m,)
     refraction: Refraction | None
     groups: tuple[Groups, ...]
-
-
-@dataclass(frozen=True)
-class Attitudes:
-    """Errors of the star trackers as the stars show them, and what follows from them."""
-
-    error_rad: Floats
-    covariance_rad2: Floats
-    seen: Mask
-    misfit: Mask
-    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
-    images: tuple[NDArray[np.int64], ...]  # of each of them, those that fit
-    correlations: tuple[Correlations, ...] = ()  # of these images
 
 
 @dataclass(frozen=True)
