@@ -327,7 +327,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'change of the camera from image to image in a corner',
         found.image_variation_px,
         'px',
-        f'lens or focus changes: {REMEDIES["change from image to image"]}',
+        REMEDIES['change from image to image'],
     )
     step = found.step
     yield _significant(
@@ -578,7 +578,7 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'check the velocity topic, the stamps and the site',
+    'assumed velocity': 'check the velocity; on the ground state the site',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',
@@ -591,7 +591,8 @@ REMEDIES: Mapping[str, str] = {
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'estimate with temperature, or calibrate each state alone',
+    'change from image to image': 'on the ground state the site (observer); in space estimate with'
+    ' temperature',
     'star places': 'take more images of other star fields, with a catalog that has proper motions',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',

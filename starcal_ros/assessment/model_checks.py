@@ -113,7 +113,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         step = float(found.gradient[k] - cross @ found.mean) / information
         held = float(estimate.linear.state.parameters[k - camera[0]])
         terms.append(HeldTerm(layout.labels[k], held, held + step, information**-0.5))
-    total, working = np.diag(found.covariance), found.working_variance
+    total, working = np.diag(found.covariance), np.diag(found.working)
     first = layout.places['mountings'].start if 'mountings' in layout else layout.count
     for entry in layout.shared:
         at = layout.of([entry.name])

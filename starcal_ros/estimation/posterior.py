@@ -125,11 +125,6 @@ class Posterior:
     errors: ErrorParts | None = None
 
     @property
-    def working_variance(self) -> Floats:
-        """Variances (P,) under independent errors of the working weights."""
-        return np.asarray(np.diag(self.working))
-
-    @property
     def of_images(self) -> Floats:
         """Mean (m, b) of the unknowns of the images."""
         return np.asarray(self.own - self.back @ self.mean)
@@ -215,7 +210,7 @@ def without_prior(
         return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
-        shown = 1.0 / found.working_variance[at] - precision
+        shown = 1.0 / np.diag(found.working)[at] - precision
         seen = np.isfinite(shown) & (shown > precision)
         variance = np.where(seen, 1.0 / shown, np.inf)
         # The wide prior pulls a little: off + mean is the sum of both by their information.

@@ -215,15 +215,10 @@ def canonical_xyzw(rotation: Rotation) -> Floats:
     return np.asarray(quaternion * np.copysign(1.0, quaternion[3]))
 
 
-def focal_factor(focal: Floats, above_reference_k: Floats) -> Floats:
-    """Factors (m,) of the focal length at temperature differences (m,) from the reference."""
-    return np.asarray(1.0 + _powers(above_reference_k, len(focal)) @ focal)
-
-
 def parameters_at(parameters: Floats, focal: Floats, above_reference_k: Floats) -> Floats:
     """Camera parameters (m, p) at temperatures (m,) above the reference."""
     result = np.tile(parameters, (len(above_reference_k), 1))
-    result[:, _SCALED] *= focal_factor(focal, above_reference_k)[:, None]
+    result[:, _SCALED] *= 1.0 + (_powers(above_reference_k, len(focal)) @ focal)[:, None]
     return result
 
 
@@ -231,8 +226,8 @@ def parameters_chain(parameters: Floats, focal: Floats, above_reference_k: Float
     """Derivatives (m, p, p + q) of `parameters_at` by the parameters, then the q focal terms."""
     p, q = len(parameters), len(focal)
     chain = np.tile(np.eye(p, p + q), (len(above_reference_k), 1, 1))
-    chain[:, _SCALED, _SCALED] *= focal_factor(focal, above_reference_k)[:, None, None]
     powers = _powers(above_reference_k, q)
+    chain[:, _SCALED, _SCALED] *= 1.0 + (powers @ focal)[:, None, None]
     chain[:, _SCALED, p:] = parameters[_SCALED][None, :, None] * powers[:, None, :]
     return chain
 

@@ -193,7 +193,7 @@ def test_a_good_calibration_passes() -> None:
             (
                 'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
                 'of 7.4 sigma (max_held_term_sigma); -60000 by the stars, 0 assumed; check '
-                'the velocity topic, the stamps and the site'
+                'the velocity; on the ground state the site'
             ),
         ),
         (
@@ -214,8 +214,8 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); lens or focus changes: '
-                'estimate with temperature, or calibrate each state alone'
+                'of 0.2 px (max_image_variation_px); on the ground state the site (observer); in '
+                'space estimate with temperature'
             ),
         ),
         (
@@ -452,7 +452,7 @@ def test_the_cause_comes_before_the_statistics() -> None:
         ),
     )
     given = reasons(found, GateOptions())
-    assert 'lens or focus changes: ' in given[0]
+    assert 'on the ground state the site' in given[0]
     assert limits_in(given)[-1] == 'max_cross_validated_residual'
     # One part of the data and what to do, not a list of eighteen.
     assert len(given[-1]) < 200
