@@ -46,7 +46,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
 
 def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
     """Return the estimated amplitudes, each with twice its log likelihood against none."""
-    found, parts = estimate.posterior, len({t.axes for t in estimate.tracker_errors})
+    found, parts = estimate.posterior, len({t.axes for t in estimate.attitudes.trackers})
     octaves = float(np.sqrt((np.exp(found.field.log_px) ** 2).sum()))
     shape = float(np.sqrt((np.exp(found.shape.log_px) ** 2).sum()))
     return (
@@ -70,7 +70,7 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
                 'sigma',
                 one.likelihood_ratio,
             )
-            for k, one in enumerate(estimate.tracker_errors)
+            for k, one in enumerate(estimate.attitudes.trackers)
         ),
     )
 

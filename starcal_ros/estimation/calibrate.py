@@ -64,7 +64,6 @@ from starcal_ros.estimation.tracker_errors import (
     Attitudes,
     measured_rates,
     star_tracker_alignments,
-    TrackerErrors,
 )
 from starcal_ros.estimation.unknowns import (
     Assumptions,
@@ -160,8 +159,6 @@ class Estimate:
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
     shared_errors : tuple of SharedError
-    tracker_errors : tuple of TrackerErrors
-        One for each star tracker with images.
     star_trackers : tuple of StarTrackerAlignment
         Empty where there is one only.
     """
@@ -193,7 +190,6 @@ class Estimate:
     termination: str
     thermal: TemperatureTerms | None
     shared_errors: tuple[SharedError, ...]
-    tracker_errors: tuple[TrackerErrors, ...]
     star_trackers: tuple[StarTrackerAlignment, ...]
 
     @property
@@ -502,7 +498,6 @@ def _result(
         termination=termination,
         thermal=_thermal(after, layout, covariance, ensemble, options),
         shared_errors=judged.errors,
-        tracker_errors=trackers,
         star_trackers=star_tracker_alignments(
             star_tracker_names(ensemble),
             problem,
