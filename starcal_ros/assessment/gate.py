@@ -35,7 +35,9 @@ from starcal_ros.records import (
 from starcal_ros.text import p_value_text, significant
 from starcal_ros.untrusted import shown
 
-_PRIOR_FACTOR = 5.0  # of the limit on the map: a prior is not as good as a calibration
+# Of the limit on the map: a prior is not as good as a calibration, and on a large detector that of
+# the lens moves the corners by more: a tenth of the half diagonal (`lens_prior`).
+_PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX = 5.0, 0.01
 _PRIOR_ROTATION = 13.0  # of the limit on the rotation: 1.5 degrees, and 5 degrees in roll
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
@@ -65,7 +67,8 @@ class GateOptions:
     max_change_px: float = option(
         10.0,
         'largest change of the distortion map from the active calibration, common rotation'
-        ' removed, px; without one five times as much from the prior',
+        ' removed, px; without one five times as much from the prior, or as many times as half of'
+        ' the diagonal has hundreds of px',
         low=0.0,
         high=1e5,
     )
@@ -272,6 +275,8 @@ def _changes(
             before = camera_at(active, calibration.temperature.reference_degc)
     else:
         camera = prior.camera
+        half_px = 0.5 * math.hypot(camera.width, camera.height)
+        factors = max(_PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX * half_px), _PRIOR_ROTATION
         centre_px = estimation.principal_point_prior * max(camera.width, camera.height)
         centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
     rotation_rad, left_px = movement(before, calibration.geometry)

@@ -290,6 +290,17 @@ def test_each_limit_of_a_change_trips_alone(
     assert ('active calibration' in reason) == (active is not None)
 
 
+@pytest.mark.parametrize(('width', 'limit_px'), [(640, 50.0), (1000, 64.0), (2592, 165.9)])
+def test_a_large_detector_may_change_more_from_the_prior(width: int, limit_px: float) -> None:
+    """The prior of the lens, a tenth of the half diagonal in a corner, does not contradict it."""
+    camera = dataclasses.replace(CAMERA, width=width, height=width * 512 // 640)
+    prior = CameraGeometry(camera, PRIOR.star_tracker_from_camera_xyzw)
+    found = dataclasses.replace(GOOD, geometry=prior)
+    rows = judge(found, prior, None, GateOptions(max_rotation_deg=180.0), ASSUMED)
+    (row,) = (row for row in rows if row.option in PAIR)
+    assert row.option == 'max_change_px' and row.limit == pytest.approx(limit_px, abs=0.1)
+
+
 def test_the_remaining_images_must_be_enough() -> None:
     """The limit on images holds for those that fit, not for those collected."""
     options = GateOptions(max_rejected_fraction=1.0)
