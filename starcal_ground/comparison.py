@@ -8,15 +8,50 @@ import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment import agreement
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table, lines_of_sight
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.record_fields import json_object
 from starcal_ros.records import Calibration, CameraGeometry
+
+_SINGULAR = 1e-12  # smaller eigenvalues of a correlation matrix are rounding errors
+
+
+@dataclass(frozen=True)
+class ChiSquared:
+    """A squared Mahalanobis distance and its degrees of freedom; both 0 if nothing is compared."""
+
+    value: float
+    degrees_of_freedom: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability that noise alone gives as large a value; 1 without degrees of freedom."""
+        n = self.degrees_of_freedom
+        return float(chdtrc(n, self.value)) if n else 1.0
+
+
+def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
+    """
+    Squared length of a difference (k,) in the metric of its covariance (k, k) (Mahalanobis).
+
+    Rows without a finite, positive variance are left out; directions in which the covariance is
+    singular do not count as degrees of freedom.
+    """
+    known = np.isfinite(covariance).all(axis=1) & (np.diag(covariance) > 0)
+    if not known.any():
+        return ChiSquared(0.0, 0)
+    difference, covariance = difference[known], covariance[np.ix_(known, known)]
+    # Scaled to a unit diagonal first: fx and k3 differ by many powers of ten.
+    sigma = np.sqrt(np.diag(covariance))
+    scaled, correlation = difference / sigma, covariance / np.outer(sigma, sigma)
+    inverse = np.linalg.pinv(correlation, rcond=_SINGULAR, hermitian=True)
+    rank = int(np.linalg.matrix_rank(correlation, tol=_SINGULAR, hermitian=True))
+    return ChiSquared(float(scaled @ inverse @ scaled), rank)
 
 
 @dataclass(frozen=True)
@@ -85,7 +120,7 @@ class Comparison:
     rotation_rad: float
     before: DifferenceMap
     after: DifferenceMap
-    total: agreement.ChiSquared
+    total: ChiSquared
     notes: tuple[str, ...]
 
     @property
@@ -121,7 +156,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         raise ProductError(
             f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
         )
-    difference = agreement.parameter_difference(b.geometry, a.geometry)
+    difference = parameter_difference(b.geometry, a.geometry)
     sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     rotation, _ = Rotation.align_vectors(new, old)
@@ -141,14 +176,27 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         rotation_rad=float(rotation.magnitude()),
         before=_map(new - old, a.geometry, sight_sigma_rad),
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
-        total=agreement.chi_squared(difference[:compared], covariance),
+        total=chi_squared(difference[:compared], covariance),
         notes=_notes(a, b, difference, sigma),
     )
 
 
+def parameter_difference(a: CameraGeometry, b: CameraGeometry) -> Floats:
+    """Parameters of a less those of b, (p,): camera, then `alignment_difference_rad`."""
+    of_camera = a.camera.parameters - b.camera.parameters
+    return np.concatenate([of_camera, alignment_difference_rad(a, b)])
+
+
+def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
+    """The passive small rotation (3,) of the camera frame that takes alignment b to a."""
+    # a_from_b = exp(-[dtheta x]), so b_from_a has dtheta as its rotation vector.
+    b_from_a = b.star_tracker_from_camera.inv() * a.star_tracker_from_camera
+    return np.asarray(b_from_a.as_rotvec())
+
+
 def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
     """Lines of sight of the grid, (GRID^2, 3), star tracker frame."""
-    directions = agreement.lines_of_sight(geometry, GRID, GRID)
+    directions = lines_of_sight(geometry, GRID, GRID)
     if not np.isfinite(directions).all():
         raise ProductError(
             'a calibration has pixels without a line of sight: its distortion folds'

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.camera.projection import ros_fit

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment import lookup
 from starcal_ros.assessment.gate import GateOptions
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera import project as project_in_camera
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations

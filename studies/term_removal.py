@@ -16,11 +16,11 @@ from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.levenberg_marquardt import covariance, NotObservable
-from starcal_ros.estimation.problem import image_parameters, Problem, State
+from starcal_ros.estimation.calibrate import Estimate, residuals_px
+from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.search import minimise, Minimum
-from starcal_ros.estimation.star_equations import arrange, residuals_px
+from starcal_ros.estimation.star_equations import arrange
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, moved
 
 _HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero
@@ -119,9 +119,8 @@ def _with_search_alone(estimate: Estimate) -> Estimate:
     linear, found = estimate.linear, estimate.posterior
     problem, own = linear.problem, found.of_images[:, IMAGE_ROTATION]
     state = moved(problem, linear.state, linear.layout, found.mean, own)
-    rotations = state.camera_from_icrf.as_matrix()
     table = estimate.table
-    explained = residuals_px(table, problem.model, image_parameters(problem, state), rotations)
+    explained = residuals_px(problem, state, table)
     camera = dataclasses.replace(estimate.geometry.camera, field=None)
     measured_px = table.measured_px - explained + estimate.residual_px
     return dataclasses.replace(
@@ -148,7 +147,9 @@ def _distances(problem: Problem, parameters: Floats, variance: Floats) -> dict[s
 
 def _sigmas(problem: Problem, solution: Minimum) -> dict[str, float]:
     """Distances of the parameters of a solution in its sigmas, the field and others known."""
-    variance = np.diag(covariance(solution.normal)[0])
+    normal = solution.normal
+    hidden = np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
+    variance = np.diag(inverse(normal.A - hidden))
     return _distances(problem, solution.state.parameters, variance)
 
 
@@ -161,10 +162,7 @@ def _of_prior(names: tuple[str, ...], before: Problem, after: Problem) -> float:
 
 def _residuals(estimate: Estimate, problem: Problem, state: State) -> TermRemoval:
     """Residuals and map of a state; of which term, the caller adds."""
-    rotations = state.camera_from_icrf.as_matrix()
-    parameters = image_parameters(problem, state)
-    residual_px = residuals_px(estimate.table, problem.model, parameters, rotations)
-    residual_px = residual_px[estimate.kept]
+    residual_px = residuals_px(problem, state, estimate.table)[estimate.kept]
     std_u, std_v = residual_px.std(axis=0)
     camera = estimate.geometry.camera
     changed = dataclasses.replace(camera, parameters=state.parameters)

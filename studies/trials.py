@@ -16,11 +16,11 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.comparison import chi_squared, parameter_difference
 from starcal_ground.simulation.centroids import scaled_inverse
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import chi_squared, lines_of_sight, parameter_difference
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table, lines_of_sight
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD

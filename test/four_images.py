@@ -23,8 +23,8 @@ from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.problem import Problem, State
-from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.star_equations import arrange, Measurements, StarTable
+from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions, Layout, unknowns_of
 
 WIDTH, HEIGHT = 1200, 800

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from starcal_ground.report import verdict
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.requirements import OPTION
+from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
 from starcal_ros.text import printable
@@ -185,7 +185,7 @@ def _gate(calibration: Calibration) -> Table:
     failed = [check for check in calibration.gate if check.passed is False]
     passed = sorted(
         (check for check in calibration.gate if check.passed and share_of_limit(check) > 0),
-        key=lambda check: (check.option == OPTION, share_of_limit(check)),
+        key=lambda check: (check.option == REQUIREMENTS, share_of_limit(check)),
         reverse=True,
     )
     for check in [*failed, *passed[:_TIGHTEST]]:

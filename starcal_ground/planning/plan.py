@@ -31,9 +31,9 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import Problem, State, whitened_attitude_errors
-from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
+from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup

@@ -8,8 +8,7 @@ import dataclasses
 import numpy as np
 
 from starcal_ground.planning.plan import LINE_OF_SIGHT, plan_pointings, Request
-from starcal_ros.assessment.gate import reasons_of
-from starcal_ros.assessment.requirements import FOCAL, OPTION, POINTING, requirements_of
+from starcal_ros.assessment.gate import FOCAL, POINTING, reasons_of, REQUIREMENTS, requirements_of
 from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline.campaign import Campaign
 from starcal_ros.records import GateCheck
@@ -27,7 +26,7 @@ def with_images_to_reach(campaign: Campaign) -> Campaign:
     """
     wanted = iter(requirements_of(campaign.setup.gate.requirements))
     gate = tuple(
-        _planned(campaign, next(wanted).quantity, check) if check.option == OPTION else check
+        _planned(campaign, next(wanted).quantity, check) if check.option == REQUIREMENTS else check
         for check in campaign.calibration.gate
     )
     if gate == campaign.calibration.gate:

@@ -18,8 +18,8 @@ from starcal_ground.comparison import Comparison, DifferenceMap
 from starcal_ground.report import svg
 from starcal_ground.report.verdict import VISIBLE_PX
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import movement
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.lookup import movement
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.errors import OptionError

@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_ground.report import svg
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import whitening

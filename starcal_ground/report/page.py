@@ -27,7 +27,7 @@ from starcal_ground.report import detector_figures, figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
 from starcal_ground.report.thumbnails import star_of, Thumbnail
 from starcal_ground.report.verdict import Row
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.bag import reader

@@ -9,13 +9,17 @@ import math
 
 import numpy as np
 
+from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.assessment.observability import movement_px
-from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.assessment.requirements import answers, OPTION
-from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.assessment.gate import REMEDIES, requirement_answers, REQUIREMENTS
+from starcal_ros.camera import (
+    CameraModel,
+    INTRINSIC_NAMES,
+    line_of_sight,
+    pixel_grid,
+    project_parameters,
+)
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
 
@@ -103,7 +107,7 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], o
 
 def met_requirements(calibration: records.Calibration) -> list[str]:
     """A sentence on each requirement that is met; one that is missed is among the reasons."""
-    met = [text for text in answers(calibration) if text.endswith(': met')]
+    met = [text for text in requirement_answers(calibration) if text.endswith(': met')]
     return [f'{text[0].upper()}{text[1:]}.' for text in met]
 
 
@@ -127,9 +131,9 @@ def next_step(calibration: records.Calibration) -> str:
         f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
     )
     text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
-    if {*failed} == {OPTION}:
+    if {*failed} == {REQUIREMENTS}:
         text = 'The sigmas hold, but miss a requirement.'
-    steps = _against_sigma(calibration) if OPTION in failed else []
+    steps = _against_sigma(calibration) if REQUIREMENTS in failed else []
     return ' '.join([text, *steps])
 
 
@@ -248,7 +252,7 @@ def parameter_rows(
     if prior and prior.camera.model != camera.model:
         prior = None  # parameters of another lens model are no start of these
     changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
-    moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
+    moves, sigma_moves = _movement_px(camera, changes), _movement_px(camera, sigma)
     rows = []
     for k, name in enumerate(camera.parameter_names):
         known, changed = sigma[k] > 0, prior and changes[k]
@@ -342,3 +346,16 @@ def sigma_text(name: str, sigma: float) -> str:
         per = '/degC' if name.endswith('_temperature') else ''
         return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
     return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
+
+
+def _movement_px(camera: CameraModel, changes: Floats) -> Floats:
+    """
+    Largest shift (k,) of a star image over the detector, px.
+
+    For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
+    """
+    pixels = pixel_grid(camera, 25, 20)
+    directions = line_of_sight(camera, pixels)
+    moved = camera.parameters - np.diag(changes)
+    found = np.stack([project_parameters(camera.model, row, directions) for row in moved])
+    return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))

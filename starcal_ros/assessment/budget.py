@@ -381,11 +381,11 @@ def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:
 
 
 def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
-    if not estimate.tracker_errors:
+    if not estimate.attitudes.trackers:
         return ''
     stated = options.star_tracker_slow_arcsec
     assumed = f'{significant(stated, 3)}″ stated' if stated else 'not given: as the noise assumed'
-    ratio = max(one.likelihood_ratio for one in estimate.tracker_errors)
+    ratio = max(one.likelihood_ratio for one in estimate.attitudes.trackers)
     slow = significant(_slow(estimate), 3)
     return f'{assumed}; estimated: {slow}″, 2 log L {max(ratio, 0.0):.1f}'
 
@@ -393,7 +393,7 @@ def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
 def _slow(estimate: Estimate) -> float:
     """Return the 1-sigma of the slow error of the star trackers, arcsec."""
     noise = estimate.star_tracker_sigma_rad / ARCSECOND_RAD
-    trackers = estimate.tracker_errors
+    trackers = estimate.attitudes.trackers
     return float(np.mean([t.slow / t.noise * noise[t.axes[0]] for t in trackers]))
 
 

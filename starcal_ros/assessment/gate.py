@@ -1,32 +1,43 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The gate: the limits that a calibration must meet to become active, and the checks."""
+"""The gate: limits that a calibration must meet to become active, checks, and remedies."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 import dataclasses
 from dataclasses import dataclass
 import math
+import re
 
 import numpy as np
 
-from starcal_ros.assessment.agreement import movement
-from starcal_ros.assessment.remedies import REMEDIES
-from starcal_ros.assessment.requirements import requirement_checks
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import movement
+from starcal_ros.assessment.observability import map_sigma_px
+from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.estimation.problem import camera_at
 from starcal_ros.options import option
+from starcal_ros.record_fields import nearest
 from starcal_ros.records import (
+    ALIGNMENT_NAMES,
     Calibration,
     CameraGeometry,
     GateCheck,
     ModelChecks,
     ResidualBin,
     StarTrackerAlignment,
+    TOTAL,
 )
 from starcal_ros.text import p_value_text, significant
+from starcal_ros.untrusted import shown
 
-_PRIOR_FACTOR = 5.0  # of the limit on the map: a prior is not as good as a calibration
+# Of the limit on the map: a prior is not as good as a calibration, and on a large detector that of
+# the lens moves the corners by more: a tenth of the half diagonal (`lens_prior`).
+_PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX = 5.0, 0.01
 _PRIOR_ROTATION = 13.0  # of the limit on the rotation: 1.5 degrees, and 5 degrees in roll
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
@@ -56,7 +67,8 @@ class GateOptions:
     max_change_px: float = option(
         10.0,
         'largest change of the distortion map from the active calibration, common rotation'
-        ' removed, px; without one five times as much from the prior',
+        ' removed, px; without one five times as much from the prior, or as many times as half of'
+        ' the diagonal has hundreds of px',
         low=0.0,
         high=1e5,
     )
@@ -263,6 +275,8 @@ def _changes(
             before = camera_at(active, calibration.temperature.reference_degc)
     else:
         camera = prior.camera
+        half_px = 0.5 * math.hypot(camera.width, camera.height)
+        factors = max(_PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX * half_px), _PRIOR_ROTATION
         centre_px = estimation.principal_point_prior * max(camera.width, camera.height)
         centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
     rotation_rad, left_px = movement(before, calibration.geometry)
@@ -318,7 +332,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'change of the camera from image to image in a corner',
         found.image_variation_px,
         'px',
-        f'lens or focus changes: {REMEDIES["change from image to image"]}',
+        REMEDIES['change from image to image'],
     )
     step = found.step
     yield _significant(
@@ -395,3 +409,200 @@ def _significant(
     if not check.passed and not likely:
         note += f'; {remedy}'
     return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)
+
+
+REQUIREMENTS = 'requirements'
+LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
+_UNITS: dict[str, tuple[str, ...]] = {
+    LINE_OF_SIGHT: ('arcsec',),
+    MAP: ('arcsec', 'px'),
+    POINTING: ('arcsec',),
+    **dict.fromkeys([FOCAL, *INTRINSIC_NAMES], ('px',)),
+    **dict.fromkeys(ALIGNMENT_NAMES, ('arcsec',)),
+    **{name: ('',) for names in COEFFICIENTS.values() for name in names},
+}
+_FORM = re.compile(r'\s*(\w+)\s*=\s*([\d.]+(?:e-?\d+)?)\s*([a-z]*)\s*(?:@\s*([\d.]+)\s*%\s*)?')
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """
+    An upper limit of a 1-sigma.
+
+    ``quantity`` is ``line_of_sight``, ``map`` (the camera alone, the rotation common to the
+    detector removed), each over a ``share`` of the detector; ``pointing`` (lines of sight in the
+    star tracker frame, RMS over the detector), ``f`` (both focal lengths), or a parameter.
+
+    >>> Requirement.of('line_of_sight=5arcsec@98%')
+    Requirement(quantity='line_of_sight', limit=5.0, unit='arcsec', share=0.98)
+    """
+
+    quantity: str
+    limit: float
+    unit: str
+    share: float = 1.0
+
+    @classmethod
+    def of(cls, text: str) -> Requirement:
+        """Requirement of a text; raises OptionError with what is allowed."""
+        match = _FORM.fullmatch(text)
+        if match is None:
+            raise OptionError(
+                f'{REQUIREMENTS}: {shown(text)} is not of the form line_of_sight=5arcsec@98%,'
+                ' map=0.1px, pointing=10arcsec or f=0.1px'
+            )
+        quantity, number, unit, percent = match.groups()
+        if quantity not in _UNITS:
+            raise OptionError(
+                f'{REQUIREMENTS}: {quantity} is not line_of_sight, map, pointing, f or a'
+                f' parameter{nearest(quantity, _UNITS)}'
+            )
+        if unit not in _UNITS[quantity]:
+            over = f'@{percent}%' if percent and quantity in (LINE_OF_SIGHT, MAP) else ''
+            written = ' or '.join(f'{quantity}={number}{name}{over}' for name in _UNITS[quantity])
+            raise OptionError(f'{REQUIREMENTS}: {text}: the unit does not fit: write {written}')
+        try:
+            limit, share = float(number), float(percent or 100.0) / 100.0
+        except ValueError as error:
+            raise OptionError(f'{REQUIREMENTS}: {text}: not a number') from error
+        if percent and quantity not in (LINE_OF_SIGHT, MAP):
+            raise OptionError(
+                f'{REQUIREMENTS}: {text}: only line_of_sight and map are over a share'
+            )
+        if not (limit > 0.0 and 0.0 < share <= 1.0):
+            raise OptionError(
+                f'{REQUIREMENTS}: {text}: the sigma must be above 0, and the share at most 100 %'
+            )
+        return cls(quantity, limit, unit, share)
+
+    @property
+    def name(self) -> str:
+        """The limited sigma in words."""
+        what = {
+            LINE_OF_SIGHT: '1-sigma of a line of sight',
+            MAP: '1-sigma of the distortion map',
+            POINTING: '1-sigma of the pointing, rms over the detector',
+        }.get(self.quantity, f'1-sigma of {self.quantity}')
+        if self.quantity not in (LINE_OF_SIGHT, MAP):
+            return what
+        share = f'{what} over {100 * self.share:g} % of the detector'
+        return share if self.share < 1.0 else f'largest {what}'
+
+    def sigma(self, calibration: Calibration) -> float:
+        """The sigma of a calibration in the unit; NaN where a part of it is not known."""
+        maps, scale = calibration.maps, 1.0 if self.unit != 'arcsec' else ARCSECOND_RAD
+        if maps is None:
+            raise ValueError('calibration: the gate needs its detector maps')
+        if self.quantity == POINTING:
+            budget = calibration.sigma_budget if calibration.has_alignment else ()
+            return next((p.pointing_arcsec for p in budget if p.cause == TOTAL), math.nan)
+        if self.quantity == LINE_OF_SIGHT:
+            # Without an alignment the common rotation has no meaning.
+            aligned = calibration.has_alignment
+            full = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
+            return self._over(full)
+        if self.quantity == MAP and self.unit == 'arcsec':
+            return self._over(maps.shape_sigma_arcsec)
+        if self.quantity == MAP:
+            try:
+                camera = calibration.geometry.camera
+                return self._over(map_sigma_px(camera, calibration.map_covariance))
+            except np.linalg.LinAlgError:
+                return math.nan
+        names = ('fx', 'fy') if self.quantity == FOCAL else (self.quantity,)
+        sigma = dict(zip(calibration.parameter_names, calibration.sigma, strict=True))
+        # One that is held has no sigma of its own.
+        return float(np.max([sigma.get(name, 0.0) or math.nan for name in names])) / scale
+
+    def _over(self, sigma: Floats) -> float:
+        """Upper limit of a sigma over the share; NaN where it has none."""
+        known = np.where(np.isfinite(sigma), sigma, np.inf)
+        limit = float(np.quantile(known, self.share, method='inverted_cdf'))
+        return limit if math.isfinite(limit) else math.nan
+
+
+def requirements_of(texts: Iterable[str]) -> tuple[Requirement, ...]:
+    """Requirements of the option; raises OptionError for one that is not understood."""
+    return tuple(Requirement.of(text) for text in texts if text)
+
+
+def requirement_checks(calibration: Calibration, texts: Iterable[str]) -> Iterator[GateCheck]:
+    """
+    A check of each requirement, with by how much it is missed.
+
+    Raises ValueError when the calibration has no maps.
+    """
+    for wanted in requirements_of(texts):
+        sigma = wanted.sigma(calibration)
+        passed = sigma <= wanted.limit  # NaN is not
+        note = 'met' if passed else 'it is not estimated'
+        if sigma > wanted.limit:
+            unit = wanted.unit and f' {wanted.unit}'
+            note = f'missed by {significant(sigma - wanted.limit, 2)}{unit}'
+        yield GateCheck(wanted.name, REQUIREMENTS, sigma, wanted.limit, wanted.unit, passed, note)
+
+
+def requirement_answers(calibration: Calibration) -> tuple[str, ...]:
+    """A sentence on each requirement of a judged calibration: the sigma, the limit, the note."""
+    return tuple(
+        f'{check.name} {check.found_text}, at most {check.limit_text} required: {check.note}'
+        for check in calibration.gate
+        if check.option == REQUIREMENTS
+    )
+
+
+REMEDIES: Mapping[str, str] = {
+    # Reasons to refuse images (`IMAGE_REFUSALS`).
+    'bad_encoding': 'record images of one channel, 8 or 16 bit, raw, as PNG or JPEG',
+    'bad_layout': 'correct width, height, step and data where the message is made',
+    'bad_stamp': 'stamp the images in UTC since 1970, and check stamp_offset_s',
+    'bad_attitude': 'send unit quaternions, and none while the star tracker has no lock',
+    'no_attitude': 'record attitudes from before the first image to after the last',
+    'attitude_gap': (
+        'record attitudes more often, or raise max_attitude_gap_s if the vehicle turns evenly'
+    ),
+    'frozen_attitude': 'record the attitudes that the star tracker measures',
+    'out_of_order': 'use one topic for each camera',
+    'overexposed': 'expose for a shorter time',
+    'blank': 'check that the camera is read out',
+    'frozen': 'check that the camera is read out',
+    'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
+    'glare': 'keep Sun, Moon and Earth out of the field',
+    'smeared': 'expose for a shorter time, or point more steadily',
+    'not_in_catalog': (
+        'raise magnitude_limit, or give starcal catalog a table of this sky (docs/mission.md)'
+    ),
+    'no_match': 'ask the diagnostics of the star observer, or starcal diagnose, for the cause',
+    'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
+    # Checks of the gate, by option, with the section of the report.
+    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'
+    ' attitudes and stamps of misfit images (Alignment)',
+    'min_images': 'take more images',
+    'min_coverage': 'take images with stars in the empty cells (Coverage)',
+    'max_rotation_deg': 'check the alignment assumed (prior_alignment) and the mounting',
+    'change of the camera': 'find out if the camera has changed',
+    'change of the mounting': 'find out if the mounting has changed',
+    # Assumed values that the stars contradict, by the start of their label, and faults they show.
+    'assumed velocity': 'check the velocity; on the ground state the site',
+    'assumed readout': 'check shutter and readout_s',
+    'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
+    'assumed mounting': 'check more_alignments',
+    'detector step': 'columns or rows are lost or shifted there: check the read-out',
+    # Causes of the sigma of a line of sight (`SigmaPart.cause`).
+    'stars': 'take more images',
+    'velocity': 'state the velocity of the camera: the topic velocity or observer_velocity_m_s; '
+    'of photographs, observer and their times (EXIF, FITS)',
+    'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
+    'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
+    'field': 'take more images with stars at other places on the detector',
+    'fine structure': 'take more images with stars at other places on the detector',
+    'change from image to image': 'on the ground state the site (observer); in space estimate with'
+    ' temperature',
+    'star places': 'take more images of other star fields, with a catalog that has proper motions',
+    'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
+    'temperature': 'take images over a wider range of temperatures',
+    'star tracker noise': 'take more images',
+    'star tracker slow error': 'take images in more attitudes of the star tracker',
+    'held parameters': 'estimate the held parameters (estimate)',
+}
+"""Name -> remedy; a check of the gate that has none states it in its note."""

@@ -1,17 +1,18 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Lines of sight of pixels with their sigmas: the whole camera as a table."""
+"""Lines of sight with their sigmas, the whole camera as a table; how two cameras differ."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.record_fields import Record
-from starcal_ros.records import MapCovariance
+from starcal_ros.records import CameraGeometry, MapCovariance
 
 CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
 GRID = 25  # pixels a side over which calibrations are compared and common rotations taken
@@ -172,3 +173,35 @@ def common_rotation(camera: CameraModel, grid: Derivatives | None = None) -> Flo
 def _rotations(directions: Floats) -> Floats:
     """Movement (n, 3, 3) of directions (n, 3) by small rotations about the three axes."""
     return np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
+
+
+def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
+    """
+    Unit directions of a grid of pixels in the star tracker frame, (columns * rows, 3), by rows.
+
+    NaN where a pixel has no line of sight.
+    """
+    in_camera = line_of_sight(geometry.camera, pixel_grid(geometry.camera, columns, rows))
+    return np.asarray(geometry.star_tracker_from_camera.apply(in_camera))
+
+
+def movement(
+    before: CameraGeometry, after: CameraGeometry, columns: int = 15, rows: int = 12
+) -> tuple[float, Floats]:
+    """
+    Movement of the lines of sight of the pixels of a camera in the star tracker frame.
+
+    Returns
+    -------
+    rotation_rad : float
+        The rotation common to all pixels.
+    left_px : (columns * rows,)
+        The remaining movement at a grid of pixels, in pixels at the centre.  Both results are
+        infinite if a pixel no longer has a line of sight.
+    """
+    old, new = (lines_of_sight(geometry, columns, rows) for geometry in (before, after))
+    if not (np.isfinite(old).all() and np.isfinite(new).all()):
+        return np.inf, np.full(len(old), np.inf)
+    rotation, _ = Rotation.align_vectors(new, old)
+    left_rad = np.linalg.norm(new - rotation.apply(old), axis=1)
+    return float(rotation.magnitude()), left_rad * after.camera.parameters[0]

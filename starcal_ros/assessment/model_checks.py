@@ -46,7 +46,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
 
 def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
     """Return the estimated amplitudes, each with twice its log likelihood against none."""
-    found, parts = estimate.posterior, len({t.axes for t in estimate.tracker_errors})
+    found, parts = estimate.posterior, len({t.axes for t in estimate.attitudes.trackers})
     octaves = float(np.sqrt((np.exp(found.field.log_px) ** 2).sum()))
     shape = float(np.sqrt((np.exp(found.shape.log_px) ** 2).sum()))
     return (
@@ -70,7 +70,7 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
                 'sigma',
                 one.likelihood_ratio,
             )
-            for k, one in enumerate(estimate.tracker_errors)
+            for k, one in enumerate(estimate.attitudes.trackers)
         ),
     )
 
@@ -113,7 +113,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         step = float(found.gradient[k] - cross @ found.mean) / information
         held = float(estimate.linear.state.parameters[k - camera[0]])
         terms.append(HeldTerm(layout.labels[k], held, held + step, information**-0.5))
-    total, working = np.diag(found.covariance), found.working_variance
+    total, working = np.diag(found.covariance), np.diag(found.working)
     first = layout.places['mountings'].start if 'mountings' in layout else layout.count
     for entry in layout.shared:
         at = layout.of([entry.name])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.camera import CameraModel, project_parameters
+from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
@@ -33,16 +33,21 @@ from starcal_ros.estimation.options import (
 from starcal_ros.estimation.outliers import dropped_stars
 from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
 from starcal_ros.estimation.problem import (
-    AttitudeErrors,
     canonical_xyzw,
     image_parameters,
     Problem,
-    star_tracker_alignments,
+    reference_degc,
     star_tracker_names,
     State,
 )
-from starcal_ros.estimation.rates import measured_rates
-from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
+from starcal_ros.estimation.search import (
+    minimise,
+    Minimum,
+    moved_to_stars,
+    problem_of,
+    start_of,
+    supported_terms,
+)
 from starcal_ros.estimation.shared_errors import (
     observation_groups,
     pixel_variance_px2,
@@ -55,8 +60,11 @@ from starcal_ros.estimation.star_equations import (
     star_table,
     StarTable,
 )
-from starcal_ros.estimation.temperature import reference_degc, why_unsupported
-from starcal_ros.estimation.tracker_errors import TrackerErrors
+from starcal_ros.estimation.tracker_errors import (
+    Attitudes,
+    measured_rates,
+    star_tracker_alignments,
+)
 from starcal_ros.estimation.unknowns import (
     Assumptions,
     FIELD_OCTAVES,
@@ -68,7 +76,6 @@ from starcal_ros.estimation.unknowns import (
 )
 from starcal_ros.estimation.weights import (
     agree,
-    Attitudes,
     CentroidVariance,
     Data,
     degrees_of_freedom,
@@ -147,14 +154,11 @@ class Estimate:
         Stars that misfit across images and were left out of all.
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
-    attitude_error_rad, attitude_covariance_rad2, attitude_seen : (m, 3), (m, 3, 3), (m,) bool
-        Star-tracker errors as the stars show them.
+    attitudes : Attitudes
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
     shared_errors : tuple of SharedError
-    tracker_errors : tuple of TrackerErrors
-        One for each star tracker with images.
     star_trackers : tuple of StarTrackerAlignment
         Empty where there is one only.
     """
@@ -181,14 +185,11 @@ class Estimate:
     misfit_image: Mask
     dropped_catalog_id: NDArray[np.int64]
     alignment_scatter_arcsec: float
-    attitude_error_rad: Floats
-    attitude_covariance_rad2: Floats
-    attitude_seen: Mask
+    attitudes: Attitudes
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
     shared_errors: tuple[SharedError, ...]
-    tracker_errors: tuple[TrackerErrors, ...]
     star_trackers: tuple[StarTrackerAlignment, ...]
 
     @property
@@ -215,12 +216,7 @@ def estimate_calibration(
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
     problem = problem_of(ensemble, prior, options)
-    order, with_rate = options.focal_temperature_order, options.alignment_temperature
-    note = (order or with_rate) and why_unsupported(
-        np.array([image.temperature_degc for image in ensemble.images]), order
-    )
-    if note:
-        order, with_rate = 0, False
+    order, with_rate, note = supported_terms(ensemble, options)
     stated_rad = assumed_tracker_sigma_rad(options)
     data = Data(
         table,
@@ -250,14 +246,14 @@ def estimate_calibration(
 
 def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) -> Estimate:
     """Return the estimate from a start."""
-    table, camera = data.table, data.prior.camera
+    table = data.table
     judged = Judged(CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None)
     measurements = arrange(table, judged.kept, judged.covariance_px2(table))
     solution = _robust_search(problem, start, measurements)
     state, iterations = solution.state, solution.iterations
     _check_not_mirrored(state)
-    residual_px = _residuals_px(problem, state, table, None, None, camera)
-    from_sky = sky_rotations(state, table, camera)
+    residual_px = residuals_px(problem, state, table)
+    from_sky = sky_rotations(state, table, data.prior.camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
     shape_px: Floats | float = _FIRST_SHAPE_PX
     before: _Round | None = None
@@ -337,7 +333,7 @@ def _round(
     shared[layout.of(_IN_STATE)] *= share
     own = found.own - found.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
-    left_px = _residuals_px(problem, after, table, layout, found, camera)
+    left_px = residuals_px(problem, after, table, layout, found, size)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
@@ -398,15 +394,20 @@ def field_of(layout: Layout, found: Posterior, size: tuple[int, int]) -> Detecto
     return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
-def _residuals_px(
+def residuals_px(
     problem: Problem,
     state: State,
     table: StarTable,
-    layout: Layout | None,
-    found: Posterior | None,
-    camera: CameraModel,
+    layout: Layout | None = None,
+    found: Posterior | None = None,
+    size: tuple[int, int] = (0, 0),
 ) -> Floats:
-    """Measured minus predicted pixels (n, 2) of all observations at a state."""
+    """
+    Measured minus predicted pixels (n, 2) of all observations at a state.
+
+    With what is not in the state at its mean, where there is a posterior: ``size`` (width, height)
+    is that of the detector.
+    """
     own = image_parameters(problem, state)
     measured = table.measured_px
     rotations = state.camera_from_icrf.as_matrix()
@@ -417,7 +418,6 @@ def _residuals_px(
         modes = layout['shape'].camera
         assert modes is not None
         own += np.einsum('mps,ms->mp', modes, shapes_px)
-        size = camera.width, camera.height
         measured = measured - field_of(layout, found, size).displacement_px(measured)
         turned = np.zeros((3, len(table)))
         for entry in layout.entries:
@@ -469,14 +469,6 @@ def _result(
         float(np.sqrt(attitudes.error_rad[shown].var(axis=0).mean())) if shown.any() else 0.0
     )
     lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
-    star_trackers = star_tracker_names(ensemble)
-    errors = AttitudeErrors(
-        data.time_ns,
-        attitudes.error_rad,
-        np.einsum('mii->mi', attitudes.covariance_rad2),
-        noise * data.stated_rad,
-        attitudes.seen,
-    )
     mountings = layout.of(['alignment', 'mountings'])
     return Estimate(
         geometry=geometry,
@@ -501,16 +493,19 @@ def _result(
         misfit_image=attitudes.misfit | lost,
         dropped_catalog_id=dropped_stars(table, kept),
         alignment_scatter_arcsec=scatter_rad / ARCSECOND_RAD,
-        attitude_error_rad=attitudes.error_rad,
-        attitude_covariance_rad2=attitudes.covariance_rad2,
-        attitude_seen=attitudes.seen,
+        attitudes=attitudes,
         iterations=iterations,
         termination=termination,
         thermal=_thermal(after, layout, covariance, ensemble, options),
         shared_errors=judged.errors,
-        tracker_errors=trackers,
         star_trackers=star_tracker_alignments(
-            star_trackers, problem, after, covariance[np.ix_(mountings, mountings)], errors
+            star_tracker_names(ensemble),
+            problem,
+            after,
+            covariance[np.ix_(mountings, mountings)],
+            attitudes,
+            data.time_ns,
+            noise * data.stated_rad,
         ),
     )
 

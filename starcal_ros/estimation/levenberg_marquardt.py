@@ -148,34 +148,6 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     return shared, w - W @ shared
 
 
-def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
-    """
-    Blocks of the inverse of the normal matrix.
-
-    Returns
-    -------
-    shared : (p, p)
-    cross : (m, q, p)
-        Between each block and the shared unknowns.
-    blocks : (m, q, q)
-        Covariance of each block.
-
-    Raises
-    ------
-    NotObservable
-        When the matrix is not positive definite.
-    """
-    p = len(normal.a)
-    if len(normal.C) == 0:
-        return inverse(normal.A), np.empty_like(normal.B), np.empty_like(normal.C)
-    C_inverse = inverse(normal.C)
-    W = C_inverse @ normal.B
-    flat_B = normal.B.reshape(normal.B.shape[0] * normal.B.shape[1], p)
-    shared = inverse(_schur_complement(normal.A, flat_B, W))
-    cross = -W @ shared
-    return shared, cross, C_inverse - cross @ np.swapaxes(W, -1, -2)
-
-
 def levenberg_marquardt(
     state: StateT,
     evaluate: Callable[[StateT], NormalT],

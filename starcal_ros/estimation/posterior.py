@@ -125,11 +125,6 @@ class Posterior:
     errors: ErrorParts | None = None
 
     @property
-    def working_variance(self) -> Floats:
-        """Variances (P,) under independent errors of the working weights."""
-        return np.asarray(np.diag(self.working))
-
-    @property
     def of_images(self) -> Floats:
         """Mean (m, b) of the unknowns of the images."""
         return np.asarray(self.own - self.back @ self.mean)
@@ -215,7 +210,7 @@ def without_prior(
         return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
-        shown = 1.0 / found.working_variance[at] - precision
+        shown = 1.0 / np.diag(found.working)[at] - precision
         seen = np.isfinite(shown) & (shown > precision)
         variance = np.where(seen, 1.0 / shown, np.inf)
         # The wide prior pulls a little: off + mean is the sum of both by their information.
@@ -305,32 +300,14 @@ def _shape_sums(
     sums: StarSums, linear: Linearisation, solver: _Solver, field_px: Floats
 ) -> ShapeSums:
     """
-    Return what each image shows of its shape, the field known.
+    Return what each image shows of its shape, the field known and its other unknowns eliminated.
 
     The images are alike in the field; each has stars in other parts of it.
     """
     layout = linear.layout
-    information, gradient, cross, shared, right = _without_rotation(sums, layout, field_px)
-    at = seen_by_stars(layout)
-    precision = solver.precision[at]
-    free = np.flatnonzero(np.isfinite(precision))
-    return ShapeSums(
-        information,
-        gradient,
-        cross[:, :, free],
-        shared[np.ix_(free, free)] + np.diag(precision[free]),
-        right[free] - precision[free] * layout.prior_offset[at][free],
-        linear.problem.time_s,
-    )
-
-
-def _without_rotation(
-    sums: StarSums, layout: Layout, field_px: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the sums of shapes and shared unknowns, the images' other unknowns eliminated."""
     blocks = sums.blocks.copy()
     blocks[:, :-1, -1] -= (field_px @ sums.field_cross)[:, :-1]
-    stars, own, rotation = chain_columns(layout)
+    _, own, rotation = chain_columns(layout)
     size = np.einsum('mii->mi', blocks[:, rotation, rotation]).max(axis=1)
     columns = np.arange(blocks.shape[1])
     others = columns[rotation]
@@ -342,14 +319,17 @@ def _without_rotation(
     C = blocks[:, others[:, None], others] + weak[:, :, None] * np.eye(len(others))
     back = np.linalg.solve(C, blocks[:, others])
     left = blocks - blocks[:, others].transpose(0, 2, 1) @ back
-    shape = columns[own][layout.places['shape']]
-    total = left.sum(axis=0)
-    return (
+    shape, total = columns[own][layout.places['shape']], left.sum(axis=0)
+    at = seen_by_stars(layout)  # the first columns
+    precision, offset = solver.precision[at], layout.prior_offset[at]
+    free = np.flatnonzero(np.isfinite(precision))
+    return ShapeSums(
         left[:, shape[:, None], shape],
         left[:, shape, -1],
-        left[:, shape, stars],
-        total[stars, stars],
-        total[stars, -1],
+        left[:, shape[:, None], free],
+        total[np.ix_(free, free)] + np.diag(precision[free]),
+        total[free, -1] - precision[free] * offset[free],
+        linear.problem.time_s,
     )
 
 

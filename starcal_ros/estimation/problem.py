@@ -11,8 +11,15 @@ With R_k = camera_from_icrf of image k, the attitude error of the star tracker i
 ``eta_k = -Log(A' R_k T_k')``, a small rotation in the star tracker frame, where A =
 camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
 
-With terms of temperature (`estimation.temperature`), parameters and A are those of the image; the
-derivatives by the shared unknowns follow by the chain rule, with one small matrix for each image.
+With terms of temperature (beyond the paper; as in NASA's GIANT), parameters and A are those of the
+image, ``dT`` above the reference::
+
+    fx, skew, fy              times g = 1 + a1 dT + a2 dT^2
+    camera_from_star_tracker  exp(-[b dT x]) times that at the reference
+
+``a`` are the focal terms, ``b`` the alignment rate: a small passive rotation of the camera frame
+per degree.  The derivatives by the shared unknowns follow by the chain rule, with one small matrix
+for each image.
 
 Several star trackers have different axes.  T_k is then that of the tracker that gave the attitude.
 Its alignment is A of the first tracker, turned by its mounting M (first from this one) and by the
@@ -23,21 +30,19 @@ rotation a of A turns that alignment by ``a + h``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import stdtr
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import parameter_names
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import Measurements, normal_blocks
-from starcal_ros.estimation.temperature import parameters_at, turns
-from starcal_ros.records import Ensemble, StarTrackerAlignment
+from starcal_ros.records import Calibration, CameraGeometry, Ensemble, TemperatureTerms
 
 METHODS = ('hierarchical', 'per_image', 'single')
+FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
+_SCALED = slice(0, 3)  # fx, skew, fy
 
 
 @dataclass(frozen=True)
@@ -199,90 +204,9 @@ def turn_derivatives(turns: Floats) -> Floats:
     return np.asarray(np.eye(3) - first * H + second * (H @ H))
 
 
-_FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
-_HOUR_S = 3600.0
-
-
-@dataclass(frozen=True)
-class AttitudeErrors:
-    """
-    Star-tracker errors of m images as their stars show them.
-
-    Attributes
-    ----------
-    time_ns : (m,)
-    error_rad : (m, 3)
-        About the axes of the star tracker of the image.
-    variance_rad2 : (m, 3)
-        Its variance from the centroids.
-    tracker_sigma_rad : (3,)
-        1-sigma of a star tracker.
-    seen : (m,) bool
-        True if the stars of the image show an attitude that fits.
-    """
-
-    time_ns: NDArray[np.int64]
-    error_rad: Floats
-    variance_rad2: Floats
-    tracker_sigma_rad: Floats
-    seen: Mask
-
-
 def star_tracker_names(ensemble: Ensemble) -> tuple[str, ...]:
     """Names of the star trackers of an ensemble; the first, whose name is empty, is always one."""
     return ('', *sorted({image.star_tracker for image in ensemble.images} - {''}))
-
-
-def star_tracker_alignments(
-    names: tuple[str, ...],
-    problem: Problem,
-    state: State,
-    covariance: Floats,
-    errors: AttitudeErrors,
-) -> tuple[StarTrackerAlignment, ...]:
-    """
-    Return the alignments to the star trackers of an ensemble; none where there is one only.
-
-    Parameters
-    ----------
-    names : tuple of str
-        From `star_tracker_names`.
-    covariance : (3 + 3 s, 3 + 3 s)
-        Covariance of the alignment and of the mountings of the s further star trackers.
-    errors : AttitudeErrors
-        Each about the axes of its own star tracker.
-    """
-    if problem.first_from_star_tracker is None:
-        return ()
-    mountings = np.concatenate([np.zeros(3), state.mountings]).reshape(-1, 3)
-    A = state.camera_from_star_tracker
-    found = []
-    for k, name in enumerate(names):
-        here = problem.star_tracker == k
-        assumed = problem.first_from_star_tracker[here][0] if k else Rotation.identity()
-        alignment = Rotation.from_rotvec(-mountings[k]) * A * assumed
-        to_angles = np.zeros((3, len(covariance)))
-        to_mounting = np.zeros_like(to_angles)
-        if k:
-            to_mounting[:, 3 * k : 3 * k + 3] = np.eye(3)
-        to_angles[:, :3] = np.eye(3)
-        to_angles += to_mounting
-        of_mounting = to_mounting @ covariance @ to_mounting.T
-        rate, total, p_value = _drift(errors, here)
-        found.append(
-            StarTrackerAlignment(
-                frame=name,
-                images=int(here.sum()),
-                star_tracker_from_camera_xyzw=canonical_xyzw(alignment.inv()),
-                alignment_covariance_rad2=to_angles @ covariance @ to_angles.T,
-                first_from_star_tracker_xyzw=canonical_xyzw(A.inv() * alignment),
-                mounting_covariance_rad2=of_mounting,
-                drift_arcsec_per_hour=tuple(float(one) for one in rate),
-                drift_arcsec=total,
-                drift_p_value=p_value,
-            )
-        )
-    return tuple(found)
 
 
 def canonical_xyzw(rotation: Rotation) -> Floats:
@@ -291,30 +215,85 @@ def canonical_xyzw(rotation: Rotation) -> Floats:
     return np.asarray(quaternion * np.copysign(1.0, quaternion[3]))
 
 
-def _drift(errors: AttitudeErrors, here: Mask) -> tuple[Floats, float, float]:
-    """
-    Slope (3,) of the errors in time, arcsec/h; its length over the span; p-value of none.
+def parameters_at(parameters: Floats, focal: Floats, above_reference_k: Floats) -> Floats:
+    """Camera parameters (m, p) at temperatures (m,) above the reference."""
+    result = np.tile(parameters, (len(above_reference_k), 1))
+    result[:, _SCALED] *= 1.0 + (_powers(above_reference_k, len(focal)) @ focal)[:, None]
+    return result
 
-    By the scatter about the slope: a drift raises the sigma of the star tracker that is estimated.
+
+def parameters_chain(parameters: Floats, focal: Floats, above_reference_k: Floats) -> Floats:
+    """Derivatives (m, p, p + q) of `parameters_at` by the parameters, then the q focal terms."""
+    p, q = len(parameters), len(focal)
+    chain = np.tile(np.eye(p, p + q), (len(above_reference_k), 1, 1))
+    powers = _powers(above_reference_k, q)
+    chain[:, _SCALED, _SCALED] *= 1.0 + (powers @ focal)[:, None, None]
+    chain[:, _SCALED, p:] = parameters[_SCALED][None, :, None] * powers[:, None, :]
+    return chain
+
+
+def turns(rate: Floats, above_reference_k: Floats) -> Rotation:
+    """Rotations (m) of the camera frame at temperature differences (m,) from the reference."""
+    return Rotation.from_rotvec(-np.outer(above_reference_k, rate))
+
+
+def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
     """
-    unknown = np.full(3, np.nan), math.nan, math.nan
-    used = here & errors.seen
-    if np.count_nonzero(used) < _FEWEST_IMAGES:
-        return unknown
-    time_ns = errors.time_ns[used]
-    hours = (time_ns - time_ns[0]) / (NANOSECONDS_PER_SECOND * _HOUR_S)
-    weight = 1.0 / (errors.variance_rad2[used] + errors.tracker_sigma_rad**2)
-    middle = (weight * hours[:, None]).sum(axis=0) / weight.sum(axis=0)
-    from_middle = hours[:, None] - middle
-    information = (weight * from_middle**2).sum(axis=0)
-    if not (information > 0).all():
-        return unknown
-    slope = (weight * from_middle * errors.error_rad[used]).sum(axis=0) / information
-    error_rad = errors.error_rad[used]
-    mean_rad = (weight * error_rad).sum(axis=0) / weight.sum(axis=0)
-    freedom = len(hours) - 2
-    scatter = (weight * (error_rad - mean_rad - from_middle * slope) ** 2).sum(axis=0) / freedom
-    t = slope * np.sqrt(information / np.maximum(scatter, 1e-300))
-    p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # of three axes
-    rate = slope / ARCSECOND_RAD
-    return rate, float(np.linalg.norm(rate) * np.ptp(hours)), p_value
+    Derivative (m, 3, 6) of the rotation of each image by alignment angles and rate.
+
+    Relative error: a twelfth of the squared rotation, 1e-7 at 0.06 degrees.
+    """
+    dT = above_reference_k[:, None, None]
+    x, y, z = rate
+    half = np.eye(3) - 0.5 * dT * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.concatenate([turns(rate, above_reference_k).as_matrix(), dT * half], axis=-1)
+
+
+def reference_degc(ensemble: Ensemble) -> float:
+    """Temperature that terms refer to: the multiple of 10 degC nearest the mean of the images."""
+    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
+    measured_degc = temperatures_degc[np.isfinite(temperatures_degc)]
+    return 10.0 * round(float(measured_degc.mean()) / 10.0) if len(measured_degc) else 0.0
+
+
+def camera_at(calibration: Calibration, temperature_degc: float) -> CameraGeometry:
+    """Camera and alignment of a calibration at a temperature; its own where it has no terms."""
+    return geometry_at(calibration.geometry, calibration.temperature, temperature_degc)
+
+
+def geometry_at(
+    geometry: CameraGeometry, thermal: TemperatureTerms | None, temperature_degc: float
+) -> CameraGeometry:
+    """Camera and alignment at a temperature; unchanged without thermal terms."""
+    if thermal is None:
+        return geometry
+    above_k = np.array([temperature_degc - thermal.reference_degc])
+    camera, alignment = geometry.camera, geometry.star_tracker_from_camera_xyzw
+    if thermal.focal_per_degc:
+        focal = np.array(thermal.focal_per_degc)
+        fx, skew, fy = parameters_at(camera.parameters, focal, above_k)[0, _SCALED]
+        camera = camera.replace(fx=float(fx), skew=float(skew), fy=float(fy))
+    if thermal.alignment_rate_rad_per_degc:
+        rotation = turns(np.array(thermal.alignment_rate_rad_per_degc), above_k)[0]
+        alignment = (Rotation.from_quat(alignment) * rotation.inv()).as_quat()
+    return CameraGeometry(camera, alignment)
+
+
+def why_unsupported(temperatures_degc: Floats, order: int) -> str:
+    """Reason why temperatures (m,) do not determine thermal terms; '' if they do."""
+    unknown = int(np.count_nonzero(~np.isfinite(temperatures_degc)))
+    count = len(temperatures_degc)
+    if unknown:
+        return f'{unknown} of {count} images have no temperature'
+    spread = float(temperatures_degc.std())
+    if spread < FEWEST_SPREAD_K:
+        return f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
+    distinct = len(np.unique(temperatures_degc))
+    if distinct <= order:
+        return f'{distinct} temperatures do not determine a polynomial of degree {order}'
+    return ''
+
+
+def _powers(above_reference_k: Floats, order: int) -> Floats:
+    """Powers 1 to ``order`` of the temperature differences, (m, order)."""
+    return np.asarray(above_reference_k[:, None] ** np.arange(1, order + 1))

@@ -325,18 +325,12 @@ def pair_moment(
     return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
 
 
-def _log_likelihood(estimate_px2: float, sigma_px2: float) -> Floats:
-    """Log likelihood of amplitudes on the grid."""
-    return np.asarray(-0.5 * ((estimate_px2 - np.exp(2.0 * _LOG_GRID)) / sigma_px2) ** 2)
-
-
 def _next_octave(log_px: Floats) -> Floats:
     """Weights (s, 240) on the grid of an octave that follows one of logarithms (s,)."""
     off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
     kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
     kernel /= kernel.sum(axis=1, keepdims=True).clip(1e-300)
-    alone = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
-    return np.asarray((1.0 - _OF_ONE_LENGTH) * kernel + _OF_ONE_LENGTH * alone / alone.sum())
+    return np.asarray((1.0 - _OF_ONE_LENGTH) * kernel + _OF_ONE_LENGTH * _PRIOR / _PRIOR.sum())
 
 
 @functools.cache
@@ -363,8 +357,8 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
     forward = first
     likelihoods, before = [], []
     for estimate, sigma in moments:
-        log_likelihood = _log_likelihood(estimate, sigma)
-        likelihoods.append(np.exp(log_likelihood - log_likelihood.max()))
+        off = -0.5 * ((estimate - np.exp(2.0 * _LOG_GRID)) / sigma) ** 2
+        likelihoods.append(np.exp(off - off.max()))
         before.append(forward)
         forward = forward * likelihoods[-1]
         forward = (forward / forward.sum()) @ transition

@@ -12,15 +12,13 @@ formed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import ALL_PARAMETER_NAMES, project_parameters
-from starcal_ros.camera.detector_field import DetectorField
+from starcal_ros.camera import ALL_PARAMETER_NAMES
 from starcal_ros.camera.lens import (
     coefficient_jacobian,
     distort,
@@ -159,7 +157,6 @@ def normal_blocks(
     parameters: Floats,
     camera_from_icrf: Floats,
     loss_scale: float = np.inf,
-    field: DetectorField | None = None,
 ) -> tuple[float, Floats]:
     """
     Cost and the normal matrix of every image.
@@ -175,8 +172,6 @@ def normal_blocks(
     loss_scale : float
         Cauchy loss ``c^2 log(1 + s / c^2)`` of the squared whitened residual s of a star;
         infinite: least squares.
-    field : DetectorField, optional
-        Taken off the measured pixels.
 
     Returns
     -------
@@ -189,7 +184,7 @@ def normal_blocks(
     rows = parameters.shape[-1] + 4
     blocks = np.zeros((measurements.image_count, rows, rows))
     cost = 0.0
-    for chunk, J in whitened_chunks(measurements, model, parameters, camera_from_icrf, field):
+    for chunk, J in whitened_chunks(measurements, model, parameters, camera_from_icrf):
         if J is None:
             return np.inf, blocks
         m, _, n = chunk.direction_icrf.shape
@@ -209,11 +204,7 @@ def normal_blocks(
 
 
 def whitened_chunks(
-    measurements: Measurements,
-    model: str,
-    parameters: Floats,
-    camera_from_icrf: Floats,
-    field: DetectorField | None = None,
+    measurements: Measurements, model: str, parameters: Floats, camera_from_icrf: Floats
 ) -> Iterator[tuple[Chunk, Floats | None]]:
     """
     Yield each chunk of m images of n stars with its whitened derivatives and residuals.
@@ -228,11 +219,7 @@ def whitened_chunks(
         own = parameters
         if parameters.ndim > 1:
             own = np.repeat(parameters[chunk.image], n, axis=0).T
-        ideal = chunk
-        if field is not None:
-            off_px = field.displacement_px(chunk.measured_px.T).T
-            ideal = dataclasses.replace(chunk, measured_px=chunk.measured_px - off_px)
-        seen = _whitened_columns(ideal, model, own, camera_from_icrf[chunk.image], J)
+        seen = _whitened_columns(chunk, model, own, camera_from_icrf[chunk.image], J)
         yield chunk, (J if seen else None)
 
 
@@ -278,29 +265,6 @@ def _whitened_columns(
     np.multiply(wvv, residual_v, out=V[p + 3])
     J[:, p + 4] = 0.0
     return True
-
-
-def residuals_px(
-    table: StarTable,
-    model: str,
-    parameters: Floats,
-    camera_from_icrf: Floats,
-    field: DetectorField | None = None,
-) -> Floats:
-    """Measured minus predicted pixels (n, 2) of every star; parameters (p,) or (m, p)."""
-    residual_px = table.measured_px.copy()
-    if field is not None:
-        residual_px -= field.displacement_px(table.measured_px)
-    # In parts: a rotation for each of all stars would be most of the memory of a calibration.
-    for first in range(0, len(table), _CHUNK_STARS):
-        part = slice(first, first + _CHUNK_STARS)
-        image = table.image[part]
-        direction_camera = np.einsum(
-            'nij,nj->ni', camera_from_icrf[image], table.direction_icrf[part]
-        )
-        own = parameters if parameters.ndim == 1 else parameters[image].T
-        residual_px[part] -= project_parameters(model, own, direction_camera)
-    return residual_px
 
 
 def squared_sigmas(residual_px: Floats, covariance_px2: Floats) -> Floats:

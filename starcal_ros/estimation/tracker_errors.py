@@ -1,26 +1,36 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Errors of a star tracker: noise of each image, and slow errors that images share.
+Errors of a star tracker: noise of each image, slow errors that images share, angular rates.
 
 The attitude errors that the stars of m images show are the alignment, noise of sigma n and a slow
 error of sigma s with the correlation K between images, in time or in attitude.  The restricted
 likelihood of n and s is evaluated on a grid for each K with the alignment eliminated, and results
 are averaged over the posterior.  A slow error that lasts longer than the campaign shows in no
 scatter: it stays in the sigma of the alignment at the size of its prior.
+
+The rate of an image is measured by a star tracker with noise, or not at all.  Its error times the
+time of read-out turns the camera from the first row to the last: three unknowns of each image.
+The time is an unknown too: its root mean square, by its prior and then by the posterior of the
+round before, stands for it.  An offset of the stamps times the error of a rate is a hundredth of
+the noise of the star tracker that gave the rate, which is estimated anyway.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtr
 
-from starcal_ros.arrays import Floats, Indices
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.amplitudes import interval_factor
+from starcal_ros.estimation.problem import canonical_xyzw, Problem, State
+from starcal_ros.records import StarObservations, StarTrackerAlignment
 
 _SPANS = (0.3, 1.0, 3.0, 10.0)  # correlation times, in spans of the campaign
 _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a large part of the sky
@@ -37,6 +47,8 @@ _STATED_SLOW_SIGMA = 0.3  # of ln s about star_tracker_slow_arcsec
 # against correlation times of a third of it and more.  The time of an estimate stays linear.
 _MOST_GROUPS = 100
 _MOST_MEMBERS = 4  # of a group, of which the mean correlation is taken
+_FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
+_HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -265,3 +277,174 @@ def _restricted(
     squared -= information * (mean**2).sum(axis=2)
     log_det = np.log(total).sum(axis=2) + np.log(information)
     return -0.5 * (error.shape[1] * log_det + squared), (ones**2 / alone).sum(axis=2)
+
+
+UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit
+_SHORTEST_GAP_S = 0.1  # between the samples of a rate whose sender states neither sigma nor gap
+_LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
+_FEWEST_RATES = 3  # whose scatter bounds the sigma that a sender does not state
+
+
+@dataclass(frozen=True)
+class Rates:
+    """
+    Rates of images, and the time of read-out by which their errors turn the camera.
+
+    The error of the rate of image k is ``root[k] z`` with z of unit variance.
+
+    Attributes
+    ----------
+    rad_s : (m, 3)
+        NaN where no image has one.
+    root_rad_s : (m, 3, 3)
+    readout_s : float
+        Root mean square of the time of read-out.
+    """
+
+    rad_s: Floats
+    root_rad_s: Floats
+    readout_s: float = 0.0
+
+    def turned(self, camera_from_star_tracker: Rotation, readout_s: float) -> Rates:
+        """Return rates in the star tracker frame in that of the camera."""
+        matrix = camera_from_star_tracker.as_matrix()
+        return Rates(self.rad_s @ matrix.T, matrix @ self.root_rad_s, readout_s)
+
+
+def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats) -> Rates:
+    """
+    Return the rates of images in the frame of the star tracker, with their errors.
+
+    Rates that differ by their errors would seem to show that there is no time of read-out, since
+    the stars do not differ with them (errors in variables).  So a rate moves to the mean of all by
+    as much as its error is of their scatter; an image without a rate has the mean.  The errors of
+    the images are not lowered for it: together they are the error of the mean.
+
+    A sigma that is not stated is that of two samples of a star tracker of sigma (3,), at most the
+    scatter of the rates.
+    """
+    m = len(images)
+    rate = np.array([image.star_tracker_rate_rad_s for image in images])
+    sigma = np.array([image.star_tracker_rate_sigma_rad_s for image in images])
+    gap_s = np.array([image.attitude_gap_s for image in images])
+    known = np.isfinite(rate).all(axis=1)
+    if not known.any():
+        return Rates(rate, np.zeros((m, 3, 3)))
+    several = np.count_nonzero(known) > 1
+    scatter = np.cov(rate[known].T) if several else np.zeros((3, 3))
+    between = math.sqrt(2.0) * tracker_sigma_rad / np.fmax(gap_s, _SHORTEST_GAP_S)[:, None]
+    if np.count_nonzero(known) >= _FEWEST_RATES:
+        between = np.minimum(between, np.sqrt(np.diag(scatter)))
+    own = np.where(sigma > 0, sigma, between)[:, :, None] ** 2 * np.eye(3)
+    # What their errors may make of the scatter at 2 sigma is no difference between rates.
+    likely = 1.0 + 2.0 * math.sqrt(2.0 / max(np.count_nonzero(known) - 1, 1))
+    values, vectors = np.linalg.eigh(scatter - likely * own[known].mean(axis=0))
+    without_errors = (vectors * values.clip(0.0)) @ vectors.T
+    own[~known] = without_errors + UNKNOWN_RATE_RAD_S**2 * np.eye(3)
+    weight = known / (np.trace(without_errors) + np.einsum('mii->m', own) + _LEAST_RAD2_S2)
+    mean = (weight @ np.where(known[:, None], rate, 0.0)) / weight.sum()
+    off = np.where(known[:, None], rate - mean, 0.0)
+    total = without_errors + own + _LEAST_RAD2_S2 * np.eye(3)
+    shrunk = np.linalg.solve(total, off[:, :, None])[:, :, 0] @ without_errors
+    root = np.asarray(np.linalg.cholesky(own + _LEAST_RAD2_S2 * np.eye(3)))
+    return Rates(mean + shrunk, root)
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Errors of the star trackers as the stars show them, and what follows from them."""
+
+    error_rad: Floats
+    covariance_rad2: Floats
+    seen: Mask
+    misfit: Mask
+    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
+    images: tuple[Indices, ...]  # of each of them, those that fit
+    correlations: tuple[Correlations, ...] = ()  # of these images
+
+
+def star_tracker_alignments(
+    names: tuple[str, ...],
+    problem: Problem,
+    state: State,
+    covariance: Floats,
+    attitudes: Attitudes,
+    time_ns: Indices,
+    sigma_rad: Floats,
+) -> tuple[StarTrackerAlignment, ...]:
+    """
+    Return the alignments to the star trackers of an ensemble; none where there is one only.
+
+    Parameters
+    ----------
+    names : tuple of str
+        From `star_tracker_names`.
+    covariance : (3 + 3 s, 3 + 3 s)
+        Covariance of the alignment and of the mountings of the s further star trackers.
+    attitudes : Attitudes
+        Of images at ``time_ns`` (m,), each about the axes of its own star tracker.
+    sigma_rad : (3,)
+        Noise of a star tracker.
+    """
+    if problem.first_from_star_tracker is None:
+        return ()
+    mountings = np.concatenate([np.zeros(3), state.mountings]).reshape(-1, 3)
+    A = state.camera_from_star_tracker
+    found = []
+    for k, name in enumerate(names):
+        here = problem.star_tracker == k
+        assumed = problem.first_from_star_tracker[here][0] if k else Rotation.identity()
+        alignment = Rotation.from_rotvec(-mountings[k]) * A * assumed
+        to_angles = np.zeros((3, len(covariance)))
+        to_mounting = np.zeros_like(to_angles)
+        if k:
+            to_mounting[:, 3 * k : 3 * k + 3] = np.eye(3)
+        to_angles[:, :3] = np.eye(3)
+        to_angles += to_mounting
+        of_mounting = to_mounting @ covariance @ to_mounting.T
+        rate, total, p_value = _drift(time_ns, attitudes, sigma_rad, here)
+        found.append(
+            StarTrackerAlignment(
+                frame=name,
+                images=int(here.sum()),
+                star_tracker_from_camera_xyzw=canonical_xyzw(alignment.inv()),
+                alignment_covariance_rad2=to_angles @ covariance @ to_angles.T,
+                first_from_star_tracker_xyzw=canonical_xyzw(A.inv() * alignment),
+                mounting_covariance_rad2=of_mounting,
+                drift_arcsec_per_hour=tuple(float(one) for one in rate),
+                drift_arcsec=total,
+                drift_p_value=p_value,
+            )
+        )
+    return tuple(found)
+
+
+def _drift(
+    time_ns: Indices, attitudes: Attitudes, sigma_rad: Floats, here: Mask
+) -> tuple[Floats, float, float]:
+    """
+    Slope (3,) of the errors in time, arcsec/h; its length over the span; p-value of none.
+
+    By the scatter about the slope: a drift raises the sigma of the star tracker that is estimated.
+    """
+    unknown = np.full(3, np.nan), math.nan, math.nan
+    used = here & attitudes.seen
+    if np.count_nonzero(used) < _FEWEST_IMAGES:
+        return unknown
+    time_ns, error_rad = time_ns[used], attitudes.error_rad[used]
+    hours = (time_ns - time_ns[0]) / (NANOSECONDS_PER_SECOND * _HOUR_S)
+    variance_rad2 = np.einsum('mii->mi', attitudes.covariance_rad2)[used]
+    weight = 1.0 / (variance_rad2 + sigma_rad**2)
+    middle = (weight * hours[:, None]).sum(axis=0) / weight.sum(axis=0)
+    from_middle = hours[:, None] - middle
+    information = (weight * from_middle**2).sum(axis=0)
+    if not (information > 0).all():
+        return unknown
+    slope = (weight * from_middle * error_rad).sum(axis=0) / information
+    mean_rad = (weight * error_rad).sum(axis=0) / weight.sum(axis=0)
+    freedom = len(hours) - 2
+    scatter = (weight * (error_rad - mean_rad - from_middle * slope) ** 2).sum(axis=0) / freedom
+    t = slope * np.sqrt(information / np.maximum(scatter, 1e-300))
+    p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # of three axes
+    rate = slope / ARCSECOND_RAD
+    return rate, float(np.linalg.norm(rate) * np.ptp(hours)), p_value

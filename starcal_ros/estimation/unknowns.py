@@ -41,12 +41,13 @@ from starcal_ros.estimation.problem import (
     image_alignment,
     mounting_errors_rad,
     mounting_turns,
+    parameters_chain,
     Problem,
     State,
     turn_derivatives,
+    turns_chain,
 )
-from starcal_ros.estimation.rates import Rates, UNKNOWN_RATE_RAD_S
-from starcal_ros.estimation.temperature import parameters_chain, turns_chain
+from starcal_ros.estimation.tracker_errors import Rates, UNKNOWN_RATE_RAD_S
 from starcal_ros.records import ALIGNMENT_NAMES
 from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
 

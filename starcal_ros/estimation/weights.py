@@ -41,7 +41,6 @@ from starcal_ros.estimation.problem import (
     Problem,
     State,
 )
-from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import (
     Groups,
     pixel_variance_px2,
@@ -51,8 +50,10 @@ from starcal_ros.estimation.shared_errors import (
 )
 from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
+    Attitudes,
     Correlations,
     correlations_of,
+    Rates,
     tracker_errors,
     TrackerErrors,
 )
@@ -217,19 +218,6 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Attitudes:
-    """Errors of the star trackers as the stars show them, and what follows from them."""
-
-    error_rad: Floats
-    covariance_rad2: Floats
-    seen: Mask
-    misfit: Mask
-    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
-    images: tuple[NDArray[np.int64], ...]  # of each of them, those that fit
-    correlations: tuple[Correlations, ...] = ()  # of these images
-
-
-@dataclass(frozen=True)
 class Judged:
     """Conclusions from the residuals of a round: the weights of the next one."""
 
@@ -360,9 +348,7 @@ def tracker_attitudes(
         )
         return Attitudes(error, covariance, seen, np.zeros(m, bool), trackers, images)
     is_stated = tracker_sigma_is_given(data.options)
-    misfit = misfit_images(
-        error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
-    )
+    misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, is_stated)
     found_images, found_trackers, found_correlations = [], [], []
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)

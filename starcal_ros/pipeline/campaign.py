@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.setup import Setup

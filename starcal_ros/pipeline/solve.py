@@ -24,7 +24,7 @@ from starcal_ros.assessment import observability
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
-from starcal_ros.assessment.residuals import Residuals, residuals_of
+from starcal_ros.assessment.predictions import Residuals, residuals_of
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.camera.projection import convert, ros_fit

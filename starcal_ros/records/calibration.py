@@ -68,7 +68,7 @@ class CameraGeometry(Record):
 @dataclass(frozen=True)
 class TemperatureTerms:
     """
-    Change of camera and alignment with temperature; `estimation.temperature` has the equations.
+    Change of camera and alignment with temperature; `estimation.problem` has the equations.
 
     Raises ValueError for another number of terms.
 

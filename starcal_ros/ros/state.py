@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ros import errors
-from starcal_ros.assessment import requirements
-from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.gate import judge, reasons_of, REMEDIES, requirement_answers
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method
 from starcal_ros.records import (
@@ -332,7 +330,7 @@ def summary(calibration: Calibration) -> str:
         f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
         f' in {calibration.images_used} images'
     )
-    return '; '.join([fit, *requirements.answers(calibration)])
+    return '; '.join([fit, *requirement_answers(calibration)])
 
 
 def _check_size(

@@ -21,9 +21,9 @@ import yaml
 
 from starcal_ground.cli import main
 from starcal_ground.cli.commands import compare
+from starcal_ground.comparison import alignment_difference_rad
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
-from starcal_ros.assessment import agreement
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.bag.frames import read_telemetry
@@ -77,7 +77,7 @@ def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[f
     free = [k for k, name in enumerate(PARAMETER_NAMES) if name in calibration.estimated]
     error = np.r_[
         (calibration.geometry.camera.parameters - truth.camera.parameters)[free],
-        agreement.alignment_difference_rad(calibration.geometry, truth),
+        alignment_difference_rad(calibration.geometry, truth),
     ]
     rows = [*free, 10, 11, 12]
     covariance = calibration.covariance[np.ix_(rows, rows)]
@@ -178,7 +178,7 @@ def test_the_tiny_bag_is_small_and_says_what_it_is() -> None:
     assert truth['k_true'] == made.truth.camera.intrinsics.tolist()
     assert truth['d_true'] == made.truth.camera.distortion.tolist()
     geometry = simulated_bag.true_geometry(truth)
-    angles_rad = agreement.alignment_difference_rad(geometry, made.truth)
+    angles_rad = alignment_difference_rad(geometry, made.truth)
     assert np.abs(angles_rad).max() < 1e-14  # there and back through a matrix
     assert read_camera_info(TINY / 'camera.yaml').parameters.tolist() == [
         *truth['k_prior'],

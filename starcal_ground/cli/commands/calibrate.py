@@ -106,7 +106,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
     from starcal_ground.outputs import check_outputs, make_folder
-    from starcal_ros.assessment.requirements import requirements_of
+    from starcal_ros.assessment.gate import requirements_of
 
     requirements_of(args.require or ())
     given = arguments.given(args, **({'requirements': args.require} if args.require else {}))
@@ -143,12 +143,12 @@ def answer_of(
 ) -> Mapping[str, object]:
     """Object that `--json` prints of a campaign whose products are in a folder."""
     from starcal_ground.report import verdict
-    from starcal_ros.assessment.requirements import OPTION
+    from starcal_ros.assessment.gate import REQUIREMENTS
 
     calibration = made.calibration
     return {
         **{name: getattr(calibration, name) for name in _ANSWERED},
-        'requirements': [check for check in calibration.gate if check.option == OPTION],
+        'requirements': [check for check in calibration.gate if check.option == REQUIREMENTS],
         'lens_model': calibration.geometry.camera.model,
         'found': made.notes,
         'assumed': dict(first.assumed(source.topics, made.ensemble)),

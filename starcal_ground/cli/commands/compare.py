@@ -172,7 +172,7 @@ def with_truth(
     """Table of the estimated parameters and the alignment with prior and truth."""
     import numpy as np
 
-    from starcal_ros.assessment.agreement import alignment_difference_rad
+    from starcal_ground.comparison import alignment_difference_rad
 
     all_names = calibration.geometry.camera.parameter_names
     names = [name for name in all_names if name in calibration.estimated]

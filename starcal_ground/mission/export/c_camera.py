@@ -25,7 +25,7 @@ from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import calibration_text
 from starcal_ros.records import Calibration, ResidualField
 

@@ -30,7 +30,7 @@ from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.detector_field import COSINE_DOMAIN
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.estimation.problem import camera_at
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 

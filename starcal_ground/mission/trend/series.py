@@ -21,9 +21,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
+from starcal_ground.comparison import alignment_difference_rad
 from starcal_ground.mission.trend.trend_table import COMPUTED, Row
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight, movement
+from starcal_ros.assessment.lookup import lines_of_sight, movement
 from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import CameraGeometry

@@ -13,7 +13,7 @@ import re
 import erfa
 import numpy as np
 
-from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.gate import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader

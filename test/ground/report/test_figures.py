@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starcal_ground.report import figures
-from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel
 
 CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, 0, 0, 0, 0, 0]))

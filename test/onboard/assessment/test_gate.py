@@ -12,11 +12,11 @@ import pytest
 from sample_records import calibration, model_checks  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.gate import GateOptions, judge, reasons_of
+from starcal_ros.assessment.lookup import movement
 from starcal_ros.camera import CameraModel
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.temperature import camera_at
+from starcal_ros.estimation.problem import camera_at
 from starcal_ros.options import names_of
 from starcal_ros.records import (
     Calibration,
@@ -193,7 +193,7 @@ def test_a_good_calibration_passes() -> None:
             (
                 'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
                 'of 7.4 sigma (max_held_term_sigma); -60000 by the stars, 0 assumed; check '
-                'the velocity topic, the stamps and the site'
+                'the velocity; on the ground state the site'
             ),
         ),
         (
@@ -214,8 +214,8 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); lens or focus changes: '
-                'estimate with temperature, or calibrate each state alone'
+                'of 0.2 px (max_image_variation_px); on the ground state the site (observer); in '
+                'space estimate with temperature'
             ),
         ),
         (
@@ -288,6 +288,17 @@ def test_each_limit_of_a_change_trips_alone(
     }
     assert reason.endswith(changed.get((limit, active is None), f'({limit})'))
     assert ('active calibration' in reason) == (active is not None)
+
+
+@pytest.mark.parametrize(('width', 'limit_px'), [(640, 50.0), (1000, 64.0), (2592, 165.9)])
+def test_a_large_detector_may_change_more_from_the_prior(width: int, limit_px: float) -> None:
+    """The prior of the lens, a tenth of the half diagonal in a corner, does not contradict it."""
+    camera = dataclasses.replace(CAMERA, width=width, height=width * 512 // 640)
+    prior = CameraGeometry(camera, PRIOR.star_tracker_from_camera_xyzw)
+    found = dataclasses.replace(GOOD, geometry=prior)
+    rows = judge(found, prior, None, GateOptions(max_rotation_deg=180.0), ASSUMED)
+    (row,) = (row for row in rows if row.option in PAIR)
+    assert row.option == 'max_change_px' and row.limit == pytest.approx(limit_px, abs=0.1)
 
 
 def test_the_remaining_images_must_be_enough() -> None:
@@ -452,7 +463,7 @@ def test_the_cause_comes_before_the_statistics() -> None:
         ),
     )
     given = reasons(found, GateOptions())
-    assert 'lens or focus changes: ' in given[0]
+    assert 'on the ground state the site' in given[0]
     assert limits_in(given)[-1] == 'max_cross_validated_residual'
     # One part of the data and what to do, not a list of eighteen.
     assert len(given[-1]) < 200

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.rates import measured_rates
+from starcal_ros.estimation.tracker_errors import measured_rates
 from starcal_ros.records import Ensemble, StarObservations
 from studies.worlds import Campaign, simulate, World
 

@@ -22,7 +22,7 @@ from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.levenberg_marquardt import covariance
+from starcal_ros.estimation.levenberg_marquardt import inverse
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.problem import Problem
 from starcal_ros.estimation.search import minimise, Minimum, problem_of, start_of
@@ -149,9 +149,16 @@ def jacobian(residuals: Residuals, unit: np.ndarray) -> np.ndarray:
     return np.asarray(np.stack(columns, axis=-1) / unit)
 
 
+def covariance(minimum: Minimum) -> np.ndarray:
+    """Covariance of the shared unknowns, the images eliminated."""
+    normal = minimum.normal
+    hidden = np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
+    return inverse(normal.A - hidden)
+
+
 def unit_of(minimum: Minimum, images: int) -> np.ndarray:
     """About one sigma of each unknown."""
-    sigma = np.sqrt(np.diag(covariance(minimum.normal)[0]))
+    sigma = np.sqrt(np.diag(covariance(minimum)))
     angle = sigma[len(FREE) + len(minimum.state.focal) :][:3].min()
     return np.asarray(np.r_[sigma, np.full(3 * images, angle)])
 
@@ -184,7 +191,7 @@ def test_the_same_covariance(thermal: bool) -> None:
     # One Gauss-Newton step of the dense problem goes nowhere: the same minimum.
     step = dense @ (J.T @ residuals(np.zeros(len(unit)))) / np.sqrt(np.diag(dense))
     assert np.abs(step).max() < 1e-4
-    ours = covariance(minimum.normal)[0]
+    ours = covariance(minimum)
     n = len(ours)
     dense = (dense * np.outer(unit, unit))[:n, :n]
     sigma = np.sqrt(np.diag(dense))
@@ -197,7 +204,7 @@ def test_the_same_covariance(thermal: bool) -> None:
 def test_the_prior_of_the_tracker_is_in_the_cost() -> None:
     # With a tighter tracker the alignment is another one.
     sigmas = [
-        np.sqrt(np.diag(covariance(searched(ensemble(), options)[1].normal)[0]))[-3]
+        np.sqrt(np.diag(covariance(searched(ensemble(), options)[1])))[-3]
         for options in (
             dataclasses.replace(EIGHT, star_tracker_sigma_arcsec=(size,) * 3)
             for size in (0.1, 3600.0)

@@ -122,12 +122,13 @@ def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
 ) -> None:
     grid = np.linspace(math.log(1e-6), math.log(0.5), 40).astype(np.float64)
     monkeypatch.setattr(module, '_LOG_GRID', grid)
+    alone = np.exp(-0.5 * ((grid - math.log(1e-5)) / 4.0) ** 2)
+    monkeypatch.setattr(module, '_PRIOR', alone)
     monkeypatch.setattr(module, '_transition', lambda: module._next_octave(grid))
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     moments = [(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)]
     found = chain_means(last[1] @ module._next_octave(last[0]), moments)
     # Each octave is e^-0.7 of the one before, within e, and one in twenty is as any amplitude.
-    alone = np.exp(-0.5 * ((grid - math.log(1e-5)) / 4.0) ** 2)
 
     def following(log_px: Floats) -> Floats:
         steps = np.exp(-0.5 * (grid[None, :] - log_px[:, None] + 0.7) ** 2)

@@ -15,7 +15,6 @@ from starcal_ros.estimation.star_equations import (
     CAMERA,
     normal_blocks,
     RESIDUAL,
-    residuals_px,
     ROTATION,
     squared_sigmas,
     star_table,
@@ -176,16 +175,6 @@ def test_a_star_behind_the_camera_has_no_finite_cost() -> None:
         rotations,
     )
     assert cost == np.inf
-
-
-def test_residuals_are_measured_minus_predicted() -> None:
-    table, rotations = made()
-    found = residuals_px(table, 'plumb_bob', CAMERA_MODEL.parameters, rotations)
-    for k in (0, 17, 40, len(table) - 1):
-        e = rotations[table.image[k]] @ table.direction_icrf[k]
-        expected = table.measured_px[k] - project(CAMERA_MODEL, e)
-        # Roundings of 1000 px.
-        np.testing.assert_allclose(found[k], expected, rtol=0, atol=1e-11)
 
 
 def test_whitening_is_the_inverse_root_of_the_covariance() -> None:

@@ -297,9 +297,9 @@ def test_a_slow_error_is_as_large_about_an_axis_of_more_noise(stated_arcsec: flo
         star_tracker_sigma_arcsec=tuple(sigma_arcsec), star_tracker_slow_arcsec=stated_arcsec
     )
     found = estimate_calibration(made.ensemble, made.scenario.prior, options)
-    assert [tracker.axes for tracker in found.tracker_errors] == [(0, 1), (2,)]
+    assert [tracker.axes for tracker in found.attitudes.trackers] == [(0, 1), (2,)]
     across, about = (
-        tracker.slow * sigma_arcsec[tracker.axes[0]] for tracker in found.tracker_errors
+        tracker.slow * sigma_arcsec[tracker.axes[0]] for tracker in found.attitudes.trackers
     )
     assert 0.4 < about / across < 2.5
     if stated_arcsec:

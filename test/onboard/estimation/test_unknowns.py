@@ -32,7 +32,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import rotation_jacobian
 from starcal_ros.estimation.equations import star_columns, tracker_turns
 from starcal_ros.estimation.problem import attitude_errors
-from starcal_ros.estimation.rates import Rates
+from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import (
     Assumptions,
     Layout,

@@ -9,8 +9,8 @@ import pytest
 
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.rates import Rates
 from starcal_ros.estimation.shared_errors import observation_groups
+from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.weights import CentroidVariance, Data, judge, Judged
 from starcal_ros.records import CameraGeometry
 

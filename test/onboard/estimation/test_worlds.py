@@ -229,9 +229,9 @@ def test_a_star_tracker_that_drifts_among_several_loses_no_images() -> None:
     rad = drift[:, None] * ARCSECOND_RAD * np.array([1.0, 0.0, 0.0])
     found = estimated(with_attitude_errors(made, rad, names))
     assert not found.misfit_image.any()
-    assert len(found.tracker_errors) == 3
+    assert len(found.attitudes.trackers) == 3
     # Its errors are slow, those of the others are noise.
-    slow = sorted(one.slow for one in found.tracker_errors)
+    slow = sorted(one.slow for one in found.attitudes.trackers)
     assert slow[2] > 5.0 > 2.0 * slow[1]
     turn = errors(found, made.scenario.truth)[10:]
     sigma = np.sqrt(np.diag(found.covariance)[10:])
@@ -277,7 +277,7 @@ def test_a_stated_sigma_that_is_far_too_small_bends_nothing(
     assert normalised(found, made.scenario.truth, slice(10, 13)) < chi2.isf(0.01, 3) / 3
     assert normalised(found, made.scenario.truth, slice(0, 10)) < chi2.isf(0.001, 10) / 10
     # Six images hardly tell noise from slow errors.
-    tracker = found.tracker_errors[0]
+    tracker = found.attitudes.trackers[0]
     assert 10.0 < stated_arcsec * np.hypot(tracker.noise, tracker.slow) < 60.0
 
 

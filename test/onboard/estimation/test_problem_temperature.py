@@ -21,10 +21,17 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation import temperature
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.problem import (
+    geometry_at,
+    METHODS,
+    parameters_at,
+    parameters_chain,
+    reference_degc,
+    turns,
+    turns_chain,
+)
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
@@ -150,21 +157,19 @@ def test_the_reference_is_the_multiple_of_ten_nearest_the_mean(
             for image, degc in zip(images, temperatures_degc, strict=False)
         )
     )
-    assert temperature.reference_degc(ensemble) == expected
+    assert reference_degc(ensemble) == expected
 
 
 @pytest.mark.parametrize('focal', [(), (3e-5,), (3e-5, -2e-7)])
 def test_derivatives_by_camera_and_focal_terms(focal: tuple[float, ...]) -> None:
     above_k = np.array([-30.0, 0.0, 12.0])
     x = np.r_[TRUTH.camera.parameters, focal]
-    chain = temperature.parameters_chain(x[:10], x[10:], above_k)
+    chain = parameters_chain(x[:10], x[10:], above_k)
     assert chain.shape == (3, 10, 10 + len(focal))
     for k in range(len(x)):
         # Bilinear: a central difference is exact, but for the rounding of parameters of 2000.
         step = np.eye(len(x))[k] * 1e-3 * max(abs(x[k]), 1e-3)
-        high, low = (
-            temperature.parameters_at((x + s)[:10], (x + s)[10:], above_k) for s in (step, -step)
-        )
+        high, low = (parameters_at((x + s)[:10], (x + s)[10:], above_k) for s in (step, -step))
         numerical = (high - low) / (2 * step[k])
         np.testing.assert_allclose(chain[:, :, k], numerical, rtol=1e-6, atol=1e-6)
 
@@ -172,12 +177,12 @@ def test_derivatives_by_camera_and_focal_terms(focal: tuple[float, ...]) -> None
 def test_derivatives_by_alignment_and_its_rate() -> None:
     above_k = np.array([-30.0, 0.0, 12.0])
     rate = np.array([2.0, -1.0, 3.0]) * 1e-5
-    chain = temperature.turns_chain(rate, above_k)
+    chain = turns_chain(rate, above_k)
     for k in range(6):
         step = 1e-6
         angles, more = np.split(np.eye(6)[k] * step, 2)
-        before = temperature.turns(rate, above_k)
-        after = temperature.turns(rate + more, above_k) * Rotation.from_rotvec(-angles)
+        before = turns(rate, above_k)
+        after = turns(rate + more, above_k) * Rotation.from_rotvec(-angles)
         turned = -(after * before.inv()).as_rotvec() / step
         # The series ends at a twelfth of the squared turn: (1e-3)^2 / 12 of 30 degrees.
         np.testing.assert_allclose(chain[:, :, k], turned, rtol=0, atol=2e-5)
@@ -365,13 +370,13 @@ def test_the_camera_at_a_temperature() -> None:
         REFERENCE_DEGC, FOCAL, (1e-6, 1e-8), tuple(RATE_RAD.tolist()), (1e-6,) * 3
     )
     for degc in (-20.0, REFERENCE_DEGC, 35.0):
-        got = temperature.geometry_at(TRUTH, terms, degc)
+        got = geometry_at(TRUTH, terms, degc)
         np.testing.assert_allclose(
             got.camera.parameters, camera_of(degc, FOCAL).parameters, rtol=1e-15
         )
         turn = Rotation.from_quat(got.star_tracker_from_camera_xyzw) * alignment_of(degc, RATE_RAD)
         assert turn.magnitude() < 1e-15
-    assert temperature.geometry_at(
-        TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0
-    ) == CameraGeometry(TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw)
-    assert temperature.geometry_at(TRUTH, None, 50.0) is TRUTH
+    assert geometry_at(TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0) == CameraGeometry(
+        TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw
+    )
+    assert geometry_at(TRUTH, None, 50.0) is TRUTH

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sample_records import calibration  # type: ignore[import-not-found]
 
-from starcal_ros.assessment.requirements import Requirement, requirement_checks, requirements_of
+from starcal_ros.assessment.gate import Requirement, requirement_checks, requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError

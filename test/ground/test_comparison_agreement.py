@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import alignment_difference_rad, chi_squared
+from starcal_ground.comparison import alignment_difference_rad, chi_squared
 from starcal_ros.camera import CameraModel
 from starcal_ros.records import CameraGeometry
 

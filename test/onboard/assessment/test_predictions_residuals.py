@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ground.products import read_residuals, write_residuals
 from starcal_ground.simulation import centroids as simulated_centroids
 from starcal_ground.simulation import scenario
-from starcal_ros.assessment.residuals import Residuals, residuals_of
+from starcal_ros.assessment.predictions import Residuals, residuals_of
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.calibrate import estimate_calibration
