@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 import hashlib
 import itertools
 import math
@@ -92,6 +92,10 @@ _ACCURACY = np.array([
 ])  # fmt: skip
 
 
+# Balanced, a tree takes three times as long to build, and answers no sooner.
+direction_tree = partial(cKDTree, balanced_tree=False, compact_nodes=False)
+
+
 @dataclass(frozen=True, eq=False)
 class StarCatalog:
     """
@@ -153,13 +157,14 @@ class StarCatalog:
         )
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.direction_icrs)
+    def tree(self) -> cKDTree:
+        """Search tree of the directions."""
+        return direction_tree(self.direction_icrs)
 
     def near(self, direction_icrs: Floats, radius_rad: float) -> NDArray[np.intp]:
         """Rows (m,), ascending, of the stars near any of some directions (n, 3), as `cone`."""
         chord = 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
-        rows = self._tree.query_ball_point(direction_icrs, chord)
+        rows = self.tree.query_ball_point(direction_icrs, chord)
         return np.unique(np.fromiter(itertools.chain.from_iterable(rows), np.intp))
 
     def select(self, rows: Mask | Indices | NDArray[np.intp] | slice) -> StarCatalog:

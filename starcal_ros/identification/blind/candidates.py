@@ -28,7 +28,7 @@ from starcal_ros.identification.blind.pattern_index import (
     sphere_points,
 )
 from starcal_ros.identification.blind.sky_fit import SourceImage
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
 _KEPT = 32  # number of best candidates of a look-up
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
@@ -143,11 +143,14 @@ def look_up(
         few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
         quad, query = quad[few], query[few]
     growth = np.exp(shape[query, 4] - index.grid.shape[quad, 4])
-    stars, sources = index.quads[quad], sources[query]
+    stars, sources = index.quads[index.grid.rows[quad]].astype(np.int64), sources[query]
     rotation = _rotations(catalog.direction_icrs[stars], view.plane[sources], growth)
     gain, own = _gains(view, catalog, growth, rotation) if len(growth) else (growth, 0.0)
     every = Candidates(stars, sources, rotation, view.focal_scale * growth, gain, own)
-    best = np.argsort(-gain, kind='stable')[:_KEPT]
+    best = np.argsort(-gain, kind='stable')[: 4 * _KEPT]
+    # Discs share stars, so that the index has some patterns twice and more.
+    _, first = np.unique(np.hstack([stars, sources])[best], axis=0, return_index=True)
+    best = best[np.sort(first)][:_KEPT]
     return every.rows(best[gain[best] > _LEAST_GAIN * own])
 
 
@@ -212,25 +215,20 @@ def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
 
 
 @functools.lru_cache(maxsize=8)
-def _all_stars(catalog: StarCatalog) -> cKDTree:
-    """Search tree of all stars of a catalog."""
-    return cKDTree(catalog.direction_icrs)
-
-
-@functools.lru_cache(maxsize=8)
 def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
     """Search trees of points all over the sky and of the stars that discs of a radius need."""
     radius_rad = math.radians(radius_deg)
     points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
     # The emptiest discs hold half of the mean number, which is still most of the stars tested.
     enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
-    return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
+    stars = catalog.direction_icrs[:enough]
+    return direction_tree(points), direction_tree(stars)
 
 
 def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
     if radius_rad < _NARROW_RAD:  # few candidates: their patterns hold the sizes of others
-        return brightest_within(_all_stars(catalog), axes, radius_rad, count)
+        return brightest_within(catalog.tree, axes, radius_rad, count)
     points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
     point = points.query(axes)[1]
     if points.n <= _TABLED:

@@ -14,14 +14,17 @@ from dataclasses import dataclass
 import functools
 import itertools
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Singles
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
+_Array = TypeVar('_Array', Floats, Singles)
 _STEP = math.sqrt(2.0)
 _STANDARD_DEG = 1.6  # radius of the discs of scale 0
 _SMALLEST, _LARGEST = -10, 9  # scales: discs of 0.05 to 36 degrees of radius
@@ -30,12 +33,22 @@ _SPACING = 0.7
 # Stars per disc from scale 0 on, 7 below: at most about a million patterns.
 _STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)
 _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
-# Orders of A, B, C, D in which noise may show a canonical pattern.
-_ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
-_PAIRS = np.array(list(itertools.combinations(range(4), 2)))
-_OTHERS = np.array([[k for k in range(4) if k not in pair] for pair in _PAIRS])
-_AT_ONCE = 30_000  # patterns
+_AB = tuple(itertools.combinations(range(4), 2))
+_CD = tuple(itertools.combinations(range(4), 2))[::-1]
+# Orders of A, B, C, D: for each pair A and B as numbered, with C and D, then A and B, exchanged.
+_ORDERS = np.array(
+    [
+        (*ab[::turn], *cd[::swap])
+        for ab, cd in zip(_AB, _CD, strict=True)
+        for turn in (1, -1)
+        for swap in (1, -1)
+    ]
+)
+_AT_ONCE = 600  # discs, whose arrays fit into a cache
 _CELL = 0.04  # about twice the tolerance: two cells along each place, and a table of a few MB
+# A and B are the farthest apart, and C is nearer to A: C and D lie in a lens of this corner.
+_LOW = (0.0, -0.88, 0.0, -0.88)
+_CELLS = (14, 45, 26, 45)
 
 
 @dataclass(frozen=True)
@@ -69,7 +82,7 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     """
     Index of the patterns of the brightest stars of each disc of a scale.
 
-    It takes about a second and is kept in memory.  The catalog is sorted by magnitude.
+    It takes half a second and is kept in memory.  The catalog is sorted by magnitude.
     """
     radius_rad = _radius_rad(scale)
     of_disc = _STARS[max(scale, 0)]
@@ -79,30 +92,30 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
         centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
     else:
         centres = _occupied(stars, _SPACING * radius_rad)
-    tree = cKDTree(stars)
+    members = brightest_within(direction_tree(stars), centres, radius_rad, of_disc)
+    held = np.count_nonzero(members >= 0, axis=1)
+    xyz = stars.T.astype(np.float32)
     # Outside the region of a deep table nearly all discs are without a pattern.
-    chord = 2 * math.sin(radius_rad / 2)
-    held = tree.query_ball_point(centres, chord, return_length=True)
-    members = brightest_within(tree, centres[held >= 4], radius_rad, of_disc)
-    chosen = np.array(list(itertools.combinations(range(of_disc), 4)))
-    # Rows ascend within a disc, and -1 fills up one with fewer stars.
-    quads: Indices = members[:, chosen].reshape(-1, 4)
-    quads = quads[quads[:, 3] >= 0]
-    first, second = quads[:, 0] << 32 | quads[:, 1], quads[:, 2] << 32 | quads[:, 3]
-    by_pattern = np.lexsort([second, first])
-    first, second = first[by_pattern], second[by_pattern]
-    differs = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
-    quads = quads[by_pattern[differs]]
-    order, shape = _in_parts(stars, quads)
-    rows, grid = shape_grid(shape)
-    return PatternIndex(radius_rad, np.take_along_axis(quads, order, axis=1)[rows], grid)
+    parts = [
+        _patterns(xyz, part)
+        for count in range(4, of_disc + 1)
+        for part in _in_parts(members[held == count, :count])
+    ]
+    quads, shape = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return PatternIndex(radius_rad, quads, shape_grid(shape))
 
 
-def _in_parts(stars: Floats, quads: Indices) -> tuple[Indices, Floats]:
-    """`shapes` of rows (n, 4) of stars; the arrays of all at once would not fit into a cache."""
-    parts = np.array_split(quads, len(quads) // _AT_ONCE + 1)
-    orders, found = zip(*(shapes(stars[part]) for part in parts), strict=True)
-    return np.concatenate(orders), np.concatenate(found)
+def _in_parts(members: Indices) -> list[Indices]:
+    """Members (d, k) of discs in parts whose arrays fit into a cache."""
+    return np.array_split(members, len(members) // _AT_ONCE + 1)
+
+
+def _patterns(xyz: Singles, members: Indices) -> tuple[Indices, Singles]:
+    """Patterns (n, 4), A to D, of stars (3, s) in discs of members (d, k), and their shapes."""
+    rows = members.T.astype(np.int32)
+    chosen = np.array(list(itertools.combinations(range(len(rows)), 4))).T
+    order, shape = shapes(xyz.take(rows, axis=1)[:, chosen].reshape(3, 4, -1).T)
+    return np.take_along_axis(rows[chosen].reshape(4, -1).T, order, axis=1), shape
 
 
 def _occupied(stars: Floats, side_rad: float) -> Floats:
@@ -117,7 +130,7 @@ def _occupied(stars: Floats, side_rad: float) -> Floats:
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 
 
-def shapes(directions: Floats) -> tuple[Indices, Floats]:
+def shapes(directions: _Array) -> tuple[Indices, _Array]:
     """
     Shapes of patterns of four directions (n, 4, 3).
 
@@ -130,21 +143,35 @@ def shapes(directions: Floats) -> tuple[Indices, Floats]:
         Positions of C and D in the frame of A and B, and the natural logarithm of the distance of
         A and B, rad.
     """
-    points = _tangent_points(directions)
-    length2 = np.abs(points[:, _PAIRS[:, 0]] - points[:, _PAIRS[:, 1]]) ** 2
-    longest = length2.argmax(axis=1)
-    order = np.concatenate([_PAIRS[longest], _OTHERS[longest]], axis=1)
-    a, b, c, d = np.take_along_axis(points, order, axis=1).T
+    # One row an axis and a star: the rows of all catalog patterns take a third of a second.
+    xyz = directions.T
+    middle = xyz.sum(axis=1)
+    middle /= np.sqrt(_dot(middle, middle))
+    points = xyz / _dot(xyz, middle[:, None])  # in the tangent plane at the middle
+    longest = np.zeros(len(directions), np.int64)
+    length2 = np.zeros(len(directions), directions.dtype)
+    for k, (i, j) in enumerate(_AB):
+        apart = points[:, i] - points[:, j]
+        apart2 = _dot(apart, apart)
+        longest[apart2 > length2] = k
+        np.maximum(length2, apart2, out=length2)
+    at = _ORDERS[::4].T.take(longest, axis=1) * len(directions) + np.arange(len(directions))
+    a, b, c, d = points.reshape(3, -1).take(at, axis=1).transpose(1, 0, 2)
+    b, c, d = b - a, c - a, d - a
+    across = np.cross(middle, b, axis=0)
     with np.errstate(invalid='ignore', divide='ignore'):
-        c, d = (c - a) / (b - a), (d - a) / (b - a)
-    swap = c.real + d.real > 1.0
-    order[swap] = order[swap][:, [1, 0, 2, 3]]
-    c, d = np.where(swap, 1.0 - c, c), np.where(swap, 1.0 - d, d)
-    later = c.real > d.real
-    order[later] = order[later][:, [0, 1, 3, 2]]
-    c, d = np.where(later, d, c), np.where(later, c, d)
-    size = 0.5 * np.log(np.maximum(length2[np.arange(len(longest)), longest], 1e-30))
-    return order, np.stack([c.real, c.imag, d.real, d.imag, size], axis=-1)
+        places = np.stack([_dot(star, axis) / length2 for star in (c, d) for axis in (b, across)])
+    swap = places[0] + places[2] > 1.0
+    places = np.where(swap, np.array([[1], [0], [1], [0]], np.int8) - places, places)
+    later = places[0] > places[2]
+    places = np.where(later, places[[2, 3, 0, 1]], places)
+    size = 0.5 * np.log(np.maximum(length2, 1e-30))
+    return _ORDERS.take(4 * longest + 2 * swap + later, axis=0), np.vstack([places, size]).T
+
+
+def _dot(a: _Array, b: _Array) -> _Array:
+    """Sum of products over the first of three axes."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def equivalent(order: Indices, shape: Floats, tolerance: float) -> tuple[Indices, Floats]:
@@ -157,28 +184,13 @@ def equivalent(order: Indices, shape: Floats, tolerance: float) -> tuple[Indices
     c = shape[:, 0] + 1j * shape[:, 1]
     d = shape[:, 2] + 1j * shape[:, 3]
     places = ((c, d), (d, c), (1.0 - c, 1.0 - d), (1.0 - d, 1.0 - c))
-    all_orders = np.concatenate([order[:, k] for k in _ORDERS])
+    all_orders = np.concatenate([order[:, k] for k in _ORDERS[:4]])
     found = np.concatenate(
         [np.stack([p.real, p.imag, q.real, q.imag, shape[:, 4]], axis=-1) for p, q in places]
     )
     c_real, d_real = found[:, 0], found[:, 2]
     near = (c_real <= d_real + 2 * tolerance) & (c_real + d_real <= 1.0 + 2 * tolerance)
     return all_orders[near], found[near]
-
-
-def _tangent_points(directions: Floats) -> NDArray[np.complex128]:
-    """Complex positions (n, 4) in the tangent plane at the mean of four directions (n, 4, 3)."""
-    middle = directions.mean(axis=1)
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    # Any two perpendicular axes: a shape does not depend on their rotation.
-    least = np.abs(middle).argmin(axis=1)
-    x = np.cross(middle, np.eye(3)[least])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    y = np.cross(middle, x)
-    along = np.einsum('nki,ni->nk', directions, middle)
-    real = np.einsum('nki,ni->nk', directions, x) / along
-    imaginary = np.einsum('nki,ni->nk', directions, y) / along
-    return np.asarray(real + 1j * imaginary)
 
 
 def sphere_points(count: int) -> Floats:
@@ -192,11 +204,15 @@ def sphere_points(count: int) -> Floats:
 
 def brightest_within(stars: cKDTree, centres: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (p, count) of the brightest of sorted stars about centres (p, 3); -1: none."""
-    found = stars.query_ball_point(centres, 2 * math.sin(radius_rad / 2), return_sorted=True)
+    chord = 2 * math.sin(radius_rad / 2)
+    discs = direction_tree(centres)
+    pairs = discs.sparse_distance_matrix(stars, chord, output_type='ndarray')
+    of_centre, star = np.divmod(np.sort(pairs['i'] * stars.n + pairs['j']), stars.n)
+    first = np.searchsorted(of_centre, np.arange(len(centres)))
+    rank = np.arange(len(star)) - first[of_centre]
     rows = np.full((len(centres), count), -1, np.int64)
-    for k, inside in enumerate(found):
-        few = inside[:count]
-        rows[k, : len(few)] = few
+    few = rank < count
+    rows[of_centre[few], rank[few]] = star[few]
     return rows
 
 
@@ -205,45 +221,42 @@ class ShapeGrid:
     """
     Shapes (q, 5) sorted by cell.
 
-    ``low`` (4,) and ``cells`` (4,): corner and number of the cells along each place; ``first``
-    (m + 1,): row of the first shape of each of the m cells, the last place counting fastest.
+    ``rows`` (q,) of the shapes as given; ``first`` (m + 1,): row of the first shape of each of
+    the m cells, the last place counting fastest.
     """
 
+    rows: NDArray[np.int32]
     shape: Singles
-    low: Floats
-    cells: Indices
     first: NDArray[np.int32]
 
 
-def shape_grid(shape: Floats) -> tuple[Indices, ShapeGrid]:
-    """Rows (q,) of the shapes (q, 5) in the order of a grid, and the grid."""
-    # Without shapes, of a catalog too small for a pattern, one empty cell.
-    low = shape[:, :4].min(axis=0, initial=0.0)
-    at = np.floor((shape[:, :4] - low) / _CELL).astype(np.int64)
-    cells = at.max(axis=0, initial=0) + 1
-    cell = np.ravel_multi_index(tuple(at.T), tuple(cells))
-    rows = np.argsort(cell, kind='stable')
-    first = np.zeros(int(np.prod(cells)) + 1, np.int32)
-    np.cumsum(np.bincount(cell, minlength=len(first) - 1), out=first[1:])
-    return rows, ShapeGrid(shape[rows].astype(np.float32), low, cells, first)
+def shape_grid(shape: Floats | Singles) -> ShapeGrid:
+    """Shapes (q, 5) in the order of a grid."""
+    cell = np.zeros(len(shape), np.int32)
+    for place, low, cells in zip(shape.T, _LOW, _CELLS, strict=False):
+        cell = cell * np.int32(cells) + ((place - low) / _CELL).astype(np.int32)
+    # The rows of a sparse matrix are sorted by counting.
+    of_cell = (np.ones(len(cell), np.int8), (cell, np.arange(len(cell), dtype=np.int32)))
+    by_cell = coo_array(of_cell, shape=(math.prod(_CELLS), max(len(cell), 1))).tocsr()
+    return ShapeGrid(by_cell.indices, shape.take(by_cell.indices, axis=0), by_cell.indptr)
 
 
 def equal_shapes(
     grid: ShapeGrid, shape: Floats, place_tolerance: float, size_tolerance: float
 ) -> tuple[Indices, Indices]:
     """Pairs of rows, of given shapes (n, 5) and of those of a grid, equal within tolerances."""
-    lowest = np.floor((shape[:, :4] - place_tolerance - grid.low) / _CELL).astype(np.int64)
-    highest = np.floor((shape[:, :4] + place_tolerance - grid.low) / _CELL).astype(np.int64)
-    lowest, highest = np.maximum(lowest, 0), np.minimum(highest, grid.cells - 1)
+    lowest = np.floor((shape[:, :4] - place_tolerance - _LOW) / _CELL).astype(np.int64)
+    highest = np.floor((shape[:, :4] + place_tolerance - _LOW) / _CELL).astype(np.int64)
+    lowest, highest = np.maximum(lowest, 0), np.minimum(highest, np.array(_CELLS) - 1)
     within = np.flatnonzero((lowest <= highest).all(axis=1))
     lowest, highest = lowest[within], highest[within]
     # One row an axis: comparisons of long rows are faster than those of short ones.
     span = np.ascontiguousarray((highest - lowest).T)
-    lowest_cell = np.ravel_multi_index(tuple(lowest.T), tuple(grid.cells))
+    lowest_cell = np.ravel_multi_index(tuple(lowest.T), _CELLS)
     pairs = []
     for step in itertools.product(*(range(int(k) + 1) for k in span[:3].max(axis=1, initial=0))):
         there = np.flatnonzero((span[0] >= step[0]) & (span[1] >= step[1]) & (span[2] >= step[2]))
-        start = lowest_cell[there] + int(np.ravel_multi_index((*step, 0), tuple(grid.cells)))
+        start = lowest_cell[there] + int(np.ravel_multi_index((*step, 0), _CELLS))
         # Cells along the last place follow one another.
         end = start + span[3, there] + 1
         pairs.append(_rows_between(within[there], grid.first[start], grid.first[end]))

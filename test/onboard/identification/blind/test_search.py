@@ -9,14 +9,18 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import camera, Frame, frames
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind.pattern_index import (
+    _SPACING,
+    _STARS,
     equal_shapes,
     equivalent,
+    pattern_index,
     shape_grid,
     shapes,
     sphere_points,
@@ -140,7 +144,7 @@ def test_equivalent_orders_have_the_shape_of_their_stars() -> None:
 def test_the_grid_finds_what_the_definition_does() -> None:
     """Every shape within the tolerances of any order, and no other."""
     order, shape = random_shapes(5, 3000)
-    rows, grid = shape_grid(shape)
+    grid = shape_grid(shape)
     rng = np.random.default_rng(6)
     for tolerance, size_tolerance in ((0.014, 0.3), (0.04, 0.13), (0.1, 0.2)):
         seen = shape[:40] + 1.4 * tolerance * rng.uniform(-1, 1, (40, 5))
@@ -152,16 +156,33 @@ def test_the_grid_finds_what_the_definition_does() -> None:
         _, near = equivalent(order[:40], seen, tolerance)
         query, found = equal_shapes(grid, near, tolerance, size_tolerance)
         # The grid keeps shapes as float32: no pair of these lies within 1e-7 of a tolerance.
-        got = {(*near[k].round(9), rows[n]) for k, n in zip(query, found, strict=True)}
+        got = {(*near[k].round(9), grid.rows[n]) for k, n in zip(query, found, strict=True)}
         assert got == expected and len(query) == len(got)
 
 
 def test_shapes_outside_the_grid_equal_none() -> None:
-    _, grid = shape_grid(random_shapes(7, 100)[1])
+    grid = shape_grid(random_shapes(7, 100)[1])
     query, found = equal_shapes(grid, np.full((3, 5), 9.0), 0.02, 0.2)
     assert len(query) == len(found) == 0
     query, found = equal_shapes(grid, np.empty((0, 5)), 0.02, 0.2)
     assert len(query) == len(found) == 0
+
+
+@pytest.mark.parametrize('scale', [1, 7])
+def test_the_index_has_all_patterns_of_the_brightest_stars_of_each_disc(
+    catalog: StarCatalog, scale: int
+) -> None:
+    index = pattern_index(catalog, scale)
+    kept = set(map(tuple, np.sort(index.quads, axis=1).tolist()))
+    centres = sphere_points(int(4 * math.pi / (_SPACING * index.radius_rad) ** 2))
+    tree = cKDTree(catalog.direction_icrs[: index.quads.max() + 1])
+    chord = 2 * math.sin(index.radius_rad / 2)
+    for place in centres[:: len(centres) // 100]:
+        members = sorted(tree.query_ball_point(place, 0.999999 * chord))[: _STARS[scale]]
+        assert kept.issuperset(itertools.combinations(members, 4))
+    order, shape = shapes(catalog.direction_icrs[index.quads[index.grid.rows]])
+    same = (order == np.arange(4)).all(axis=1) & (abs(index.grid.shape - shape) < 1e-3).all(axis=1)
+    assert same.mean() > 0.9999  # two orders may be equal to rounding
 
 
 def test_the_chance_of_an_order_is_that_among_all_permutations() -> None:
