@@ -217,7 +217,9 @@ def _information(
         of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])
         shared[:, of_tracker[:, None], turning] = -J[chunk.image] @ turns[chunk.image]
         own[:, of_tracker, IMAGE_ROTATION] = J[chunk.image]
-        own[:, of_shape, layout.places['shape']] = np.diag(1.0 / estimate.posterior.shape_sigma_px)
+        own[:, of_shape, layout.places['shape']] = np.diag(
+            1.0 / estimate.posterior.shapes.sigma_px
+        )
         Q = np.linalg.qr(own)[0]
         left = (shared - Q @ (Q.transpose(0, 2, 1) @ shared)) @ root[place]
         information[chunk.image] = left.transpose(0, 2, 1) @ left

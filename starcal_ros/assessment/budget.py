@@ -85,7 +85,7 @@ def sigma_budget(
     covariance = estimate.joint_covariance
     held = of_rows.variances(covariance - estimate.posterior.covariance[part])
     shapes = _known_shapes(estimate, errors)
-    common = common_shape(estimate.linear.layout, estimate.posterior.common_shape_px2)
+    common = common_shape(estimate.linear.layout, estimate.posterior.shapes.common_px2)
     causes = [
         _Cause('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
         *_unknowns(estimate, options, errors, in_root),
@@ -93,8 +93,8 @@ def sigma_budget(
             'change from image to image',
             _gain(errors, shapes, in_root) + seen.variances(common),
             _estimated(
-                float(np.linalg.norm(estimate.posterior.shape_sigma_px)),
-                estimate.posterior.shape.likelihood_ratio,
+                float(np.linalg.norm(estimate.posterior.shapes.sigma_px)),
+                estimate.posterior.shapes.amplitudes.likelihood_ratio,
             ),
         ),
         *_shared(estimate, options, errors, in_root, unresolved),

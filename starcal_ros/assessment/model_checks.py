@@ -48,7 +48,7 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
     """Return the estimated amplitudes, each with twice its log likelihood against none."""
     found, parts = estimate.posterior, len({t.axes for t in estimate.attitudes.trackers})
     octaves = float(np.sqrt((np.exp(found.field.log_px) ** 2).sum()))
-    shape = float(np.sqrt((np.exp(found.shape.log_px) ** 2).sum()))
+    shape = float(np.sqrt((np.exp(found.shapes.amplitudes.log_px) ** 2).sum()))
     return (
         Amplitude('field', octaves, 'px', found.field.likelihood_ratio),
         Amplitude(
@@ -57,7 +57,9 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
             'px',
             found.term.likelihood_ratio,
         ),
-        Amplitude('change from image to image', shape, 'px', found.shape.likelihood_ratio),
+        Amplitude(
+            'change from image to image', shape, 'px', found.shapes.amplitudes.likelihood_ratio
+        ),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)
             for error in estimate.shared_errors
@@ -79,7 +81,7 @@ def _image_variation_px(estimate: Estimate) -> float:
     """1-sigma change of the camera from image to image in a corner, px."""
     camera = estimate.geometry.camera
     corner_px = 0.5 * math.hypot(camera.width, camera.height)
-    sigma_px = np.exp(estimate.posterior.shape.log_px)
+    sigma_px = np.exp(estimate.posterior.shapes.amplitudes.log_px)
     # Those of the focal length grow to the corner; the decentring is that of the corner.
     sigma_px[:3] *= corner_px / float(camera.parameters[0])
     return float(np.linalg.norm(sigma_px))

@@ -174,7 +174,7 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     excess = root @ errors.excess @ root.T
     variance_px2 = estimate.weights.variance_px2
     own_share = variance_px2 / (variance_px2 + estimate.weights.inflation_px2)
-    of_image = estimate.linear.layout.image_precision(estimate.posterior.shape_sigma_px)
+    of_image = estimate.linear.layout.image_precision(estimate.posterior.shapes.sigma_px)
     for rows, columns, own, residual in _images(estimate, part, mean):
         V = own_share[rows]
         predicted = _predicted(

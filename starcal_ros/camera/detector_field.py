@@ -69,7 +69,7 @@ def basis_products(
     terms, _ = cosine_terms(width, height, octaves)
     along = _waves(pixels, (width, height), 2 * terms.max(axis=0))
     table = np.stack([(along[0] * row) @ along[1].T for row in weights])
-    (i, j), size = terms.T, np.where(terms > 0, math.sqrt(2.0), 1.0).prod(axis=1)
+    (i, j), size = terms.T, _sizes(terms)
     products = np.zeros((len(weights), len(terms), len(terms)))
     for by_u in (np.add.outer(i, i), np.abs(np.subtract.outer(i, i))):
         for by_v in (np.add.outer(j, j), np.abs(np.subtract.outer(j, j))):
@@ -88,6 +88,11 @@ def _waves(pixels: Floats, sizes: tuple[int, int], most: Indices) -> list[Floats
             waves[k] = 2.0 * waves[1] * waves[k - 1] - waves[k - 2]
         along.append(waves)
     return along
+
+
+def _sizes(terms: NDArray[np.int64]) -> Floats:
+    """Return the largest values (t,) of the functions."""
+    return np.asarray(np.where(terms > 0, math.sqrt(2.0), 1.0).prod(axis=1))
 
 
 def term_count(width: int, height: int, octaves: int) -> int:
@@ -121,11 +126,16 @@ class DetectorField(Record):
         pixels = np.asarray(pixels, np.float64)
         # Beyond the detector the stars show nothing: the value at its border is used.
         inside = np.clip(pixels.reshape(-1, 2), -0.5, [self.width - 0.5, self.height - 0.5])
-        parts = [
-            self.basis(inside[k : k + _CHUNK]) @ self.coefficients.T
-            for k in range(0, max(len(inside), 1), _CHUNK)
-        ]
+        parts = [self._at(inside[k : k + _CHUNK]) for k in range(0, max(len(inside), 1), _CHUNK)]
         return np.concatenate(parts).reshape(pixels.shape)
+
+    def _at(self, pixels: Floats) -> Floats:
+        """Return the displacement (n, 2), summed along v before u: a third of the time."""
+        terms = self.orders
+        along_u, along_v = _waves(pixels, (self.width, self.height), terms.max(axis=0))
+        table = np.zeros((2, len(along_u), len(along_v)))
+        table[:, terms[:, 0], terms[:, 1]] = self.coefficients * _sizes(terms)
+        return np.asarray((table @ along_v * along_u).sum(axis=1).T)
 
     @property
     def orders(self) -> NDArray[np.int64]:

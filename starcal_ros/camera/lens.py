@@ -32,6 +32,7 @@ or (c, n) for n points.  Complex numbers pass through, for complex-step derivati
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import functools
 
 import numpy as np
 
@@ -136,7 +137,7 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
     r2 = x * x + y * y
     g, _, _ = _radial(model, r2, coefficients)
     if model == _EQUIDISTANT:
-        return _planes(g * x, g * y)
+        return points_of(g * x, g * y)
     p1, p2 = coefficients[3:5]
     g = g + 2 * (p1 * y + p2 * x)  # the terms of p1 and p2 share this factor of x and y
     xd, yd = g * x + p2 * r2, g * y + p1 * r2
@@ -145,10 +146,10 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
         xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
     if model == 'tilted':
         xd, yd, _ = _tilt(xd, yd, *coefficients[12:])
-    return _planes(xd, yd)
+    return points_of(xd, yd)
 
 
-def _planes(x: Floats, y: Floats) -> Floats:
+def points_of(x: Floats, y: Floats) -> Floats:
     """Points (..., 2) stored as all x, then all y: arithmetic on them takes half the time."""
     both = np.stack([x, y])
     return both.transpose(*range(1, both.ndim), 0)
@@ -258,6 +259,11 @@ def fold_radius2(model: str, coefficients: Floats) -> float:
     There the distorted radius stops growing, or a rational polynomial has its pole; infinite
     where it grows without end.  180 degrees at most for ``equidistant``.
     """
+    return _fold_radius2(model, *coefficients.tolist())
+
+
+@functools.lru_cache(maxsize=64)
+def _fold_radius2(model: str, *coefficients: float) -> float:
     if model == _EQUIDISTANT:
         k1, k2, k3, k4 = coefficients
         # The odd polynomial's derivative by the radius.

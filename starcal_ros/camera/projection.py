@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 
@@ -50,6 +51,7 @@ _INVERSE_STEPS = 50  # Newton iterations: 6 suffice in the field, far corners ne
 # of a good camera by a thousandth of that.
 _FIELD_STEPS = 12
 _FIELD_TOLERANCE_PX = 1e-11  # of a step: the rounding of a pixel
+_SHORT = 0.3  # a step that stays on the branch, on the ideal image plane
 _INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal length of 4000 px
 # Penalty of a fit for each unit by which a coefficient of a rational polynomial changes.
 _HELD_PX = 1e-2
@@ -130,6 +132,15 @@ class CameraModel(Record):
         """The (3, 3) camera matrix K with skew (Eq. 7)."""
         fx, skew, fy, cx, cy = self.intrinsics
         return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @functools.cached_property
+    def half_diagonal_rad(self) -> float:
+        """Mean angle of the corners from the axis; infinite if none has a line of sight."""
+        x, y = self.width - 0.5, self.height - 0.5
+        cosine = line_of_sight(self, np.array([[-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]]))[:, 2]
+        # A corner that a strong distortion folds over has no line of sight.
+        seen = cosine[np.isfinite(cosine)]
+        return float(np.arccos(seen).mean()) if len(seen) else np.inf
 
     @property
     def opencv_coefficients(self) -> Floats:
@@ -218,14 +229,14 @@ def _pixels(intrinsics: Floats, distorted: Floats) -> Floats:
     """Pixels (..., 2) of distorted points (..., 2) of the image plane."""
     fx, skew, fy, cx, cy = intrinsics
     xd, yd = distorted[..., 0], distorted[..., 1]
-    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1)
+    return lens.points_of(fx * xd + skew * yd + cx, fy * yd + cy)
 
 
 def _plane_points(camera: CameraModel, pixels: Floats) -> Floats:
     """Distorted points (..., 2) of the image plane of pixels (..., 2): inverse of `_pixels`."""
     fx, skew, fy, cx, cy = camera.intrinsics
     yd = (pixels[..., 1] - cy) / fy
-    return np.stack([(pixels[..., 0] - cx - skew * yd) / fx, yd], axis=-1)
+    return lens.points_of((pixels[..., 0] - cx - skew * yd) / fx, yd)
 
 
 def project_parameters(model: str, parameters: Floats, directions_camera: Floats) -> Floats:
@@ -354,29 +365,31 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         if np.abs(error).max(initial=0.0) < _INVERSE_TOLERANCE:
             break
         J = lens.distort_jacobian(model, xy, distortion)
-        a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
         with np.errstate(all='ignore'):
-            determinant = a * d - b * c
-            step = np.stack(
-                [
-                    (d * error[..., 0] - b * error[..., 1]) / determinant,
-                    (a * error[..., 1] - c * error[..., 0]) / determinant,
-                ],
-                axis=-1,
+            by_y, by_x = error[..., 1], error[..., 0]
+            step = lens.points_of(
+                J[..., 1, 1] * by_x - J[..., 0, 1] * by_y,
+                J[..., 0, 0] * by_y - J[..., 1, 0] * by_x,
             )
-            # A step much longer than the radius has left the branch of the axis: it is shortened.
-            reach = 0.5 + np.hypot(xy[..., 0], xy[..., 1])
-            length = np.hypot(step[..., 0], step[..., 1])
-            step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
-        moved = xy - np.nan_to_num(step)
-        xy = _inside(xy, moved, fold2) if guarded else moved
-    J = lens.distort_jacobian(model, xy, distortion)
-    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+            step /= _determinant(J)[..., None]
+            if not np.abs(step).max(initial=0.0) < _SHORT:
+                # A step much longer than the radius has left the branch of the axis.
+                reach = 0.5 + np.hypot(xy[..., 0], xy[..., 1])
+                length = np.hypot(step[..., 0], step[..., 1])
+                step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
+                step[np.isnan(step)] = 0.0
+        xy = _inside(xy, xy - step, fold2) if guarded else xy - step
+    determinant = _determinant(lens.distort_jacobian(model, xy, distortion))
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
     xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
     return lens.directions_of(model, xy)
+
+
+def _determinant(J: Floats) -> Floats:
+    """Determinants (...) of matrices (..., 2, 2)."""
+    return np.asarray(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])
 
 
 def _inside(before: Floats, after: Floats, fold2: float) -> Floats:

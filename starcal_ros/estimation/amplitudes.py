@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+import functools
 import math
 
 import numpy as np
@@ -285,13 +286,19 @@ class Shapes:
     Amplitudes of the shapes of the images.
 
     ``sigma_px`` (s,): those that stand for the posterior (`interval_factor`); ``amplitudes`` has
-    its maximum; ``common_px2`` (s,) is the variance that all images share if the shapes are
-    correlated in time.
+    its maximum; ``sums`` are those of several images.
     """
 
     sigma_px: Floats
     amplitudes: Amplitudes
-    common_px2: Floats
+    sums: ShapeSums | None
+
+    @functools.cached_property
+    def common_px2(self) -> Floats:
+        """Variance (s,) that all images share if the shapes are correlated in time."""
+        if self.sums is None:
+            return np.zeros(len(self.sigma_px))
+        return _common_part(self.sums, self.sigma_px)
 
 
 def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
@@ -308,7 +315,7 @@ def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
         raise NotObservable('the unknowns cannot be separated from the shapes of the images')
     weight = np.exp(log_weight - log_weight.max())
     sigma_px = np.exp(best) * interval_factor(np.exp(shift), weight)
-    return Shapes(sigma_px, Amplitudes(best, ratio), _common_part(sums, sigma_px))
+    return Shapes(sigma_px, Amplitudes(best, ratio), sums)
 
 
 def interval_factor(sigma: Floats, weight: Floats) -> float:
@@ -338,16 +345,18 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
     flat = right.reshape(n * m, P + 1).T.copy()
     whole = np.zeros((P + 1, P + 1))
     whole[:P, :P], whole[:P, P] = sums.shared_information, sums.shared_gradient
+    total = np.einsum('mii->i', sums.information)
 
     def likelihood(log_px: Floats) -> Floats:
-        k = len(log_px)
-        if k > 1 and k * m > _AT_ONCE:  # more at once is slower: memory
+        k, s = len(log_px), np.exp(log_px)
+        shown = np.flatnonzero(s**2 @ total > _NO_EFFECT)
+        if k > 1 and len(shown) * m > _AT_ONCE:  # more at once is slower: memory
             return np.concatenate([likelihood(log_px[: k // 2]), likelihood(log_px[k // 2 :])])
-        s = np.exp(log_px)
-        size2 = (s[:, :, None] * s[:, None, :])[:, None]
-        covariance, log_det = _inverse(np.eye(n) + sums.information * size2)
+        left, log_det = np.tile(whole, (k, 1, 1)), np.zeros(k)
+        size2 = (s[shown, :, None] * s[shown, None, :])[:, None]
+        covariance, log_det[shown] = _inverse(np.eye(n) + sums.information * size2)
         covariance *= size2
-        left = whole - flat @ (covariance @ right).reshape(k, n * m, P + 1)
+        left[shown] -= flat @ (covariance @ right).reshape(len(shown), n * m, P + 1)
         try:
             lower = np.linalg.cholesky(left[:, :P, :P])
         except np.linalg.LinAlgError:

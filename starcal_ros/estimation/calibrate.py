@@ -59,6 +59,7 @@ from starcal_ros.estimation.star_equations import (
     squared_sigmas,
     star_table,
     StarTable,
+    turned,
 )
 from starcal_ros.estimation.tracker_errors import (
     Attitudes,
@@ -97,7 +98,7 @@ from starcal_ros.records import (
 
 _START_FLOOR_PX = 0.05  # until the residuals show it: of the order of what is left in good images
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
-_ROBUST_GAIN = 1e-3  # a step of 0.04 sigma: the posterior goes on from there
+_ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
 _ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
@@ -266,7 +267,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shape_sigma_px, _FIRST_SHAPE_PX)
+        shape_px = np.maximum(last.posterior.shapes.sigma_px, _FIRST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.linear.layout, last.posterior)
         if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
@@ -411,7 +412,7 @@ def residuals_px(
     own = image_parameters(problem, state)
     measured = table.measured_px
     rotations = state.camera_from_icrf.as_matrix()
-    e = np.einsum('nij,nj->ni', rotations[table.image], table.direction_icrf)
+    e = turned(rotations, table.image, table.direction_icrf)
     if layout is not None and found is not None:
         own = np.broadcast_to(own, (table.image_count, problem.camera_count)).copy()
         shapes_px = found.of_images[:, layout.places['shape']]
@@ -419,17 +420,17 @@ def residuals_px(
         assert modes is not None
         own += np.einsum('mps,ms->mp', modes, shapes_px)
         measured = measured - field_of(layout, found, size).displacement_px(measured)
-        turned = np.zeros((3, len(table)))
+        turn = np.zeros((3, len(table)))
         for entry in layout.entries:
             if entry.turn is not None:
                 by = entry.turn(table.measured_px.T, e.T, table.image)
                 at = layout.places[entry.name]
                 if entry.of_image:
-                    turned += (by * found.of_images[table.image, at].T).sum(axis=1)
+                    turn += (by * found.of_images[table.image, at].T).sum(axis=1)
                 else:
-                    turned += np.einsum('aqn,q->an', by, found.mean[at])
-        e = e - np.cross(turned.T, e)
-    own_of_star = own if own.ndim == 1 else own[table.image].T
+                    turn += np.einsum('aqn,q->an', by, found.mean[at])
+        e = e - np.cross(turn, e.T, axis=0).T
+    own_of_star = own if own.ndim == 1 else np.take(own.T, table.image, axis=1)
     return np.asarray(measured - project_parameters(problem.model, own_of_star, e))
 
 

@@ -90,8 +90,8 @@ class Equations:
     information : (P, P)
         S on the shared unknowns without their priors.
     gradient : (P,)
-    back : (m, b, P)
-        ``C_k^-1 B_k``: an image's unknowns follow the shared ones by ``y = own - back x``.
+    cross : (m, b, P)
+        ``B_k``.
     own : (m, b)
         ``C_k^-1 c_k``.
     covariance : (m, b, b)
@@ -100,14 +100,19 @@ class Equations:
 
     information: Floats
     gradient: Floats
-    back: Floats
+    cross: Floats
     own: Floats
     covariance: Floats
+
+    @property
+    def back(self) -> Floats:
+        """``C_k^-1 B_k`` (m, b, P): unknowns of an image follow the shared by ``own - back x``."""
+        return np.asarray(self.covariance @ self.cross)
 
 
 def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     """
-    Yield each chunk with its whitened columns (2, c, m n).
+    Yield each chunk with its whitened columns (2, c, m n), which the next one overwrites.
 
     They are the camera parameters, the turns (velocity of the observer and others, then those of
     an image), the rotation of the image, and the residual: that of the camera parameters and the
@@ -124,21 +129,20 @@ def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     rotations = state.camera_from_icrf.as_matrix()
     turning = [entry for entry in linear.layout.entries if entry.turn is not None]
     turning.sort(key=lambda entry: entry.of_image)
-    for chunk, J in whitened_chunks(linear.measurements, problem.model, own, rotations):
+    given = linear.measurements, problem.model, own, rotations, None, sum(map(len, turning))
+    for chunk, J in whitened_chunks(*given):
         if J is None:
             raise NotObservable('a star has no image')
-        n = chunk.direction_icrf.shape[2]
-        rotation = J[:, p : p + 3]
-        turned = []
         if turning:
             e = (rotations[chunk.image] @ chunk.direction_icrf).transpose(1, 0, 2).reshape(3, -1)
-            image = np.repeat(chunk.image, n)
-            predicted_px = _predicted_px(chunk, J[:, p + 3])
+            image = np.repeat(chunk.image, chunk.direction_icrf.shape[2])
+            predicted_px, at = _predicted_px(chunk, J[:, -2]), p
             for entry in turning:
                 assert entry.turn is not None
-                turns = entry.turn(predicted_px, e, image)
-                turned.append(sum(rotation[:, b, None] * turns[b] for b in range(3)))
-        yield chunk, np.concatenate([J[:, :p], *turned, J[:, p : p + 4]], axis=1)
+                turns, here = entry.turn(predicted_px, e, image), J[:, at : at + len(entry)]
+                np.einsum('rbn,bqn->rqn', J[:, -5:-2], turns, out=here)
+                at += len(entry)
+        yield chunk, J[:, :-1]
 
 
 def star_rows(linear: Linearisation) -> Iterator[tuple[Chunk, Floats, Floats, Floats]]:
@@ -254,7 +258,7 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
     blocks, cross = sums.blocks, sums.field_cross
     m, P = len(blocks), layout.count
     stars, own, _ = chain_columns(layout)
-    total = blocks.sum(axis=0)
+    total, of_field = blocks.sum(axis=0), cross.sum(axis=0)
     A, a = np.zeros((P, P)), np.zeros(P)
     A[np.ix_(at, at)], a[at] = total[stars, stars], total[stars, -1]
     C, c = blocks[:, own, own].copy(), blocks[:, own, -1].copy()
@@ -263,9 +267,9 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
     if 'field' in layout:
         field = np.arange(P)[layout.places['field']]
         A[np.ix_(field, field)] = sums.field_information
-        A[np.ix_(field, at)] = cross[:, :, stars].sum(axis=0)
+        A[np.ix_(field, at)] = of_field[:, stars]
         A[np.ix_(at, field)] = A[np.ix_(field, at)].T
-        a[field] = cross[:, :, -1].sum(axis=0)
+        a[field] = of_field[:, -1]
         B[:, :, field] = cross[:, :, own].transpose(0, 2, 1)
     cost = _add_star_tracker(A, a, B, C, c, problem, state, layout)
     # A rotation on which nothing pulls stays.
@@ -288,13 +292,12 @@ def eliminated(
     C = normal.C
     C = C + np.diag(layout.image_precision(shape_sigma_px))
     covariance = inverse(C)
-    back = covariance @ normal.B
     # The product of a matrix and its transpose takes half the time of that of any two.
     root = (np.linalg.cholesky(covariance).transpose(0, 2, 1) @ normal.B).reshape(m * b, P)
     own = np.einsum('mij,mj->mi', covariance, normal.c)
     gradient = normal.a - normal.B.reshape(m * b, P).T @ own.ravel()
     information = normal.A - root.T @ root
-    return Equations(0.5 * (information + information.T), gradient, back, own, covariance)
+    return Equations(0.5 * (information + information.T), gradient, normal.B, own, covariance)
 
 
 def information_of_images(

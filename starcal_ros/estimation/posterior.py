@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 from scipy.linalg import solve
@@ -77,36 +78,33 @@ class Posterior:
     Attributes
     ----------
     mean : (P,)
-    covariance : (P, P)
-        Under the errors that observations share, after `with_shared_errors`.
     working : (P, P)
-        Under independent errors of the working weights, `common_shape_px2` aside.
+        Covariance under independent errors of the working weights; what all images share in their
+        shapes is not in it.
     own, back : (m, b), (m, b, P)
         The unknowns of an image are ``own - back mean``.
     image_covariance : (m, b, b)
         Covariance of the unknowns of an image, the shared ones known.
     estimated : (e,) int
         Shared unknowns that are estimated; the others are held.
-    field, term, shape : Amplitudes
-        Of the octaves of the field, of the next term of the lens, of the shapes of the images.
+    field, term : Amplitudes
+        Of the octaves of the field, and of the next term of the lens.
+    shapes : Shapes
+        Of the images.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
-    shape_sigma_px : (s,)
-        Amplitudes of the shapes of an image that stand for their posterior.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
-    common_shape_px2 : (s,)
-        Part of ``covariance``: of the shapes that all images share.
     information, gradient : (P, P), (P,)
         From the stars and the star trackers, without priors, the images eliminated.
     log_evidence : float
         Of the data given the priors, but for what follows from the data alone.
+    layout : Layout
     errors : ErrorParts or None
         None before `with_shared_errors`.
     """
 
     mean: Floats
-    covariance: Floats
     working: Floats
     own: Floats
     back: Floats
@@ -114,15 +112,22 @@ class Posterior:
     estimated: Indices
     field: Amplitudes
     term: Amplitudes
-    shape: Amplitudes
+    shapes: Shapes
     last_octave: tuple[Floats, Floats]
-    shape_sigma_px: Floats
     resolved: float
-    common_shape_px2: Floats
     information: Floats
     gradient: Floats
     log_evidence: float
+    layout: Layout
     errors: ErrorParts | None = None
+
+    @functools.cached_property
+    def covariance(self) -> Floats:
+        """Covariance (P, P); under the errors that observations share, if they are known."""
+        total = self.working + common_shape(self.layout, self.shapes.common_px2)
+        if self.errors is None:
+            return total
+        return np.asarray(total + self.errors.root @ self.errors.excess @ self.errors.root.T)
 
     @property
     def of_images(self) -> Floats:
@@ -153,10 +158,10 @@ def posterior(
     solver = _Solver(layout)
     base, field_px = solver.likely(start, near.field if near else None)
     none = Amplitudes(np.full(len(before), NO_AMPLITUDE), 0.0)
-    found, last = Shapes(before, none, np.zeros(len(before))), start
+    found, last = Shapes(before, none, None), start
     if len(sums.blocks) > 1:
         by_image = _shape_sums(sums, linear, solver, field_px)
-        found = shapes(by_image, near.shape if near else None)
+        found = shapes(by_image, near.shapes.amplitudes if near else None)
         last = eliminated(normal, layout, found.sigma_px)
     mean, covariance, last_octave, term, log_evidence = solver.solve(last, base)
     # The unknowns of the images, eliminated, and the prior of their amplitudes.
@@ -168,7 +173,6 @@ def posterior(
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
-        covariance=covariance + common_shape(layout, found.common_px2),
         working=covariance,
         own=last.own,
         back=last.back,
@@ -176,14 +180,13 @@ def posterior(
         estimated=solver.estimated,
         field=base,
         term=term,
-        shape=found.amplitudes,
+        shapes=found,
         last_octave=last_octave,
-        shape_sigma_px=found.sigma_px,
         resolved=resolved,
-        common_shape_px2=found.common_px2,
         information=last.information,
         gradient=last.gradient,
         log_evidence=log_evidence,
+        layout=layout,
     )
 
 
@@ -379,15 +382,13 @@ def with_shared_errors(
 ) -> Posterior:
     """Return the posterior with the covariance under the errors that observations share."""
     layout = linear.layout
-    covariance = found.covariance - common_shape(layout, found.common_shape_px2)
-    root, held = _root(covariance, found.estimated, sums, layout)
+    root, held = _root(found.working, found.estimated, sums, layout)
     excess, shared = _of_observations(found, linear, weights, root)
     of_attitudes, by_tracker = _of_attitudes(found, linear, weights, root)
     excess += of_attitudes
     none = (0, held.shape[1])  # errors of the modes that priors hold
     return dataclasses.replace(
         found,
-        covariance=found.covariance + root @ excess @ root.T,
         errors=ErrorParts(
             np.concatenate([root, held], axis=1),
             np.pad(excess, none),

@@ -40,7 +40,7 @@ from starcal_ros.estimation.problem import (
     State,
     why_unsupported,
 )
-from starcal_ros.estimation.star_equations import Measurements, StarTable
+from starcal_ros.estimation.star_equations import Measurements, StarTable, turned
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
 from starcal_ros.records import CameraGeometry, Ensemble
 
@@ -234,11 +234,11 @@ def _rotations(
     good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST_STARS)
     count = np.bincount(image, minlength=m)
     middle = np.cumsum(count) - count + count // 2
+    # Medians: lengths, at most 2, are sorted within their images by one key.
     off, off_before = (
-        np.append(length[np.lexsort((length, image))], np.inf)[middle]
+        np.append(np.sort(image + 0.25 * length), np.inf)[middle]
         for length in (
-            np.linalg.norm(seen - np.einsum('nij,nj->ni', one[image], e), axis=1)
-            for one in (fitted, before)
+            np.linalg.norm(seen - turned(one, image, e), axis=1) for one in (fitted, before)
         )
     )
     good &= off < off_before

@@ -271,12 +271,13 @@ def _restricted(
     along = vectors.T @ error
     alone = slow2[..., None] * np.maximum(values, 0.0) + noise2[:, None] / members
     total = alone + of_stars / members
-    information = (ones**2 / total).sum(axis=2)
-    mean = np.einsum('snm,ma->sna', ones / total, along) / information[..., None]
-    squared = np.einsum('snm,ma->sn', 1.0 / total, along**2)
-    squared -= information * (mean**2).sum(axis=2)
-    log_det = np.log(total).sum(axis=2) + np.log(information)
-    return -0.5 * (error.shape[1] * log_det + squared), (ones**2 / alone).sum(axis=2)
+    log_det = np.log(total).sum(axis=2)
+    inverse = np.reciprocal(total, out=total)
+    information = inverse @ ones**2
+    mean = inverse @ (ones[:, None] * along) / information[..., None]
+    squared = inverse @ (along**2).sum(axis=1) - information * (mean**2).sum(axis=2)
+    log_det += np.log(information)
+    return -0.5 * (error.shape[1] * log_det + squared), (1.0 / alone) @ ones**2
 
 
 UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit

@@ -48,7 +48,7 @@ from starcal_ros.estimation.shared_errors import (
     SharedError,
     star_shares_px2,
 )
-from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
+from starcal_ros.estimation.star_equations import ROTATION, StarTable, turned, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
     Attitudes,
     Correlations,
@@ -297,16 +297,16 @@ def degrees_of_freedom(
     # By camera and rotation: an image turns no star by itself.
     rows = np.arange(E.shape[1])
     used_rows = np.concatenate([rows[: problem.camera_count], rows[ROTATION]])
-    of_image, c = E[:, used_rows, own], len(used_rows)
+    root = np.linalg.cholesky(found.image_covariance)
+    by_root = (E[:, used_rows, own] @ root).transpose(0, 2, 1)
     given = image_parameters(problem, state), state.camera_from_icrf.as_matrix()
     for chunk, J in whitened_chunks(linear.measurements, problem.model, *given):
         assert J is not None  # as in the sums
         m, _, n = chunk.direction_icrf.shape
-        columns = J[:, :c].reshape(2, c, m, n).transpose(2, 0, 3, 1).reshape(m, 2 * n, c)
-        K = columns @ of_image[chunk.image]
-        each = ((K @ found.image_covariance[chunk.image]) * K).sum(axis=2).reshape(m, 2, n)
+        columns = J[:, : len(used_rows)].reshape(2, -1, m, n).transpose(0, 2, 1, 3)
+        each = np.square(by_root[chunk.image] @ columns).sum(axis=(0, 2)).ravel()
         real = chunk.whitener[0] > 0
-        leverage[chunk.row[real]] = each.sum(axis=1).ravel()[real]
+        leverage[chunk.row[real]] = each[real]
     used = max(int(np.count_nonzero(kept)), 1)
     if leverage.sum() + found.resolved >= 2 * used:
         raise NotObservable('fewer residuals than unknowns')
@@ -423,16 +423,16 @@ def sky_rotations(state: State, table: StarTable, camera: CameraModel) -> Floats
     The rotation part of the derivative of the pixel by the place of the star.
     """
     e = table.direction_icrf
-    along = np.cross(e, [0.1, 0.2, 0.97])
+    along: Floats = np.asarray(np.cross(e, [0.1, 0.2, 0.97]))
     along /= np.linalg.norm(along, axis=1)[:, None]
-    rotations = state.camera_from_icrf.as_matrix()[table.image]
-    in_camera = np.einsum('nij,nj->ni', rotations, e)
+    rotations = state.camera_from_icrf.as_matrix()
+    in_camera = turned(rotations, table.image, e)
     J = rotation_jacobian(
         dataclasses.replace(camera, parameters=state.parameters, field=None), in_camera
     )
     columns = [
-        np.einsum('nab,nb->na', J, np.cross(np.einsum('nij,nj->ni', rotations, one), in_camera))
-        for one in (along, np.cross(e, along))
+        np.einsum('nab,nb->na', J, np.cross(turned(rotations, table.image, axis), in_camera))
+        for axis in (along, np.asarray(np.cross(e, along)))
     ]
     M = np.stack(columns, axis=2)
     # A mirrored pair of axes is the same for all stars: the sky's second axis is turned over.

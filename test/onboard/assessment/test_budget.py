@@ -200,7 +200,7 @@ def test_known_shapes_add_the_information_that_they_hide() -> None:
     T = budget._known_shapes(found, errors)
     given = found.sums, found.linear
     hidden = equations(*given, 1e-7).information
-    hidden = hidden - equations(*given, found.posterior.shape_sigma_px).information
+    hidden = hidden - equations(*given, found.posterior.shapes.sigma_px).information
     C = errors.root @ errors.root.T
     size = np.sqrt(np.diag(C))
     size[size == 0] = 1.0

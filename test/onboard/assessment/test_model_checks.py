@@ -166,7 +166,7 @@ def test_a_focal_length_that_breathes_is_estimated_image_by_image() -> None:
     shown = found.posterior.of_images[:, 3] / focal_px
     np.testing.assert_allclose(shown - shown.mean(), scales - scales.mean(), atol=4e-5)
     # The scale varies, the others do not.
-    scale_px, *others_px = found.posterior.shape_sigma_px
+    scale_px, *others_px = found.posterior.shapes.sigma_px
     assert max(others_px) < 0.1 * scale_px
     # The camera of one image scatters by that about the mean, which adds 1 in 12 of the variance;
     # what neighbours may share comes to it.

@@ -68,7 +68,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let all amplitudes be known: those of octaves and shapes; the term of the lens is absent."""
     field, shape = (Amplitudes(np.log(one), 0.0) for one in (OCTAVES_PX, SHAPE))
     monkeypatch.setattr(module, 'field_amplitudes', lambda *_: field)
-    monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, np.zeros(len(SHAPE))))
+    monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, None))
     monkeypatch.setattr(amplitudes, '_SHIFTS', np.zeros(1))
     monkeypatch.setattr(amplitudes, '_OF_TERM', np.array([-300.0]))
     monkeypatch.setattr(module, '_HELD', 1e-13)
@@ -103,7 +103,7 @@ def test_at_known_amplitudes_it_is_the_dense_solution(given: Small, truth: Dense
     precision, offset = prior_precision(given, SHAPE, OCTAVES_PX), prior_offset(given)
     mean, covariance, _ = solution(truth, precision, offset)
     assert_same(found, mean, covariance)
-    assert np.array_equal(found.shape_sigma_px, SHAPE)
+    assert np.array_equal(found.shapes.sigma_px, SHAPE)
     # The number of unknowns that the data determine: trace of data over all information.
     free = np.flatnonzero(np.isfinite(precision[: given.layout.count]))
     prior = np.trace(covariance[np.ix_(free, free)] * precision[free])
@@ -195,7 +195,7 @@ def mixed(parts: list[tuple[float, Floats, Floats]]) -> tuple[Floats, Floats, Fl
 
 def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied) -> None:
     made, truth, found, result = varied.made, varied.truth, varied.found, varied.result
-    assert np.array_equal(found.shape_sigma_px, result.sigma_px)
+    assert np.array_equal(found.shapes.sigma_px, result.sigma_px)
     mode_px = found.field.log_px
     shifts = found.last_octave[0] - mode_px[-1]
     assert shifts.min() == pytest.approx(-8.0)
@@ -224,7 +224,7 @@ def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied
     assert np.abs(difference / np.outer(sigma[free], sigma[free])).max() < 1e-5
     added = common_shape(made.layout, result.common_px2)
     assert np.allclose(found.working + added, found.covariance, rtol=1e-12, atol=0.0)
-    assert np.array_equal(found.common_shape_px2, result.common_px2)
+    assert np.array_equal(found.shapes.common_px2, result.common_px2)
     size = np.sqrt(np.diag(covariance)[P:])
     assert np.abs((found.of_images.ravel() - mean[P:]) / size).max() < 1e-5
 
@@ -407,9 +407,9 @@ def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance
     own = np.arange(P, len(truth.stars.T))
     X = np.concatenate([truth.stars, truth.trackers])
     N = X[:, own].T @ X[:, own]
-    N += np.diag(prior_precision(given, found.shape_sigma_px, None)[own])
+    N += np.diag(prior_precision(given, found.shapes.sigma_px, None)[own])
     left = X[:, :P] - X[:, own] @ np.linalg.solve(N, X[:, own].T @ X[:, :P])
-    plain = found.covariance - common_shape(given.layout, found.common_shape_px2)
+    plain = found.covariance - common_shape(given.layout, found.shapes.common_px2)
     parts = propagated(given, truth, plain @ left.T, weights, V)
     expected = found.covariance + sum(parts.values())
     rows = truth.stars[::7, :P]

@@ -309,8 +309,8 @@ def test_a_changing_camera_fits_only_where_it_is_asked_for() -> None:
     rms, more = (np.sqrt(np.mean(e.residual_px[e.kept] ** 2)) for e in (estimate, without))
     assert estimate.variance_factor == pytest.approx(1.0, abs=0.1)
     # Without the terms the images have shapes of their own, and the camera is known less well.
-    assert without.posterior.shape.likelihood_ratio > 50.0
-    assert estimate.posterior.shape.likelihood_ratio < 15.0
+    assert without.posterior.shapes.amplitudes.likelihood_ratio > 50.0
+    assert estimate.posterior.shapes.amplitudes.likelihood_ratio < 15.0
     assert more == pytest.approx(rms, rel=0.02)
     assert without.covariance[0, 0] > 4 * estimate.covariance[0, 0]
 
