@@ -23,6 +23,7 @@ from scipy.stats import chi2
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import parameter_difference
+from starcal_ros.assessment.lookup import grid_derivatives
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
@@ -137,13 +138,14 @@ def run_trial(design: Design, trial: int) -> tuple[Row, ...]:
 def _cell(design: Design, part: StarField, unused: StarField | None) -> Iterator[Row]:
     """Errors of each method at each star tracker noise, and the bounds of its assumptions."""
     camera, blocks = part.truth.camera, trials.information_blocks(part)
+    grid = grid_derivatives(camera)
     own = {
-        method: trials.map_bound_px(camera, trials.bound(method, blocks, 0.0))
+        method: trials.map_bound_px(camera, trials.bound(method, blocks, 0.0), grid)
         for method in ('per_image', 'single')
     }
     for tracker, share in itertools.product(design.tracker_arcsec, design.outlier_shares):
         least = trials.bound('hierarchical', blocks, tracker)
-        own['hierarchical'] = trials.map_bound_px(camera, least)
+        own['hierarchical'] = trials.map_bound_px(camera, least, grid)
         ensemble = trials.observe(part, tracker, share)
         for method in design.methods:
             assumed = tracker if design.assumed_arcsec is None else design.assumed_arcsec
@@ -160,7 +162,7 @@ def _cell(design: Design, part: StarField, unused: StarField | None) -> Iterator
                 'own_bound_px': own[method],
                 'per_image_bound_px': own['per_image'],
                 'bound_px': own['hierarchical'],
-                'pointing_bound_arcsec': trials.pointing_bound_arcsec(camera, least),
+                'pointing_bound_arcsec': trials.pointing_bound_arcsec(grid, least),
             }
 
 

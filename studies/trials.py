@@ -19,9 +19,9 @@ from starcal_ground.simulation.centroids import scaled_inverse
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import chi_squared, lines_of_sight, parameter_difference
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.lookup import Derivatives, GRID, sigma_arcsec
 from starcal_ros.assessment.observability import map_sigma_px
-from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
+from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
@@ -171,15 +171,16 @@ def bound(method: str, blocks: Floats, tracker_arcsec: float) -> MapCovariance:
     return MapCovariance(covariance)
 
 
-def map_bound_px(camera: CameraModel, covariance: MapCovariance) -> float:
+def map_bound_px(
+    camera: CameraModel, covariance: MapCovariance, grid: Derivatives | None = None
+) -> float:
     """Expected `map_error_px` for a covariance, RMS over the detector, px."""
-    return rms(map_sigma_px(camera, covariance))
+    return rms(map_sigma_px(camera, covariance, grid))
 
 
-def pointing_bound_arcsec(camera: CameraModel, covariance: MapCovariance) -> float:
+def pointing_bound_arcsec(grid: Derivatives, covariance: MapCovariance) -> float:
     """Expected `pointing_error_arcsec` for a covariance, RMS over the detector."""
-    table = line_of_sight_table(camera, covariance, pixel_grid(camera, GRID, GRID))
-    return rms(table.sigma_arcsec)
+    return rms(sigma_arcsec(grid.covariance_rad2(covariance, grid.J)))
 
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:

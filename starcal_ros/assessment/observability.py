@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import movement
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.lookup import (
+    common_rotation,
+    Derivatives,
+    GRID,
+    grid_derivatives,
+    line_of_sight_table,
+    sigma_arcsec,
+)
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,
@@ -250,10 +257,14 @@ def keep_most_informative(
     return replace(ensemble, images=images)
 
 
-def map_sigma_px(camera: CameraModel, covariance: MapCovariance) -> Floats:
-    """1-sigma (GRID * GRID,) of the shape of the map, in pixels at the centre."""
-    table = line_of_sight_table(camera, covariance, pixel_grid(camera, GRID, GRID))
-    return np.asarray(table.shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
+def map_sigma_px(
+    camera: CameraModel, covariance: MapCovariance, grid: Derivatives | None = None
+) -> Floats:
+    """1-sigma (GRID * GRID,) of the map's shape, px at the centre; ``grid``: its derivatives."""
+    grid = grid or grid_derivatives(camera)
+    J = grid.of_shape(camera, common_rotation(camera, grid))
+    sigma = sigma_arcsec(grid.covariance_rad2(covariance, J))
+    return np.asarray(sigma * ARCSECOND_RAD * camera.parameters[0])
 
 
 def map_error_px(found: CameraModel, true: CameraModel) -> float:
