@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 import contextlib
+import dataclasses
 import fcntl
 import functools
 import gc
@@ -256,6 +257,23 @@ def tiny_bag(made_once: MadeOnce) -> Path:
         (folder / 'params.yaml').write_text(params)
 
     return made_once('tiny', copy)
+
+
+@pytest.fixture(scope='session')
+def few_images(made_once: MadeOnce) -> Path:
+    """
+    The same bag as it is after three images, which half of the time calibrates.
+
+    For tests of what becomes of bags and of calibrations, not of what is in them.
+    """
+
+    def write(folder: Path) -> None:
+        from starcal_ground.simulation import scenario, simulated_bag
+
+        few = dataclasses.replace(scenario.scenario('tiny'), image_count=3)
+        simulated_bag.write_bag(few, folder / 'tiny', f'file://{TINY}/camera.yaml')
+
+    return made_once('few', write) / 'tiny'
 
 
 @pytest.fixture(scope='session')

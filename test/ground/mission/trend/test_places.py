@@ -42,8 +42,10 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypatch) -> None:
-    shutil.copytree(TINY, tmp_path / 'fleet/one')
+def test_content_that_is_known_is_not_calibrated_again(
+    few_images: Path, tmp_path: Path, monkeypatch
+) -> None:
+    shutil.copytree(few_images, tmp_path / 'fleet/one')
     cameras = Cameras(params=str(TINY / 'params.yaml'))
     fleet.update(Table(tmp_path), fleet.find(str(tmp_path / 'fleet'), cameras))
     os.utime(tmp_path / 'fleet/one/tiny_0.mcap', (5, 5))
@@ -108,10 +110,10 @@ def test_relative_paths_are_made_absolute(mission: Path, monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_bags_and_products_by_url(tmp_path: Path, capsys) -> None:
+def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, capsys) -> None:
     memory = fsspec.filesystem('memory')
     memory.rm('/fleet', recursive=True) if memory.exists('/fleet') else None
-    memory.put(str(TINY), '/fleet/bag', recursive=True)
+    memory.put(str(few_images), '/fleet/bag', recursive=True)
     write(tmp_path / 'one', 3)
     memory.put(str(tmp_path / 'one'), '/fleet/one', recursive=True)
     line = ['trend', 'memory://fleet', '-o', str(tmp_path)]
