@@ -272,7 +272,7 @@ def few_images(made_once: MadeOnce) -> Path:
         from starcal_ground.simulation import scenario, simulated_bag
 
         few = dataclasses.replace(scenario.scenario('tiny'), image_count=3)
-        simulated_bag.write_bag(few, folder / 'tiny', f'file://{TINY}/camera.yaml')
+        simulated_bag.write_bag(few, folder / 'tiny', 'camera.yaml')
 
     return made_once('few', write) / 'tiny'
 
