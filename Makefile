@@ -73,7 +73,7 @@ help:
 	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
 	@echo 'make check   lint and the fast tests, before each commit'
 	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/onboard/camera"
-	@echo 'make packaging   tests that build, install, draw and browse; .ci/run runs them too'
+	@echo 'make packaging   tests that build, install, draw, browse and follow documents; .ci/run runs them'
 	@echo 'make lint    ruff, mypy --strict and the import contract'
 	@echo 'make docs    the Sphinx site in docs/_build/html; warnings are errors'
 	@echo 'make bench   the measurements of docs/performance.md'

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 import contextlib
+import dataclasses
 import fcntl
 import functools
 import gc
@@ -34,9 +35,10 @@ TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 # the others wait.
 LONGEST = (
     *('test_colcon', 'test_bench', 'test_night_sky', 'test_calibrate', 'test_monte_carlo'),
-    *('test_kills', 'test_diagnose', 'test_object_store'),
-    *('test_c_camera', 'test_deep_catalog', 'test_set_up_mistakes', 'test_trend'),
-    *('test_recording', 'test_untrusted_files', 'test_docs'),
+    *('test_first_setup', 'test_arguments_output', 'test_docs', 'test_diagnose', 'test_c_camera'),
+    *('test_kills', 'test_series_overview', 'test_object_store', 'test_trend', 'test_plan'),
+    *('test_set_up_mistakes', 'test_state', 'test_lens_models', 'test_main', 'test_hostile_state'),
+    *('test_mission_records_guard', 'test_deep_catalog', 'test_unknown_air'),
     *('test_ros_tools', 'test_hostile_messages', 'test_calibrator_camera_driver'),
 )
 
@@ -256,6 +258,23 @@ def tiny_bag(made_once: MadeOnce) -> Path:
         (folder / 'params.yaml').write_text(params)
 
     return made_once('tiny', copy)
+
+
+@pytest.fixture(scope='session')
+def few_images(made_once: MadeOnce) -> Path:
+    """
+    The same bag as it is after three images, which half of the time calibrates.
+
+    For tests of what becomes of bags and of calibrations, not of what is in them.
+    """
+
+    def write(folder: Path) -> None:
+        from starcal_ground.simulation import scenario, simulated_bag
+
+        few = dataclasses.replace(scenario.scenario('tiny'), image_count=3)
+        simulated_bag.write_bag(few, folder / 'tiny')
+
+    return made_once('few', write) / 'tiny'
 
 
 @pytest.fixture(scope='session')

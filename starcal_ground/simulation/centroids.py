@@ -13,11 +13,10 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import pixel_stamps
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import CameraModel, project_jacobians, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Ensemble, StarObservations
@@ -79,7 +78,7 @@ def with_rate(
 
 def scene_bound(
     scenario: synthetic.Scenario, shown: synthetic.Scene
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Mask]:
     """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
     camera = scenario.truth.camera
     path_px = None
@@ -175,23 +174,29 @@ def centroid_bound(
     return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
 
 
-def cramer_rao_covariance(scenario: synthetic.Scenario) -> Floats:
+def cramer_rao_covariance(
+    scenario: synthetic.Scenario, bounds: Sequence[tuple[Floats, Floats, Mask]] = ()
+) -> Floats:
     """
     Cramer-Rao bound of the covariance of the camera parameters named by `bound_names`.
 
     Every star above `BOUND_SNR` counts, with its own bound; the attitude of each image is free
-    and the parameters not named are held.
+    and the parameters not named are held.  ``bounds``: the `scene_bound` of each scene.
     """
     camera = scenario.truth.camera
     columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
-    return scaled_inverse(scenario_information(scenario, columns))
+    return scaled_inverse(scenario_information(scenario, columns, bounds))
 
 
-def scenario_information(scenario: synthetic.Scenario, columns: Sequence[int]) -> Floats:
+def scenario_information(
+    scenario: synthetic.Scenario,
+    columns: Sequence[int],
+    bounds: Sequence[tuple[Floats, Floats, Mask]] = (),
+) -> Floats:
     """Information (k, k) of all images on the camera parameters of some columns."""
     information = np.zeros((len(columns), len(columns)))
-    for shown in synthetic.scenes(scenario):
-        covariance, _, keep = scene_bound(scenario, shown)
+    for index, shown in enumerate(synthetic.scenes(scenario)):
+        covariance, _, keep = bounds[index] if bounds else scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
         information += camera_information(
             scenario.truth.camera, in_camera, covariance[keep], columns

@@ -129,11 +129,8 @@ class SimulatedBag:
 def truth_content(scenario: synthetic.Scenario, bag_name: str) -> dict[str, object]:
     """Content of the truth file of a bag, a JSON object."""
     true, prior = scenario.truth, scenario.prior
-    stars = stars_above = 0
-    for shown in synthetic.scenes(scenario):
-        _, snr, _ = centroids.scene_bound(scenario, shown)
-        stars += len(snr)
-        stars_above += int((snr > centroids.BOUND_SNR).sum())
+    bounds = [centroids.scene_bound(scenario, shown) for shown in synthetic.scenes(scenario)]
+    snr = np.concatenate([of_scene for _, of_scene, _ in bounds])
     return {
         'scenario': scenario.name,
         'seed': scenario.seed,
@@ -150,12 +147,12 @@ def truth_content(scenario: synthetic.Scenario, bag_name: str) -> dict[str, obje
         'sigma_st_arcsec': max(scenario.star_tracker_sigma_arcsec),
         'sigma_st_axes_arcsec': list(scenario.star_tracker_sigma_arcsec),
         'images': scenario.image_count,
-        'stars': stars,
-        'stars_snr5': stars_above,
+        'stars': len(snr),
+        'stars_snr5': int((snr > centroids.BOUND_SNR).sum()),
         'crlb_keep': [
             true.camera.parameter_names.index(name) for name in centroids.bound_names(true.camera)
         ],
-        'crlb_cov': centroids.cramer_rao_covariance(scenario).tolist(),
+        'crlb_cov': centroids.cramer_rao_covariance(scenario, bounds).tolist(),
         't0': scenario.start_ns / NANOSECONDS_PER_SECOND,
         'step': scenario.cadence_s,
     }

@@ -129,7 +129,7 @@ def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     rotations = state.camera_from_icrf.as_matrix()
     turning = [entry for entry in linear.layout.entries if entry.turn is not None]
     turning.sort(key=lambda entry: entry.of_image)
-    given = linear.measurements, problem.model, own, rotations, None, sum(map(len, turning))
+    given = linear.measurements, problem.model, own, rotations, sum(map(len, turning))
     for chunk, J in whitened_chunks(*given):
         if J is None:
             raise NotObservable('a star has no image')

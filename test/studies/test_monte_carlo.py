@@ -36,7 +36,10 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 METHODS = ('per_image', 'single', 'hierarchical')
-ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
+ARGUMENTS = (
+    *('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5'),
+    *('--methods', 'hierarchical'),
+)
 SMALL = {
     'table1': {'trials': 2, 'images': (4,), 'stars': (20, 30), 'tracker_arcsec': (0.0, 20.0)},
     'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},

@@ -256,6 +256,7 @@ def test_the_tool_takes_the_line(line: Line) -> None:
 RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 @pytest.mark.parametrize('document', RUNNING, ids=lambda path: path.name)
 def test_the_commands_of_a_document_run(

@@ -276,7 +276,8 @@ def test_what_starcal_did_not_write_is_not_replaced(
 )
 @pytest.mark.parametrize('bag', [BAG, '/none'])
 def test_standard_streams_that_are_closed_full_or_abandoned(bag: object, ends: str) -> None:
-    command = f'{sys.executable} -m starcal_ground.cli.main inspect {bag} {ends}'
+    line = f'inspect {bag} --params {BAG}/params.yaml'  # without, it is a search for the camera
+    command = f'{sys.executable} -m starcal_ground.cli.main {line} {ends}'
     done = subprocess.run(['bash', '-c', command], capture_output=True, text=True, timeout=60)
     assert 'Traceback' not in done.stdout + done.stderr
     assert 'Exception' not in done.stdout + done.stderr

@@ -435,15 +435,15 @@ def test_interrupt_is_one_line(run: Run, tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 def test_simulate_writes_bag_truth_and_parameters(run: Run, tmp_path: Path) -> None:
-    status, out, err = run('simulate', '-o', tmp_path / 'bag', '--scenario', 'tiny', '--seed', '5')
+    made = ('--scenario', 'tiny', '--seed', '5', '--images', '4')
+    status, out, err = run('simulate', '-o', tmp_path / 'bag', *made)
     assert (status, err) == (0, '')
     truth = json.loads((tmp_path / 'bag' / 'truth.json').read_text())
-    assert (truth['seed'], truth['images'], truth['scenario']) == (5, 10, 'tiny')
+    assert (truth['seed'], truth['images'], truth['scenario']) == (5, 4, 'tiny')
     assert (tmp_path / 'bag' / truth['bag']).is_file()
     assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
     assert 'truth.json' in out and 'params.yaml' in out
-    status, _, _ = run('simulate', '-o', tmp_path / 'b.mcap', '--scenario', 'tiny', '--seed', '5')
-    assert status == 0
+    assert run('simulate', '-o', tmp_path / 'b.mcap', *made)[0] == 0
     same = (tmp_path / 'bag' / truth['bag']).read_bytes()
     assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
     assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}

@@ -124,10 +124,11 @@ def test_streaks_that_are_measured_are_identified_too(
 ) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    assert main(['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8']) == 0
+    line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '4']
+    assert main(line) == 0
     capsys.readouterr()
-    assert main(['calibrate', str(bag), '-o', str(out), '--no-report']) == 0
-    assert '10 of 10 images identified by their stars' in capsys.readouterr().err
+    assert main(['calibrate', str(bag), '-o', str(out), '--no-report']) in (0, 3)
+    assert '4 of 4 images identified by their stars' in capsys.readouterr().err
     calibration = read_calibration(out / 'calibration.json')
     truth = json.loads((bag / 'truth.json').read_text())['k_true'][0]
     # One draw: 4 sigma are exceeded once in 16,000.
@@ -138,7 +139,7 @@ def test_streaks_that_are_measured_are_identified_too(
 def test_photographs_of_which_nothing_is_stated(
     tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    night, out = write_pngs(tmp_path / 'night', tiny_images[:5]), tmp_path / 'out'
+    night, out = write_pngs(tmp_path / 'night', tiny_images[:3]), tmp_path / 'out'
     command = ['calibrate', str(night), '-o', str(out), '--no-report']
     assert main([*command, '--focal-length-mm', '50', '--pixel-size-um', '10']) in (0, 3)
     text, notes = capsys.readouterr()

@@ -100,12 +100,12 @@ def broken(*_: object) -> None:
     ],
 )
 def test_a_drawing_that_fails_costs_the_drawing_only(
-    tmp_path: Path, capsys, monkeypatch, place: str, missing: str
+    few_images: Path, tmp_path: Path, capsys, monkeypatch, place: str, missing: str
 ) -> None:
     out = tmp_path / 'out'
     monkeypatch.setattr(place, broken)
-    calibrate = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
-    assert main.main(calibrate) == 0
+    params = str(few_images / 'params.yaml')
+    assert main.main(['calibrate', str(few_images), '--params', params, '-o', str(out)]) == 0
     said = capsys.readouterr()
     assert 'accepted by the gate' in said.out
     assert f'warning: no {missing}, ' in said.err and 'TypeError: another version' in said.err

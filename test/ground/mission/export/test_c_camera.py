@@ -26,7 +26,7 @@ from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import write_calibration
 from starcal_ros.records import Calibration, factored_field, MapCovariance, SigmaPart
 
-pytestmark = pytest.mark.slow  # compilers run
+pytestmark = [pytest.mark.packaging, pytest.mark.slow]  # compilers run
 WARNINGS = ['-Wall', '-Wextra', '-Werror', '-pedantic']
 SANITIZERS = ['-g', '-fsanitize=address,undefined', '-fno-sanitize-recover=all']
 MODELS = ['plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidistant']

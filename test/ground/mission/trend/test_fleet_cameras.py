@@ -67,8 +67,8 @@ def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_the_metadata_of_a_bag_names_them(tmp_path: Path) -> None:
-    shutil.copytree(TINY, tmp_path / 'fleet/one')
+def test_the_metadata_of_a_bag_names_them(few_images: Path, tmp_path: Path) -> None:
+    shutil.copytree(few_images, tmp_path / 'fleet/one')
     metadata = tmp_path / 'fleet/one/metadata.yaml'
     text = metadata.read_text()
     named = re.sub('custom_data: .*', 'custom_data: {spacecraft: A, camera: nav, x: 1}', text)

@@ -29,9 +29,9 @@ CAMERAS = Cameras(params=str(TINY / 'params.yaml'))
 
 
 @pytest.fixture
-def task(tmp_path: Path) -> Task:
+def task(few_images: Path, tmp_path: Path) -> Task:
     """The one bag of a fleet whose folder is that of the output as well."""
-    shutil.copytree(TINY, tmp_path / 'sat 1/2026-01')
+    shutil.copytree(few_images, tmp_path / 'sat 1/2026-01')
     (found,) = fleet.find(str(tmp_path), CAMERAS)
     return dataclasses.replace(found, spacecraft='sat 1', camera='nav')
 
@@ -59,9 +59,9 @@ def test_each_computed_row_has_its_calibration_after_any_kill(
 
 
 @pytest.mark.slow
-def test_a_copy_of_a_bag_keeps_one_calibration(tmp_path: Path) -> None:
+def test_a_copy_of_a_bag_keeps_one_calibration(few_images: Path, tmp_path: Path) -> None:
     for name in ('one', 'copy'):
-        shutil.copytree(TINY, tmp_path / name)
+        shutil.copytree(few_images, tmp_path / name)
     found = list(fleet.find(str(tmp_path), CAMERAS))
     copy = fleet.update(Table(tmp_path), [*found])
     assert copy == fleet.Done(computed=1, known=1) and len(kept(tmp_path)) == 1

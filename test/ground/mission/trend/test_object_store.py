@@ -38,9 +38,10 @@ class Store(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self) -> None:
+    def __init__(self, bag: Path) -> None:
         super().__init__(('127.0.0.1', 0), Handler)
         self.url = f'http://127.0.0.1:{self.server_port}'
+        self._bag = bag
         self.objects: dict[str, bytes] = {}
         self.faults: dict[str, int] = {}
         self.requests: list[str] = []
@@ -49,11 +50,11 @@ class Store(ThreadingHTTPServer):
     def reset(self) -> None:
         """Two bags, and no fault."""
         self.objects, self.faults, self.requests = {}, {}, []
-        content = (TINY / 'tiny_0.mcap').read_bytes()
+        content = (self._bag / 'tiny_0.mcap').read_bytes()
         for k in range(2):
             changed = content.replace(b'starcal', b'%07d' % k, 1)  # in the header, not read
             self.objects[f'fleet/{k}/tiny_0.mcap'] = changed
-            self.objects[f'fleet/{k}/metadata.yaml'] = (TINY / 'metadata.yaml').read_bytes()
+            self.objects[f'fleet/{k}/metadata.yaml'] = (self._bag / 'metadata.yaml').read_bytes()
 
     def handle_error(self, *_: object) -> None:
         """Say nothing where a client has left."""
@@ -125,8 +126,8 @@ class Handler(BaseHTTPRequestHandler):
 
 
 @pytest.fixture(scope='module')
-def server() -> Iterator[Store]:
-    made = Store()
+def server(few_images: Path) -> Iterator[Store]:
+    made = Store(few_images)
     threading.Thread(target=made.serve_forever, daemon=True).start()
     with pytest.MonkeyPatch.context() as patch:
         settings = {'ACCESS_KEY_ID': 'a', 'SECRET_ACCESS_KEY': 'b', 'ENDPOINT_URL': made.url}

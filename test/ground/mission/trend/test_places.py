@@ -96,10 +96,10 @@ def test_relative_paths_are_made_absolute(mission: Path, monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_bags_and_products_by_url(tmp_path: Path, capsys) -> None:
+def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, capsys) -> None:
     memory = fsspec.filesystem('memory')
     memory.rm('/fleet', recursive=True) if memory.exists('/fleet') else None
-    memory.put(str(TINY), '/fleet/bag', recursive=True)
+    memory.put(str(few_images), '/fleet/bag', recursive=True)
     write(tmp_path / 'one', 3)
     memory.put(str(tmp_path / 'one'), '/fleet/one', recursive=True)
     line = ['trend', 'memory://fleet', '-o', str(tmp_path)]

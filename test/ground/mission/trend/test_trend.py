@@ -89,9 +89,11 @@ def test_a_repaired_file_has_not_failed(mission: Path, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(tmp_path: Path, capsys):
+def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(
+    few_images: Path, tmp_path: Path, capsys
+) -> None:
     """The parameters name files that decide as well, and so does the metadata of a bag."""
-    shutil.copytree(TINY, tmp_path / 'fleet/one')
+    shutil.copytree(few_images, tmp_path / 'fleet/one')
     shutil.copytree(TINY, tmp_path / 'setup')
     camera, params = tmp_path / 'setup/camera.yaml', tmp_path / 'setup/params.yaml'
     good = camera.read_text()
@@ -145,12 +147,14 @@ def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_a_link_to_no_file_costs_itself_and_not_its_bag(mission: Path, capsys) -> None:
+def test_a_link_to_no_file_costs_itself_and_not_its_bag(
+    mission: Path, few_images: Path, capsys
+) -> None:
     for k, target in enumerate(('/dev/zero', '/dev/tty', 'nowhere', 'x.mcap')):
         (mission / f'odd{k}').mkdir()
         (mission / f'odd{k}/x.mcap').symlink_to(target)
         (mission / f'odd{k}/metadata.yaml').write_text('')
-        shutil.copy(TINY / 'tiny_0.mcap', mission / f'odd{k}/good.mcap')
+        shutil.copy(few_images / 'tiny_0.mcap', mission / f'odd{k}/good.mcap')
     assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
     assert '9 new, 3 known, 0 failed' in capsys.readouterr().out
 
@@ -165,8 +169,8 @@ def test_a_calibration_that_no_page_can_show_costs_itself(mission: Path, capsys)
 
 
 @pytest.mark.slow
-def test_bags_are_calibrated_with_parameters(tmp_path: Path, capsys) -> None:
-    shutil.copytree(TINY, tmp_path / 'fleet/one')
+def test_bags_are_calibrated_with_parameters(few_images: Path, tmp_path: Path, capsys) -> None:
+    shutil.copytree(few_images, tmp_path / 'fleet/one')
     (tmp_path / 'fleet/two').mkdir()
     (tmp_path / 'fleet/two/poison.mcap').write_bytes(b'\x89MCAP0\r\n' + bytes(1000))
     line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
@@ -177,10 +181,12 @@ def test_bags_are_calibrated_with_parameters(tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_observations_of_another_version_are_calibrated_again(tmp_path: Path, capsys) -> None:
+def test_observations_of_another_version_are_calibrated_again(
+    few_images: Path, tmp_path: Path, capsys
+) -> None:
     folder = tmp_path / 'mission/one'
     params = str(TINY / 'params.yaml')
-    assert main(['calibrate', str(TINY), '--params', params, '-o', str(folder)]) == 0
+    assert main(['calibrate', str(few_images), '--params', params, '-o', str(folder)]) == 0
     text = (folder / 'calibration.json').read_text()
     (folder / 'calibration.json').write_text(re.sub(r'"starcal [^"]*"', '"starcal 0.0.1"', text))
     capsys.readouterr()
