@@ -176,14 +176,14 @@ def star_rows(linear: Linearisation) -> Iterator[tuple[Chunk, Floats, Floats, Fl
         )
 
 
-def star_rows_by(
+def weighted_rows_by(
     linear: Linearisation, root: Floats, of_images: Floats
 ) -> Iterator[tuple[Chunk, Floats]]:
     """
-    Yield each chunk with its whitened derivatives (2, m n, r) by the columns of a root (P, r).
+    Yield each chunk with its weighted derivatives (2, m n, r) by the columns of a root (P, r).
 
-    The unknowns of the images follow them by (m, b, r).  The functions of the field are not
-    whitened one by one as in `star_rows`: half of the products are saved.
+    The weights are inverse covariances.  The unknowns of the images follow the root by (m, b, r).
+    The functions of the field are not weighted one by one, half of the products are saved.
     """
     layout = linear.layout
     E, at = chain(linear.problem, layout, linear.measurements.image_count), seen_by_stars(layout)
@@ -193,14 +193,18 @@ def star_rows_by(
     of_field = np.concatenate(np.split(root[layout.places['field']], 2), axis=1)
     for chunk, Z in star_columns(linear):
         m, _, n = chunk.direction_icrf.shape
+        wuu, wuv, wvv = chunk.whitener
+        Z[1] *= wvv
+        Z[1] += wuv * Z[0]
+        Z[0] *= wuu
         columns = Z.reshape(2, -1, m, n).transpose(0, 2, 3, 1)
         rows = (columns @ by_root[chunk.image]).reshape(2, m * n, r)
         moved = functions(linear.predicted_px[chunk.row].T).T @ of_field
-        wuu, wuv, wvv = chunk.whitener[..., None]
-        rows[0] += wuu * moved[:, :r]
+        rows[0] += (wuu * wuu)[:, None] * moved[:, :r]
+        rows[1] += (wuv * wuv + wvv * wvv)[:, None] * moved[:, r:]
         if wuv.any():
-            rows[0] += wuv * moved[:, r:]
-        rows[1] += wvv * moved[:, r:]
+            rows[0] += (wuu * wuv)[:, None] * moved[:, r:]
+            rows[1] += (wuu * wuv)[:, None] * moved[:, :r]
         yield chunk, rows
 
 

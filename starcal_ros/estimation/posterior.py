@@ -37,9 +37,9 @@ from starcal_ros.estimation.equations import (
     Equations,
     Linearisation,
     seen_by_stars,
-    star_rows_by,
     StarSums,
     tracker_turns,
+    weighted_rows_by,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.problem import whitened_attitude_errors
@@ -439,10 +439,8 @@ def _of_observations(
     )
     if not groups.own_px2.any():  # the errors are those of the working weights
         return groups.own, {}
-    for chunk, (u, v) in star_rows_by(linear, root, -found.back @ root):
-        wuu, wuv, wvv = chunk.whitener[..., None]
-        real = chunk.whitener[0] > 0
-        groups.add(chunk.row[real], np.stack([wuu * u, wuv * u + wvv * v], axis=1)[real])
+    for chunk, rows in weighted_rows_by(linear, root, -found.back @ root):
+        groups.add(chunk.row, rows)  # stars of no weight add nothing
     whole = groups.whole()
     return sum(whole.values(), -groups.own), whole
 

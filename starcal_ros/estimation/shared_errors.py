@@ -389,7 +389,7 @@ def star_shares_px2(errors: Sequence[SharedError]) -> tuple[Floats | float, Floa
 
 class GroupSums:
     """
-    Sums of weighted derivatives (n, 2, r) over groups, part by part of the observations.
+    Sums of weighted derivatives (2, n, r) over groups, part by part of the observations.
 
     `whole` is ``sum_g |sum_i s_i Y_i|^2`` of each error, and `own` ``sum_i s_i^2 |Y_i|^2`` of all
     with the inflation of the weights: their difference is the part of V beyond the working one.
@@ -409,7 +409,7 @@ class GroupSums:
         self.errors = [error for error in errors if error.matters]
         self.from_sky = from_sky
         self.sums: Mapping[str, Floats] = {
-            error.name: np.zeros((int(error.group.max(initial=-1)) + 1, 2 * columns))
+            error.name: np.zeros((2 * int(error.group.max(initial=-1)) + 2, columns))
             for error in self.errors
         }
         self.own = np.zeros((columns, columns))
@@ -424,21 +424,22 @@ class GroupSums:
         self.own_px2 = self.share * total + inflation_px2
 
     def add(self, rows: Indices, Y: Floats) -> None:
-        """Add the observations ``rows`` (k,) with Y (k, 2, r)."""
+        """Add the observations ``rows`` (k,) with Y (2, k, r)."""
         k = len(rows)
+        # By what each of two axes of a group gets of u and of v of its members.
+        axis, of = np.array([0, 1])[:, None, None], np.array([0, 1])[:, None]
+        column = np.broadcast_to(of * k + np.arange(k), (2, 2, k)).ravel()
         for error in self.errors:
-            values = Y
-            if error.of_star:
-                values = self.from_sky[rows].transpose(0, 2, 1) @ Y
-            shape = (self.sums[error.name].shape[0], k)
             shared_px2 = self.share[rows] * error.share_px2[rows]
             part = np.sqrt(shared_px2) * self.is_shared[error.name][rows]
-            member = csr_array((part, (error.group[rows], np.arange(k))), shape=shape)
-            self.sums[error.name][...] += member @ values.reshape(k, -1)
-        flat = (Y * np.sqrt(self.own_px2[rows])[:, None, None]).reshape(2 * k, -1)
-        self.own += flat.T @ flat
+            turned = self.from_sky[rows].T if error.of_star else np.eye(2)[:, :, None]
+            row = np.broadcast_to(2 * error.group[rows] + axis, (2, 2, k)).ravel()
+            member = ((part * turned).ravel(), (row, column))
+            total = self.sums[error.name]
+            total += csr_array(member, shape=(len(total), 2 * k)) @ Y.reshape(2 * k, -1)
+        for values in Y * np.sqrt(self.own_px2[rows])[:, None]:
+            self.own += values.T @ values
 
     def whole(self) -> dict[str, Floats]:
         """Return the matrix (r, r) of each error by its name."""
-        flat = {name: one.reshape(-1, len(self.own)) for name, one in self.sums.items()}
-        return {name: one.T @ one for name, one in flat.items()}
+        return {name: total.T @ total for name, total in self.sums.items()}

@@ -420,7 +420,7 @@ def test_sums_over_groups_are_those_of_all_pairs() -> None:
                 of_cells += 0.05 * common * Y[i].T @ Y[j]
     sums = GroupSums(errors, variance, inflation, from_sky, r)
     for part in np.array_split(rng.permutation(used), 3):
-        sums.add(part, Y[part])
+        sums.add(part, Y[part].transpose(1, 0, 2))
     whole = sums.whole()
     assert list(whole) == ['star places', 'cells']
     assert whole['star places'] == pytest.approx(of_stars, abs=1e-10)
