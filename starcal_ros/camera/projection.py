@@ -24,8 +24,8 @@ import functools
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import lens
 from starcal_ros.camera.detector_field import DetectorField
+import starcal_ros.camera.lens as lens  # its package imports this module
 from starcal_ros.record_fields import Record
 
 MAX_SIDE_PX = 65536

@@ -36,9 +36,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from starcal_ros.errors import OptionError, StarcalError
+from starcal_ros.errors import StarcalError
 from starcal_ros.formats.messages.message_codec import Message
-from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, Setup
 from starcal_ros.processes import return_freed_memory
 from starcal_ros.ros import inputs, parameters, printable_log
@@ -66,8 +65,7 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.options = parameters.OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
-        for unknown in self.options.unknown():
-            raise OptionError(unknown_option(unknown, self.options.names()))
+        self.options.check_names()
         self.failure = ''  # why the last transition failed, one line
         self._publishers_made: list[Any] = []
         self.inputs = inputs.Inputs(self)

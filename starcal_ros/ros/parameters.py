@@ -60,16 +60,12 @@ class OptionParameters:
                 values |= paths_from({name: value}, folder)
         return values
 
-    def names(self) -> list[str]:
-        """Names of all options."""
-        return list(self._fields)
-
-    def unknown(self) -> list[str]:
-        """Names given at start that no option has: ROS itself passes over a misspelt one."""
+    def check_names(self) -> None:
+        """Raise OptionError for a name given at start that no option has: ROS passes over it."""
         given = getattr(self._node, '_parameter_overrides', {})  # rclpy has no other access to it
-        return sorted(
-            name for name in given if name not in self._fields and not options.is_of_ros(name)
-        )
+        for name in sorted(given):
+            if name not in self._fields and not options.is_of_ros(name):
+                raise OptionError(options.unknown_option(name, self._fields))
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
