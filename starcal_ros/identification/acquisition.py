@@ -66,7 +66,7 @@ def acquire(
     for depth in (count, *(depth for depth in _DEPTHS if depth < count)):
         if depth < _FEWEST_SOURCES:
             continue
-        brightest = sources.brightest(depth)
+        brightest = sources.select(slice(depth))
         try:
             turn = _vote(prediction, brightest, geometry, reach_px, roll_rad)
             found_px = _match(prediction, brightest, geometry, turn, (reach_px, roll_rad))
@@ -74,7 +74,9 @@ def acquire(
             # The first attempt uses every source: its numbers describe the image.
             refused = refused or error
             continue
-        met = _bright_met(found_px, sources, geometry)
+        inside = in_image(found_px, geometry.camera.width, geometry.camera.height)
+        brightest_px = found_px[inside][: 2 * _DEPTHS[0]]
+        met = len(_pairs(brightest_px, sources.xy_px[: _DEPTHS[0]], _MET_PX))
         if met > most:
             best_px, most = found_px, met
         if most >= _SOUND_SHARE * min(len(sources.snr), _DEPTHS[0]):
@@ -82,14 +84,6 @@ def acquire(
     if best_px is None:
         raise refused or ImageRefused('no_match', f'{len(sources.snr)} star-like sources')
     return best_px
-
-
-def _bright_met(predicted_px: Floats, sources: Sources, geometry: CameraGeometry) -> int:
-    """Number of the brightest sources that meet one of the brightest predictions (n, 2)."""
-    camera = geometry.camera
-    inside = in_image(predicted_px, camera.width, camera.height)
-    depth = _DEPTHS[0]
-    return len(_pairs(predicted_px[inside][: 2 * depth], sources.xy_px[:depth], _MET_PX))
 
 
 def _vote(
@@ -259,7 +253,7 @@ def _match(
     with np.errstate(invalid='ignore'):
         bright = np.flatnonzero(in_image(turned_px, camera.width, camera.height, margin_px))
     bright = bright[: min(4 * len(sources.snr), 400)]
-    seen = sources.brightest(4 * len(bright))
+    seen = sources.select(slice(4 * len(bright)))
     xy, pairs = _refine_rotation(prediction, seen, geometry, rotation, bright)
     half_px = 0.5 * max(camera.width, camera.height)
     for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):

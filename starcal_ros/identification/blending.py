@@ -43,10 +43,6 @@ class Pulls:
     swamped: Mask
     outshone: Mask
 
-    def of_first(self, count: int) -> Pulls:
-        """Return those on the first stars."""
-        return Pulls(*(getattr(self, field.name)[:count] for field in dataclasses.fields(self)))
-
 
 def neighbour_pulls(
     xy_px: Floats,
@@ -57,7 +53,7 @@ def neighbour_pulls(
     measured: Mask,
 ) -> Pulls:
     """
-    Pull of the neighbours on the centroid of each star.
+    Pull of the neighbours, all of ``xy_px`` (n + k, 2), on the centroids of the first n of them.
 
     ``flux_dn`` (n,) is measured and includes light of neighbours; the flux of a neighbour follows
     from the difference of the magnitudes.  For an unresolved pair the pull is from the star to the
@@ -68,16 +64,17 @@ def neighbour_pulls(
     radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
     reach_px = radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
     pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
-    star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    star, other = pairs[pairs[:, 0] < len(flux_dn)].T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     offset_px = xy_px[other] - xy_px[star]
     distance_px = apart_px(offset_px, sigma_px, model.streaks_at(xy_px[star]))
-    known = modelled[other]
+    known = np.r_[modelled, np.zeros(len(xy_px) - len(modelled), bool)][other]
     # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
     # centre of a double of similar stars is not used either: its orbital motion, which the catalog
     # lacks, reaches arcseconds (zeta Herculis).
     near = distance_px < np.where(known, SWAMPED_SIGMA, _NEAR_SIGMA) * sigma_px
-    swamped, outshone = np.zeros((2, len(xy_px)), bool)
+    swamped, outshone = np.zeros((2, len(flux_dn)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
     outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
     snr = expected_snr(flux_dn, model.blurred_px, model.background.noise_dn, model.pixel_noise)
@@ -103,7 +100,7 @@ def neighbour_pulls(
         model.pixel_noise,
         model.streaks_at(xy_px[star]),
     )
-    total_px, uncertain_px = np.zeros_like(xy_px), np.zeros_like(xy_px)
+    total_px, uncertain_px = np.zeros((2, len(flux_dn), 2))
     np.add.at(total_px, star[~known], pull_px[~known])
     part = np.where(known, _MODELLED_UNCERTAINTY, _PULL_UNCERTAINTY)
     np.add.at(uncertain_px, star, part[:, None] * pull_px)
@@ -150,15 +147,14 @@ def separate(
     # The search for lost lines also uses the stars measured far from their predictions.
     measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     deeper_px, deeper_magnitude = deeper
-    count, none = len(magnitude), np.zeros(len(deeper_magnitude), bool)
     pulls = neighbour_pulls(
         np.concatenate([prediction.xy_px, deeper_px]),
         np.concatenate([magnitude, deeper_magnitude]),
-        np.concatenate([centroids.flux_dn, none]),
+        centroids.flux_dn,
         model,
-        np.concatenate([centroids.modelled, none]),
-        np.concatenate([measured, none]),
-    ).of_first(count)
+        centroids.modelled,
+        measured,
+    )
     unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
     faintest = float((catalog.deeper or catalog).magnitude[-1])
     unlisted_px = np.where(

@@ -12,8 +12,6 @@ Brightnesses do not match then.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
@@ -39,19 +37,11 @@ _LEAST_RISE = 40.0
 _FLOOR_PX = 0.05  # systematic error of star positions, per axis
 
 
-@dataclass(frozen=True)
-class LineLoss:
-    """Approximate first row after lost lines, and the offset (2,) of the rows below, px."""
-
-    row: int
-    off_px: Floats
-
-
 def find_line_loss(
     predicted_px: Floats, measured_px: Floats, sigma_px: Floats, shape: tuple[int, int]
-) -> LineLoss | None:
+) -> tuple[int, Floats] | None:
     """
-    Row at which the residuals of an image (height, width) jump; None without a jump.
+    First row after lost lines, about, and the offset (2,) of those below, px; None without a jump.
 
     ``predicted_px``, ``measured_px`` (n, 2) of the good stars, ``sigma_px`` (n,) noise per axis.
     For each tested row, a robust fit of the residuals with a polynomial in u and v and a step.  A
@@ -101,7 +91,7 @@ def find_line_loss(
     side = steps[:, k] == (2.0 * steps[:, k].mean() < 1.0)  # the side with fewer stars
     if np.hypot(*off_px[k]) < _LEAST_PX or agree[side].mean() < _AGREE:
         return None
-    return LineLoss(round(float(rows[k])), off_px[k])
+    return round(float(rows[k])), off_px[k]
 
 
 _FEWEST = 4  # stars: fewer give no meaningful scatter or share

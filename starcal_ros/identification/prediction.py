@@ -15,12 +15,8 @@ from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
-from starcal_ros.sky.astrometry import (
-    apparent_directions,
-    MIN_ELEVATION_DEG,
-    SiteOptions,
-    through_the_air,
-)
+from starcal_ros.sky import astrometry
+from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import cone, StarCatalog
 
 SPACE = SiteOptions()
@@ -133,11 +129,11 @@ def visible(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Catalog rows (m,) above the elevation limit, and apparent ICRF directions (m, 3)."""
     if site.observer != 'ground':
-        return index, apparent_directions(catalog.select(index), time_ns, velocity_m_s)
-    direction_icrf, elevation_rad = through_the_air(
-        apparent_directions(catalog.select(index), time_ns), time_ns, site
+        return index, astrometry.apparent_directions(catalog.select(index), time_ns, velocity_m_s)
+    direction_icrf, elevation_rad = astrometry.through_the_air(
+        astrometry.apparent_directions(catalog.select(index), time_ns), time_ns, site
     )
-    high = elevation_rad >= math.radians(MIN_ELEVATION_DEG)
+    high = elevation_rad >= math.radians(astrometry.MIN_ELEVATION_DEG)
     return index[high], direction_icrf[high]
 
 

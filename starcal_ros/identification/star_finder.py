@@ -38,18 +38,16 @@ from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
 from starcal_ros.sky.astrometry import EARTH, julian_year, SiteOptions, Velocity
 from starcal_ros.sky.catalog import sky_circle, StarCatalog
-from starcal_ros.stars.centroiding import Centroids, measure_stars, shape_changed, with_faint
-from starcal_ros.stars.detection import (
-    Background,
-    detect,
-    detect_near,
-    detectable_count,
-    measure_background,
-    Sources,
+from starcal_ros.stars import detection
+from starcal_ros.stars.centroiding import (
+    Centroids,
+    learn,
+    measure_stars,
+    shape_changed,
+    with_faint,
 )
 from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
-from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
-from starcal_ros.stars.psf_field import Instrument, learn, MeasuredStars
+from starcal_ros.stars.image_model import CentroidOptions, ImageModel, Instrument, model_image
 from starcal_ros.stars.psf_fit import stamp_radius_px
 from starcal_ros.stars.streak import Streak, without_streaks
 
@@ -149,7 +147,7 @@ def observe_stars(
     ``incomplete``.
     """
     image, options = exposure.image, search.identification
-    background = measure_background(image.pixels)
+    background = detection.measure_background(image.pixels)
     prediction = predict(
         geometry,
         exposure.icrf_from_star_tracker_xyzw,
@@ -172,7 +170,7 @@ def observe_stars(
     model = model_image(image.pixels, background, stars, search.centroid, streak, sources)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
-        sources = detect(image.pixels, background)
+        sources = detection.detect(image.pixels, background)
         sources, streak = without_streaks(image.pixels, background, sources, geometry.camera)
         model = model_image(image.pixels, background, sources, search.centroid, streak)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
@@ -198,19 +196,19 @@ def measure_predicted(
     contradict the catalog or too few streaks are alone, ``smeared`` where they are too long.
     """
     catalog, options = search.catalog, search.identification
-    height, width = exposure.image.pixels.shape
+    pixels, hot_pixels = exposure.image.pixels, exposure.hot_pixels
+    height, width = pixels.shape
     shown = within_image(prediction, width, height)
-    count = detectable_count(
-        exposure.image.pixels, shown.xy_px, model.background, search.centroid.min_snr
-    )
+    least_snr = search.centroid.min_snr
+    count = detection.detectable_count(pixels, shown.xy_px, model.background, least_snr)
     looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
-    measured = _measured(exposure, looked_at, model, search)
+    measured = measure_stars(pixels, looked_at.xy_px, model, search.centroid, hot_pixels)
     keeps_instrument = False
     if instrument is not None and shape_changed(measured, model):
         model = _with_streaks(exposure.image, looked_at, measured, model, search.centroid)
         keeps_instrument = model.streak is not None
         if keeps_instrument:
-            measured = _measured(exposure, looked_at, model, search)
+            measured = measure_stars(pixels, looked_at.xy_px, model, search.centroid, hot_pixels)
     # Faint stars are refused, but their light may pull the centroids of the others.
     faint = with_faint(measured, shown.xy_px)
     deeper = deeper_stars(
@@ -227,44 +225,21 @@ def measure_predicted(
     refusal = refuse_on_hot_pixels(
         shown.xy_px,
         _refuse_displaced(shown.xy_px, centroids, width),
-        exposure.hot_pixels,
+        hot_pixels,
         width,
         stamp_radius_px(model.psf_sigma_px or 1.0, model.longest_streak_px),
         model.blurred_px,
     )
     magnitude = catalog.magnitude[shown.catalog_index]
     centroids = dataclasses.replace(centroids, refusal=refusal)
-    refusal = refuse_by_brightness(
-        magnitude,
-        shown.xy_px,
-        centroids,
-        model,
-        search.centroid.min_snr,
-        options.max_brightness_scatter_mag,
-    )
+    most_mag = options.max_brightness_scatter_mag
+    refusal = refuse_by_brightness(magnitude, shown.xy_px, centroids, model, least_snr, most_mag)
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(exposure, shown, catalog, centroids, model)
-    if observations.refusal or measured.fit is None or keeps_instrument:
+    if observations.refusal or keeps_instrument:
         return observations, instrument
-    fitted = measured.fitted
-    stars = MeasuredStars(
-        centroids.xy_px[fitted],
-        measured.fit,
-        measured.psf_sigma_px[fitted],
-        measured.noise_dn[fitted],
-        ((refusal == StarRefusal.NONE) & alone)[fitted],
-    )
-    shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
-    return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
-
-
-def _measured(
-    exposure: Exposure, shown: Prediction, model: ImageModel, search: StarSearch
-) -> Centroids:
-    """Centroids of all stars of a prediction within the image."""
-    return measure_stars(
-        exposure.image.pixels, shown.xy_px, model, search.centroid, exposure.hot_pixels
-    )
+    usable = (refusal == StarRefusal.NONE) & alone
+    return observations, learn(instrument, measured, usable, model)
 
 
 def _with_streaks(
@@ -277,7 +252,7 @@ def _with_streaks(
     """Model of an image whose stars are streaks; unchanged without: the focus may have drifted."""
     snr = np.nan_to_num(measured.snr)
     order = np.argsort(-snr, kind='stable')
-    sources = Sources(shown.xy_px[order], snr[order], float(image.pixels.size))
+    sources = detection.Sources(shown.xy_px[order], snr[order], float(image.pixels.size))
     sources, streak = without_streaks(image.pixels, model.background, sources, shown.camera)
     if streak is None:
         return model
@@ -379,11 +354,11 @@ def _check_catalog(
 
 def _find(
     pixels: Pixels,
-    background: Background,
+    background: detection.Background,
     prediction: Prediction,
     geometry: CameraGeometry,
     search: StarSearch,
-) -> tuple[Floats, Sources, Streak | None]:
+) -> tuple[Floats, detection.Sources, Streak | None]:
     """
     Predicted pixels (n, 2) corrected to match the sources, those sources, and their streaks.
 
@@ -394,7 +369,9 @@ def _find(
     """
     camera = geometry.camera
     inside = in_image(prediction.xy_px, camera.width, camera.height)
-    near = detect_near(pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX)
+    near = detection.detect_near(
+        pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX
+    )
     try:
         reach_px = float(SEARCH_RADIUS_PX)
         near, streak = without_streaks(pixels, background, near, camera)
@@ -402,7 +379,9 @@ def _find(
         return matched_px, near, streak
     except ImageRefused:
         pass
-    sources, streak = without_streaks(pixels, background, detect(pixels, background), camera)
+    sources, streak = without_streaks(
+        pixels, background, detection.detect(pixels, background), camera
+    )
     if len(sources.snr) < _MIN_STARS:
         raise ImageRefused(
             'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
@@ -442,6 +421,6 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
         predicted_px[good], centroids.xy_px[good], centroids.sigma_px[good], shape
     )
     if loss is not None:
-        u, v = loss.off_px
-        detail = f'stars below row {loss.row} are displaced by ({u:+.1f}, {v:+.1f}) px'
+        row, (u, v) = loss
+        detail = f'stars below row {row} are displaced by ({u:+.1f}, {v:+.1f}) px'
         raise ImageRefused('incomplete', detail)

@@ -37,15 +37,8 @@ from starcal_ros.identification.star_finder import (
 from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median
 from starcal_ros.sky.catalog import cone
-from starcal_ros.stars.detection import (
-    Background,
-    brightest_near,
-    DETECTION_SIGMA,
-    measure_background,
-    sample_background,
-)
-from starcal_ros.stars.image_model import known_model
-from starcal_ros.stars.psf_field import Instrument
+from starcal_ros.stars import detection
+from starcal_ros.stars.image_model import Instrument, known_model
 
 _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
@@ -101,7 +94,9 @@ def track_stars(
     prediction = _predict(exposure, before, search)
     # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
-    background = sample_background(pixels) if fitted else measure_background(pixels)
+    background = (
+        detection.sample_background(pixels) if fitted else detection.measure_background(pixels)
+    )
     rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera)
     rotation = Rotation.from_rotvec(-rotation_rad)
     direction_camera = rotation.apply(prediction.direction_camera)
@@ -151,7 +146,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
 
 
 def _find_rotation(
-    pixels: Pixels, background: Background, prediction: Prediction, camera: CameraModel
+    pixels: Pixels, background: detection.Background, prediction: Prediction, camera: CameraModel
 ) -> Floats:
     """
     Small passive rotation (3,) of the camera, rad, from the predictions to the stars.
@@ -163,8 +158,8 @@ def _find_rotation(
     rim = reach_px + 4.0
     inside = ((xy > rim) & (xy < [camera.width - 1 - rim, camera.height - 1 - rim])).all(axis=1)
     guides = np.nonzero(inside)[0][:_GUIDES]
-    place_px, snr = brightest_near(pixels, background, xy[guides], reach_px)
-    found = snr > DETECTION_SIGMA
+    place_px, snr = detection.brightest_near(pixels, background, xy[guides], reach_px)
+    found = snr > detection.DETECTION_SIGMA
     guides, place_px = guides[found], place_px[found]
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars match a source')
     if len(guides) < 4:

@@ -18,11 +18,18 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
+from starcal_ros.robust_statistics import centre_and_scatter
 from starcal_ros.stars import detection, psf_fit
 from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
-from starcal_ros.stars.image_model import CentroidOptions, ImageModel, MAX_SHAPE_CHANGE
-from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, PixelNoise
-from starcal_ros.stars.psf_field import PsfWidth
+from starcal_ros.stars.image_model import (
+    CentroidOptions,
+    ImageModel,
+    Instrument,
+    MAX_SHAPE_CHANGE,
+    PsfWidth,
+    width_basis,
+)
+from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
 
 # The mask of Eqs. 8 and 9; the radius holds 99 % of the light of a star of 1 px.
 _MASK_RADIUS_PX = 3.0
@@ -31,7 +38,9 @@ _MIN_MASK_PIXELS = 4
 _MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their neighbours
 SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
 _NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
-_BRIGHT_SNR, _FEWEST_BRIGHT = 15.0, 5  # stars that show a common change of shape
+_BRIGHT_SNR, _FEWEST_BRIGHT = 15.0, 5  # stars that show a common change of shape, or the PSF
+_MOST = 60  # the brightest stars that show the PSF; fainter ones add almost nothing
+_MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
 _COMMON_CHANGE = 0.5 * MAX_SHAPE_CHANGE
 _IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away shows another source
 
@@ -426,9 +435,8 @@ def _moments(weight: Floats, variance: Floats, offsets: Floats) -> tuple[Floats,
     ``weight`` and ``variance`` (n, w, w) are those of the pixels, 0 outside the mask; ``offsets``
     (w,) are the places of the pixels along each axis.
     """
-    total = np.maximum(weight.sum(axis=(1, 2)), 1e-12)
-    x = (weight * offsets[None, None, :]).sum(axis=(1, 2)) / total
-    y = (weight * offsets[None, :, None]).sum(axis=(1, 2)) / total
+    total, place_px, moments_px2 = detection.second_moments(weight)
+    x, y = place_px.T
     dx = offsets[None, None, :] - x[:, None, None]
     dy = offsets[None, :, None] - y[:, None, None]
 
@@ -436,6 +444,52 @@ def _moments(weight: Floats, variance: Floats, offsets: Floats) -> tuple[Floats,
         pairs = ((dx, dx), (dx, dy), (dy, dy))
         return np.stack([(values * a * b).sum(axis=(1, 2)) for a, b in pairs], axis=-1)
 
-    xx, xy, yy = (second(weight) / total[:, None]).T
-    ellipticity = np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12)
-    return np.stack([x, y], axis=-1), second(variance) / (total**2)[:, None], ellipticity
+    uu, vv, uv = moments_px2.T
+    ellipticity = np.hypot(uu - vv, 2 * uv) / np.maximum(uu + vv, 1e-12)
+    return place_px, second(variance) / (np.maximum(total, 1e-12) ** 2)[:, None], ellipticity
+
+
+def learn(
+    before: Instrument | None, measured: Centroids, usable: Mask, model: ImageModel
+) -> Instrument | None:
+    """
+    PSF, pixel noise and saturation after one more image; ``before`` if it has too few stars.
+
+    ``usable`` (n,) masks the isolated stars that were not refused.
+    """
+    if measured.fit is None:
+        return before
+    stars = np.flatnonzero(usable[measured.fitted])
+    bright = stars[measured.fit.snr[stars] > _BRIGHT_SNR][:_MOST]
+    if len(bright) < _FEWEST_BRIGHT:
+        return before
+    # Fainter stars show no PSF error, so that it can be separated from photon noise.
+    shown = stars[:_MOST]
+    noise = psf_fit.noise_sums(
+        psf_fit.select(measured.fit, shown),
+        measured.noise_dn[measured.fitted[shown]],
+        model.pixel_noise,
+    )
+    fit, row = psf_fit.select(measured.fit, bright), measured.fitted[bright]
+    variance = measured.psf_sigma_px[row] ** 2
+    median, scatter = centre_and_scatter(fit.shape_change)
+    change = fit.shape_change[:, :2].mean(axis=1)
+    # A companion or a cosmic ray moves one star by more than the scatter of all.
+    spread2 = 0.25 * (fit.shape_sigma[:, :2] ** 2).sum(axis=1) + 0.5 * scatter[:2].mean() ** 2
+    off2 = (change - median[:2].mean()) ** 2 / spread2
+    weight = (off2 < 9.0) / (spread2 * variance**2)
+    height, width = model.background.shape
+    basis = width_basis(measured.xy_px[row], width, height)
+    weighted = basis * weight[:, None]
+    normal, right = weighted.T @ basis, weighted.T @ (variance * (1.0 + change))
+    if before is not None:
+        # A decaying weight follows a change of focus.
+        keep = _MEMORY
+        normal, right = normal + keep * before.width_normal, right + keep * before.width_right
+        noise = NoiseSums(
+            noise.normal + keep * before.noise.normal, noise.right + keep * before.noise.right
+        )
+        median = median + keep * (before.shape_median - median)
+        scatter = scatter + keep * (before.shape_scatter - scatter)
+    shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
+    return Instrument(width, height, normal, right, noise, median, scatter, shown_dn)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
 from starcal_ros.robust_statistics import median, medians
@@ -77,10 +78,6 @@ class Sources:
     xy_px: Floats
     snr: Floats
     searched_px2: float
-
-    def brightest(self, count: int) -> Sources:
-        """Return the brightest ``count`` sources of the same area."""
-        return self.select(slice(count))
 
     def select(self, rows: Mask | slice) -> Sources:
         """Return some of the sources, of the same area."""
@@ -173,13 +170,11 @@ def _difference_noise(pixels: Pixels, cell_px: int, step_px: tuple[int, int]) ->
 
 def mesh_slope(mesh: Singles, shape: tuple[int, ...]) -> tuple[Singles, Singles]:
     """Slopes (rows, cols) of a mesh over an image of ``shape``, down and across, per pixel."""
-    rows, cols = mesh.shape
-    down, across = np.zeros_like(mesh), np.zeros_like(mesh)
-    if rows > 1:
-        down = np.asarray(np.gradient(mesh, shape[0] / rows, axis=0), np.float32)
-    if cols > 1:
-        across = np.asarray(np.gradient(mesh, shape[1] / cols, axis=1), np.float32)
-    return down, across
+    down, across = (
+        np.gradient(mesh, shape[axis] / cells, axis=axis) if cells > 1 else np.zeros_like(mesh)
+        for axis, cells in enumerate(mesh.shape)
+    )
+    return np.asarray(down, np.float32), np.asarray(across, np.float32)
 
 
 def _quantile(ascending: Singles, part: float, first: Indices) -> Singles:
@@ -411,6 +406,25 @@ def windows_inside(shape: tuple[int, ...], centre: Indices, radius: int) -> Mask
     height, width = shape
     u, v = centre[:, 0], centre[:, 1]
     return (u >= radius) & (u < width - radius) & (v >= radius) & (v < height - radius)
+
+
+def second_moments(light: Floats) -> tuple[Floats, Floats, Floats]:
+    """Sums (n,), centres (n, 2) from the middles, second moments (n, 3) uu, vv, uv of stamps."""
+    reach = np.arange(light.shape[1]) - light.shape[1] // 2
+    across, down = light.sum(axis=1), light.sum(axis=2)
+    total = across.sum(axis=1)
+    flux = np.maximum(total, 1e-9)
+    u, v = across @ reach / flux, down @ reach / flux
+    uu, vv = across @ reach**2 / flux - u * u, down @ reach**2 / flux - v * v
+    uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
+    return total, np.stack([u, v], axis=-1), np.stack([uu, vv, uv], axis=-1)
+
+
+def apart(xy_px: Floats, least_px: float) -> Mask:
+    """Mask (n,) of the points (n, 2), brightest first, without a brighter one nearby."""
+    is_apart = np.ones(len(xy_px), bool)
+    is_apart[cKDTree(xy_px).query_pairs(least_px, output_type='ndarray').max(axis=1)] = False
+    return is_apart
 
 
 _GROUP = 256  # stars of one mean: its noise is 0.06 of that of a star

@@ -159,13 +159,21 @@ def screen(
     Raises ImageRefused ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
     """
     least_dn = _saturation_dn(sample, saturation_dn)
-    _refuse_overexposed(sample, least_dn)
+    part = np.count_nonzero(sample.pixels >= least_dn) / sample.pixels.size
+    if part > _MAX_SATURATED_FRACTION:
+        raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {least_dn}')
     if sample.constant.all() and np.ptp(sample.pixels) == 0:
         raise ImageRefused('blank', f'every pixel is {int(sample.pixels[0, 0])}')
     if before is not None:
         _refuse_repeated(fingerprint, before, options)
     _refuse_incomplete(sample, fingerprint, least_dn, options)
-    _refuse_glare(sample, least_dn, dark)
+    slope = slope_left(sample, least_dn, dark)
+    if slope > _MAX_SLOPE:
+        raise ImageRefused(
+            'glare',
+            f'the background is uneven within {_SEGMENT_PX} px: its slope is {slope:.2f} of the'
+            f' noise per pixel, over {_MAX_SLOPE}',
+        )
 
 
 def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
@@ -175,13 +183,6 @@ def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
         saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
     # An integer, since a comparison with a float converts every pixel.
     return math.ceil(saturation_dn)
-
-
-def _refuse_overexposed(sample: RowSample, least_dn: int) -> None:
-    """Refuse a frame with too many saturated pixels."""
-    part = np.count_nonzero(sample.pixels >= least_dn) / sample.pixels.size
-    if part > _MAX_SATURATED_FRACTION:
-        raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {least_dn}')
 
 
 def _refuse_repeated(current: Fingerprint, before: Fingerprint, options: ScreeningOptions) -> None:
@@ -253,17 +254,6 @@ def _noise_dn(sample: RowSample, alive: Mask) -> float:
     spread = median(np.abs(here - below)[alive])
     # The second value is the noise of rounding to whole DN.
     return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), math.sqrt(1.0 / 12.0))
-
-
-def _refuse_glare(sample: RowSample, least_dn: int, dark: Pixels | None) -> None:
-    """Refuse a frame whose background is too uneven over more than half of it."""
-    slope = slope_left(sample, least_dn, dark)
-    if slope > _MAX_SLOPE:
-        raise ImageRefused(
-            'glare',
-            f'the background is uneven within {_SEGMENT_PX} px: its slope is {slope:.2f} of the'
-            f' noise per pixel, over {_MAX_SLOPE}',
-        )
 
 
 def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> float:

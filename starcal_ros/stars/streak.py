@@ -17,14 +17,14 @@ import math
 import cv2
 import numpy as np
 from scipy.ndimage import label
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Mask, Pixels
+from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
 from starcal_ros.robust_statistics import median
-from starcal_ros.stars.detection import Background, NOISE_LEFT, Sources, stamps_at_edges
+from starcal_ros.stars import detection
+from starcal_ros.stars.detection import Background, Sources
 
 LONGEST_PX = 10.0  # a longer streak is too faint beside its noise, and too curved, for the fit
 _CORE_PX = 4  # half width of a window that shows whether a source is round
@@ -104,9 +104,8 @@ def without_streaks(
         stars = sources.select(lit <= _BODY)
         if len(stars.snr) < len(sources.snr):
             return without_streaks(pixels, background, stars, camera)
-    apart = _apart(middle_px, _APART_PX)
-    middle_px, moments_px2 = middle_px[apart], moments_px2[apart]
-    streak = _turn(camera, middle_px, moments_px2)
+    alone = detection.apart(middle_px, _APART_PX)
+    streak = _turn(camera, middle_px[alone], moments_px2[alone])
     if streak is None:
         return sources, None
     length_px = streak.longest_px
@@ -116,15 +115,8 @@ def without_streaks(
             f'the stars are streaks of {length_px:.0f} px, up to {LONGEST_PX:g} can be measured',
         )
     middle_px = _extents(pixels, background, sources.xy_px, _HALF_PX)[0]
-    apart = _apart(middle_px, max(_APART_PX, 0.5 * length_px))
-    return dataclasses.replace(sources, xy_px=middle_px).select(apart), streak
-
-
-def _apart(xy_px: Floats, least_px: float) -> Mask:
-    """Mask (n,) of the points (n, 2), brightest first, without a brighter one nearby."""
-    apart = np.ones(len(xy_px), bool)
-    apart[cKDTree(xy_px).query_pairs(least_px, output_type='ndarray').max(axis=1)] = False
-    return apart
+    alone = detection.apart(middle_px, max(_APART_PX, 0.5 * length_px))
+    return dataclasses.replace(sources, xy_px=middle_px).select(alone), streak
 
 
 def _elongated(moments_px2: Floats) -> bool:
@@ -153,13 +145,13 @@ def _extents(
     Also the share (n,) of its window that each fills.
     """
     centre = np.rint(xy_px).astype(np.int64)
-    stamps, outside = stamps_at_edges(pixels, centre, half_px)
+    stamps, outside = detection.stamps_at_edges(pixels, centre, half_px)
     stamps -= background.level_at(centre)[:, None, None]
     side = 2 * half_px + 1
     # One call for all windows: the light that it carries over a joint is at their rims.
     cv2.GaussianBlur(stamps.reshape(-1, side), (7, 7), 1.0, dst=stamps.reshape(-1, side))
     peak = stamps[:, half_px, half_px]
-    least = np.maximum(_LEVEL * peak, _NOISE * NOISE_LEFT * background.noise_at(centre))
+    least = np.maximum(_LEVEL * peak, _NOISE * detection.NOISE_LEFT * background.noise_at(centre))
     lit = (stamps > least[:, None, None]) & ~outside
     # Pixels join within a window, also over corners, but not from one window to the next.
     joins = np.zeros((3, 3, 3), bool)
@@ -168,14 +160,9 @@ def _extents(
     own = part[:, half_px, half_px]
     is_own = (part == own[:, None, None]) & (own > 0)[:, None, None]
     light = np.where(is_own, stamps, 0.0)
-    reach = np.arange(-half_px, half_px + 1.0)
-    across, down = light.sum(axis=1), light.sum(axis=2)
-    flux = np.maximum(across.sum(axis=1), 1e-9)
-    u, v = across @ reach / flux, down @ reach / flux
-    uu, vv = across @ reach**2 / flux - u * u, down @ reach**2 / flux - v * v
-    uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
-    moments_px2 = np.stack([uu - 1.0, vv - 1.0, uv], axis=-1)  # the filter adds its variance
-    return centre + np.stack([u, v], axis=-1), moments_px2, is_own.mean(axis=(1, 2))
+    _, middle_px, moments_px2 = detection.second_moments(light)
+    # The filter adds its variance.
+    return centre + middle_px, moments_px2 - [1.0, 1.0, 0.0], is_own.mean(axis=(1, 2))
 
 
 def _turn(camera: CameraModel, xy_px: Floats, moments_px2: Floats) -> Streak | None:

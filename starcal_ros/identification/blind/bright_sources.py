@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Pixels
-from starcal_ros.stars.detection import Background, detect, measure_background, stamps_at_edges
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.stars import detection
+from starcal_ros.stars.detection import Background
 
 _STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
 LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # that a window shows whole, its ends blurred
@@ -48,34 +48,33 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     Saturated stars keep their rank, and several maxima of one star are one source.  A centroid is
     good to a few tenths of a pixel.
     """
-    background = measure_background(pixels)
-    found = detect(pixels, background)
+    background = detection.measure_background(pixels)
+    found = detection.detect(pixels, background)
     centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
-    stamps, outside = stamps_at_edges(pixels, centre, _STAMP_PX)
+    stamps, outside = detection.stamps_at_edges(pixels, centre, _STAMP_PX)
     light = stamps - background.level_at(centre)[:, None, None]
     light[outside | (light < 3.0 * background.noise_at(centre)[:, None, None])] = 0.0
     reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
     # The second round is centred on the first centroid: neighbours at the rim then count less.
-    offset = np.zeros((len(centre), 2))
+    offset: Floats = np.zeros((len(centre), 2))
     for radius_px in (4.0, 5.0):
         u2, v2 = ((reach - offset[:, k, None]) ** 2 for k in (0, 1))
         weight = light * (u2[:, None] + v2[:, :, None] <= radius_px**2)
-        flux = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
-        middle = [weight.sum(axis=axis) @ reach / flux for axis in (1, 2)]
-        offset = np.stack(middle, axis=-1)
-    long_px, wide_px, along_rad = _extents(light, reach)
-    total = light.sum(axis=(1, 2))
+        _, offset, _ = detection.second_moments(weight)
+    total, _, moments_px2 = detection.second_moments(light)
+    uu, vv, uv = moments_px2.T
+    mean, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
     order = np.argsort(-total, kind='stable')
     order = order[total[order] > 0]
     xy_px = (centre + offset)[order]
-    order = order[_apart(xy_px)][:_KEPT]
+    order = order[detection.apart(xy_px, _APART_PX)][:_KEPT]
     return BrightSources(
         (centre + offset)[order],
         total[order],
         stamps.max(axis=(1, 2))[order] if len(stamps) else total[order],
-        long_px[order],
-        wide_px[order],
-        along_rad[order],
+        np.sqrt(np.maximum(mean + half, 0.0))[order],
+        np.sqrt(np.maximum(mean - half, 0.0))[order],
+        (0.5 * np.arctan2(2 * uv, uu - vv))[order],
         background,
     )
 
@@ -96,26 +95,3 @@ def smear(sources: BrightSources) -> tuple[float, float] | None:
     # The standard deviation of a uniform line is its length over the square root of twelve.
     length_px = math.sqrt(12.0) * float(np.median(sources.long_px[:40][bright]))
     return length_px, 0.5 * float(np.angle(double))
-
-
-def _extents(light: Floats, reach: Indices) -> tuple[Floats, Floats, Floats]:
-    """Longest and shortest 1-sigma extent (n,) in windows, and the direction of the longest."""
-    flux = np.maximum(light.sum(axis=(1, 2)), 1e-9)
-    u = (light.sum(axis=1) * reach).sum(axis=1) / flux
-    v = (light.sum(axis=2) * reach).sum(axis=1) / flux
-    uu = (light.sum(axis=1) * reach**2).sum(axis=1) / flux - u * u
-    vv = (light.sum(axis=2) * reach**2).sum(axis=1) / flux - v * v
-    uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
-    mean, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
-    return (
-        np.sqrt(np.maximum(mean + half, 0.0)),
-        np.sqrt(np.maximum(mean - half, 0.0)),
-        0.5 * np.arctan2(2 * uv, uu - vv),
-    )
-
-
-def _apart(xy_px: Floats) -> Indices:
-    """Rows of the points (n, 2), brightest first, without a brighter one nearby."""
-    kept = np.ones(len(xy_px), bool)
-    kept[cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray').max(axis=1)] = False
-    return np.flatnonzero(kept)

@@ -2,39 +2,31 @@
 """
 Identification of the stars of one image without attitude or alignment.
 
-Patterns of the brightest sources give candidates (`candidates`).  The best ones are refined, those
-that are almost certain before all others; the first one with a significant p-value is accepted
-(`sky_fit`).
+Patterns of four of the brightest sources are looked up among those of the catalog
+(`pattern_index`).  Each match is a candidate, with a rotation and a focal length; the bright stars
+predicted with them are compared with the sources.  The best candidates are refined, those that are
+almost certain before all others; the first one with a significant p-value is accepted (`sky_fit`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import functools
 import itertools
 import math
 import time
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import CameraModel
-from starcal_ros.identification.blind.candidates import Candidates, focal_scales, look_up, View
-from starcal_ros.identification.blind.pattern_index import scales_for
-from starcal_ros.identification.blind.sky_fit import (
-    FOUND,
-    log10_p_value,
-    match,
-    predicted,
-    Ranges,
-    refined,
-    SkyFit,
-    SourceImage,
-    STATED,
-)
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.identification.blind import pattern_index, sky_fit
+from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, SkyFit, SourceImage, STATED
+from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
 ROUNDS = ((0, 12), (12, 18), (18, 24))
@@ -47,6 +39,18 @@ _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
 _OF_A_GUESS = 40  # brightest stars and sources compared with a guess
 _FEWEST_SOURCES = 5
 _AGAIN_PX = 3.0  # radius of matching with a better camera
+_KEPT = 32  # number of best candidates of a look-up
+_CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
+_TESTED = 16  # brightest predictions used to test a candidate
+_TABLED = 5000  # most points whose stars are kept in memory: for discs of 9 degrees and more
+_NARROW_RAD = math.radians(1.0)  # smaller discs are searched about each candidate itself
+_CHUNK = 5000  # candidates tested at once: 30 MB
+_MAP_SIDE = 128  # cells of the map of the sources along each side
+_NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
+_SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
+_KNOWN = 0.05  # half range of the focal length from which a field is searched with one
+_LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
+_CERTAIN_GAIN = 1.5  # such a gain that few false candidates reach and most true ones do
 
 
 @dataclass(frozen=True)
@@ -94,19 +98,6 @@ class NotFound:
     log10_p_value: float = math.inf
 
 
-def find_sky(
-    xy_px: Floats, camera: CameraModel, catalog: StarCatalog, try_mirrored: bool = False
-) -> SkyMatch | NotFound:
-    """
-    Identified stars among sources (n, 2), brightest first, or the reason why there are none.
-
-    ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
-    distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the mirror image is searched too.
-    """
-    return find_in_any([xy_px], camera, catalog, (False, True) if try_mirrored else (False,))[0]
-
-
 def find_in_any(
     rankings: Sequence[Floats],
     camera: CameraModel,
@@ -117,10 +108,13 @@ def find_in_any(
     ranges: Ranges = STATED,
 ) -> tuple[SkyMatch | NotFound, int]:
     """
-    As `find_sky` for several selections of the sources of an image; the row of the matched.
+    Identified stars of an image, or the reason why there are none; the row of their selection.
 
-    ``mirrored`` are the ways that each is tried, ``rounds`` a part of `ROUNDS`, ``ranges`` those
-    of the camera.  The search ends when the processor time of the thread reaches ``deadline_s``.
+    ``rankings`` are selections (n, 2) of its sources, brightest first.  ``camera`` is the prior,
+    within ``ranges``: by default focal length within 25 %, principal point within 5 % of the
+    width, distortion within 3 % of the radius.  The catalog is sorted by magnitude.  ``mirrored``
+    are the ways that each is tried, ``rounds`` a part of `ROUNDS`.  The search ends when the
+    processor time of the thread reaches ``deadline_s``.
     """
     seen = [
         _Seen(_image(xy_px, camera, turned, ranges), turned, k)
@@ -137,7 +131,7 @@ def find_in_any(
         chosen = [one for one in seen if len(one.image.xy_px) > before]
         for one, candidates in _candidates(chosen, catalog, before, sources):
             for fit in _fits(one.image, catalog, candidates):
-                log10_p, radius_px = log10_p_value(one.image, catalog, fit)
+                log10_p, radius_px = sky_fit.log10_p_value(one.image, catalog, fit)
                 log10_p += tried
                 least = min(least, log10_p)
                 if log10_p < MAX_LOG10_P_VALUE:
@@ -166,19 +160,19 @@ def _image(xy_px: Floats, camera: CameraModel, mirrored: bool, ranges: Ranges) -
 
 def _candidates(
     seen: Sequence[_Seen], catalog: StarCatalog, before: int, sources: int
-) -> Iterator[tuple[_Seen, Candidates]]:
+) -> Iterator[tuple[_Seen, list[_Candidate]]]:
     """
     Candidates of all look-ups: first the almost certain ones of each, then the others.
 
     To refine a false candidate costs half as much as a look-up, and there may be 32 of them.
     """
     others = []
-    scales = focal_scales(seen[0].image) if seen else ()
+    scales = _focal_scales(seen[0].image) if seen else ()
     for focal_scale, one in itertools.product(scales, seen):
-        view = View(one.image, focal_scale)
+        view = _View(one.image, focal_scale)
         patterns = view.patterns(before, sources)
-        for scale in scales_for(one.image.half_diagonal_rad / focal_scale):
-            certain, other = look_up(view, catalog, scale, patterns).in_two()
+        for scale in pattern_index.scales_for(one.image.half_diagonal_rad / focal_scale):
+            certain, other = _look_up(view, catalog, scale, patterns)
             yield one, certain
             others.append((one, other))
     yield from others
@@ -192,15 +186,15 @@ def confirm_sky(
     mirrored: bool = False,
     ranges: Ranges = STATED,
 ) -> SkyMatch | NotFound:
-    """Identified stars, as from `find_sky`, given a rotation known to 10 % of the field."""
+    """Identified stars among sources (n, 2), given a rotation known to 10 % of the field."""
     image = _image(xy_px, camera, mirrored, ranges)
     stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
     start = SkyFit(camera_from_icrf, image.camera, stars)
     pairs = _shifted_alike(image, catalog, start)
-    fit = refined(image, catalog, start, pairs) if len(pairs) >= 5 else None
+    fit = sky_fit.refined(image, catalog, start, pairs) if len(pairs) >= 5 else None
     if fit is None:
         return NotFound('the stars are not where they were expected')
-    log10_p, radius_px = log10_p_value(image, catalog, fit)
+    log10_p, radius_px = sky_fit.log10_p_value(image, catalog, fit)
     if log10_p >= MAX_LOG10_P_VALUE:
         return NotFound('the stars are not where they were expected', log10_p)
     return _result(image, catalog, fit, radius_px, log10_p, mirrored)
@@ -218,7 +212,7 @@ def matched_again(
 
 def _shifted_alike(image: SourceImage, catalog: StarCatalog, start: SkyFit) -> Indices:
     """Pairs (k, 2) of catalog row and source whose shifts are the most alike."""
-    stars, xy_px = predicted(catalog, start, _OF_A_GUESS)
+    stars, xy_px = sky_fit.predicted(catalog, start, _OF_A_GUESS)
     shift = (image.xy_px[None, :_OF_A_GUESS] - xy_px[:, None]) / image.half_diagonal_px
     rank, source = np.nonzero(np.hypot(shift[..., 0], shift[..., 1]) < _GUESSED)
     if len(rank) == 0:
@@ -243,18 +237,18 @@ def mirrored_camera(camera: CameraModel) -> CameraModel:
     return turned.replace(p2=-float(camera.parameters[9]))
 
 
-def _fits(image: SourceImage, catalog: StarCatalog, candidates: Candidates) -> Iterator[SkyFit]:
+def _fits(
+    image: SourceImage, catalog: StarCatalog, candidates: Sequence[_Candidate]
+) -> Iterator[SkyFit]:
     """Refined fits of candidates in their order."""
-    fx, fy = image.camera.parameters[[0, 2]]
-    for k, scale in enumerate(candidates.focal_scale.tolist()):
-        rotation = candidates.rotation[k]
+    fx, fy = image.camera.parameters[[0, 2]].tolist()
+    for stars, sources, rotation, scale in candidates:
         start = SkyFit(
             Rotation.from_matrix(rotation),
-            image.camera.replace(fx=scale * float(fx), fy=scale * float(fy)),
+            image.camera.replace(fx=scale * fx, fy=scale * fy),
             _stars_about(image, catalog, rotation[2]),
         )
-        pairs = np.stack([candidates.stars[k], candidates.sources[k]], axis=-1)
-        fit = refined(image, catalog, start, pairs)
+        fit = sky_fit.refined(image, catalog, start, np.stack([stars, sources], axis=-1))
         if fit is not None:
             yield fit
 
@@ -278,10 +272,10 @@ def _result(
     """Result of a fit with all sources that match it."""
     # Stars fainter than the sources would match only false ones.
     deepest = 2 * len(image.xy_px)
-    pairs = match(image, catalog, fit, max(radius_px, 1.5), deepest, 10_000)
+    pairs = sky_fit.match(image, catalog, fit, max(radius_px, 1.5), deepest, 10_000)
     xy_px = image.xy_px[pairs[:, 1]]
     order = np.argsort(pairs[:, 0])
-    stars, placed = predicted(catalog, fit, deepest)
+    stars, placed = sky_fit.predicted(catalog, fit, deepest)
     residual = xy_px[order] - placed[np.searchsorted(stars, pairs[order, 0])]
     return SkyMatch(
         camera_from_icrf=fit.camera_from_icrf,
@@ -292,3 +286,198 @@ def _result(
         log10_p_value=log10_p,
         residual_px=float(np.sqrt((residual**2).mean())),
     )
+
+
+class _Candidate(NamedTuple):
+    """
+    A pattern of an image that matches one of the catalog.
+
+    ``stars`` and ``sources`` (4,) rows of the catalog and of the sources; ``rotation`` (3, 3) from
+    the catalog to the camera; ``focal_scale`` focal length over that of the prior.
+    """
+
+    stars: Indices
+    sources: Indices
+    rotation: Floats
+    focal_scale: float
+
+
+@dataclass(frozen=True)
+class _View:
+    """An image with the focal length of its prior camera scaled."""
+
+    image: SourceImage
+    focal_scale: float
+
+    @functools.cached_property
+    def directions(self) -> Floats:
+        """Lines of sight (n, 3) of the sources."""
+        fx, fy = self.focal_scale * self.image.camera.parameters[[0, 2]]
+        camera: CameraModel = self.image.camera.replace(fx=float(fx), fy=float(fy))
+        return line_of_sight(camera, self.image.xy_px)
+
+    @functools.cached_property
+    def plane(self) -> Floats:
+        """Tangents (n, 2) of the lines of sight."""
+        return np.asarray(self.directions[:, :2] / self.directions[:, 2:])
+
+    @functools.cached_property
+    def gain_map(self) -> tuple[Floats, Floats, float]:
+        """`_gain_map` of the sources."""
+        plane = self.plane[np.isfinite(self.plane[:, 0])]
+        return _gain_map(plane, math.tan(self.image.half_diagonal_rad))
+
+    def patterns(self, before: int, sources: int) -> tuple[Indices, Floats]:
+        """Patterns (n, 4) of the ``sources`` brightest, one after row ``before``; `shapes`."""
+        usable = np.flatnonzero(np.isfinite(self.directions[:sources, 0]))
+        every = list(itertools.combinations(usable.tolist(), 4))
+        chosen: Indices = np.array(every, np.int64).reshape(-1, 4)
+        chosen = chosen[chosen[:, 3] >= before]
+        order, shape = pattern_index.shapes(self.directions[chosen])
+        return np.take_along_axis(chosen, order, axis=1), shape
+
+
+def _focal_scales(image: SourceImage) -> tuple[float, ...]:
+    """Focal lengths to try, over the prior; in a narrow field shapes do not depend on it."""
+    if image.half_diagonal_rad < math.radians(12.0) or image.ranges.focal < _KNOWN:
+        return (1.0,)
+    if image.half_diagonal_rad < math.radians(24.0):
+        return (1.0, 0.86, 1.16)
+    return (1.0, 0.91, 1.1, 0.83, 1.2)
+
+
+def _tolerances(image: SourceImage) -> tuple[float, float]:
+    """Largest error of the shape of a pattern, and of the logarithm of its size."""
+    size = {1: image.ranges.focal + 0.05, 3: 0.16, 5: 0.13}[len(_focal_scales(image))]
+    return 0.012 + 0.04 * image.half_diagonal_rad, size
+
+
+def _look_up(
+    view: _View, catalog: StarCatalog, scale: int, patterns: tuple[Indices, Floats]
+) -> tuple[list[_Candidate], list[_Candidate]]:
+    """
+    Candidates from `_View.patterns` and the index of one scale, the most likely first.
+
+    Those that are almost certain, and the others.
+    """
+    index = pattern_index.pattern_index(catalog, scale)
+    place_tolerance, size_tolerance = _tolerances(view.image)
+    sources, shape = patterns
+    fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
+    sources, shape = pattern_index.equivalent(sources[fits], shape[fits], place_tolerance)
+    query, quad = pattern_index.equal_shapes(index.grid, shape, place_tolerance, size_tolerance)
+    if len(quad) > _CANDIDATES:
+        few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
+        quad, query = quad[few], query[few]
+    growth = np.exp(shape[query, 4] - index.grid.shape[quad, 4])
+    stars, sources = index.quads[index.grid.rows[quad]].astype(np.int64), sources[query]
+    rotation = _rotations(catalog.direction_icrs[stars], view.plane[sources], growth)
+    # Log-likelihood ratios of the sources to those by chance, and of the stars of a pattern alone.
+    gain, own = _gains(view, catalog, growth, rotation) if len(growth) else (growth, 0.0)
+    best = np.argsort(-gain, kind='stable')[: 4 * _KEPT]
+    # Discs share stars, so that the index has some patterns twice and more.
+    _, first = np.unique(np.hstack([stars, sources])[best], axis=0, return_index=True)
+    best = best[np.sort(first)][:_KEPT]
+    best = best[gain[best] > _LEAST_GAIN * own]
+    candidates = [
+        _Candidate(stars[k], sources[k], rotation[k], view.focal_scale * float(growth[k]))
+        for k in best
+    ]
+    count = np.count_nonzero(gain[best] > _CERTAIN_GAIN * own)
+    return candidates[:count], candidates[count:]
+
+
+def _rotations(stars: Floats, plane: Floats, growth: Floats) -> Floats:
+    """Rotations (n, 3, 3) from directions of stars (n, 4, 3) to tangents (n, 4, 2) over growth."""
+    seen = np.empty((len(growth), 4, 3))
+    seen[..., :2] = plane / growth[:, None, None]
+    seen[..., 2] = 1.0
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    return np.asarray(np.matmul(_triads(seen).transpose(0, 2, 1), _triads(stars)))
+
+
+def _triads(directions: Floats) -> Floats:
+    """Axes (n, 3, 3), in rows, of four directions (n, 4, 3): their middle, and A towards B."""
+    middle = directions.sum(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    # C and D enter through the middle.
+    towards = directions[:, 1] - directions[:, 0]
+    side = np.cross(middle, towards)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    return np.stack([middle, np.cross(side, middle), side], axis=1)
+
+
+def _gains(
+    view: _View, catalog: StarCatalog, growth: Floats, rotation: Floats
+) -> tuple[Floats, float]:
+    """Gains (n,) of rotations (n, 3, 3) with focal lengths ``growth`` (n,), and of four stars."""
+    half = math.tan(view.image.half_diagonal_rad)
+    gain_map, low, cell = view.gain_map
+    (rows, columns), flat = gain_map.shape, gain_map.ravel()
+    gains = np.empty(len(rotation))
+    for first in range(0, len(rotation), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        stars = _bright_about(catalog, rotation[part, 2], 1.1 * math.atan(half), 3 * _TESTED)
+        place = np.matmul(catalog.direction_icrs[stars], rotation[part].transpose(0, 2, 1))
+        ahead = (stars >= 0) & (place[..., 2] > 0.1)
+        scale = growth[part, None] / np.where(ahead, place[..., 2], 1.0) / cell
+        column, row = (np.floor(place[..., k] * scale - low[k] / cell) for k in (0, 1))
+        inside = ahead & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        at = np.where(inside, row * columns + column, 0.0).astype(np.int64)
+        inside &= np.cumsum(inside, axis=1, dtype=np.int32) <= _TESTED
+        value = flat[at]
+        # An image of few stars shows only the brightest: take the best depth.
+        gains[part] = np.cumsum(value * inside, axis=1).max(axis=1)
+    return gains, 4.0 * float(gain_map.max())
+
+
+def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
+    """Log-likelihood ratio of a star predicted in each cell of the image plane."""
+    low, high = plane.min(axis=0), plane.max(axis=0)
+    cell = float((high - low).max()) / _MAP_SIDE
+    shape = np.ceil((high - low) / cell).astype(np.int64) + 1
+    u, v = np.meshgrid(*(low[k] + cell * (np.arange(shape[k]) + 0.5) for k in (0, 1)))
+    apart, _ = cKDTree(plane).query(np.stack([u.ravel(), v.ravel()], axis=-1))
+    area = float(np.prod(high - low)) / len(plane)
+    density = sum(
+        0.5 * np.exp(-0.5 * (apart / (s * half)) ** 2) / (2 * math.pi * (s * half) ** 2)
+        for s in (_NEAR, _FAR)
+    )
+    gain = np.log((1.0 - _SHOWN) + _SHOWN * area * density)
+    return gain.reshape(u.shape), low, cell
+
+
+@functools.lru_cache(maxsize=8)
+def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
+    """Search trees of points all over the sky and of the stars that discs of a radius need."""
+    radius_rad = math.radians(radius_deg)
+    points = pattern_index.sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
+    # The emptiest discs hold half of the mean number, which is still most of the stars tested.
+    enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
+    stars = catalog.direction_icrs[:enough]
+    return direction_tree(points), direction_tree(stars)
+
+
+def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
+    """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
+    if radius_rad < _NARROW_RAD:  # few candidates: their patterns hold the sizes of others
+        return pattern_index.brightest_within(catalog.tree, axes, radius_rad, count)
+    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
+    point = points.query(axes)[1]
+    if points.n <= _TABLED:
+        return np.asarray(_bright_everywhere(catalog, radius_rad, count)[point])
+    point, place = np.unique(point, return_inverse=True)
+    found = pattern_index.brightest_within(stars, points.data[point], _widened(radius_rad), count)
+    return np.asarray(found[place.ravel()])
+
+
+@functools.lru_cache(maxsize=8)
+def _bright_everywhere(catalog: StarCatalog, radius_rad: float, count: int) -> Indices:
+    """Rows (p, count) of `_bright_about` for all points of `_bright_stars`."""
+    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
+    return pattern_index.brightest_within(stars, points.data, _widened(radius_rad), count)
+
+
+def _widened(radius_rad: float) -> float:
+    """Radius about the nearest point that holds the disc about an axis."""
+    return min(1.25 * radius_rad, math.pi)

@@ -18,9 +18,8 @@ from starcal_ros.identification.blending import (
     unlisted_pull_px,
 )
 from starcal_ros.stars.detection import Background
-from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.image_model import ImageModel, uniform_width
 from starcal_ros.stars.pixel_noise import PixelNoise
-from starcal_ros.stars.psf_field import uniform_width
 from starcal_ros.stars.psf_fit import fit_psf, stamp_radius_px
 
 SIGMA_PX = 0.95

@@ -22,9 +22,8 @@ from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.centroiding import Centroids
 from starcal_ros.stars.detection import Background
-from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.image_model import ImageModel, uniform_width
 from starcal_ros.stars.pixel_noise import PixelNoise
-from starcal_ros.stars.psf_field import uniform_width
 
 SHAPE = (512, 640)
 MIN_SNR = 5.0

@@ -119,5 +119,6 @@ def test_columns_that_are_shifted_are_told() -> None:
     measured = xy + 0.1 * rng.normal(size=(100, 2)) + np.outer(xy[:, 1] > 300, [4.0, 0.0])
     tear = find_line_loss(xy, measured, sigma, SHAPE)
     assert tear is not None
-    assert abs(tear.row - 300) < 12  # the next of the rows that are tried
-    np.testing.assert_allclose(tear.off_px, [4.0, 0.0], rtol=0, atol=0.2)
+    row, off_px = tear
+    assert abs(row - 300) < 12  # the next of the rows that are tried
+    np.testing.assert_allclose(off_px, [4.0, 0.0], rtol=0, atol=0.2)

@@ -18,7 +18,6 @@ from starcal_ground.simulation.rendering import render
 from starcal_ground.simulation.scenario import scenario, Scene, scene
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification import star_finder
 from starcal_ros.identification.star_finder import (
     Exposure,
     IdentificationOptions,
@@ -149,7 +148,7 @@ def test_stars_left_out_as_too_faint_are_listed_as_refused(
     fainter = int((refused > used.max()).sum())
     count = len(used) + len(refused) - fainter // 2
     assert fainter > 100
-    monkeypatch.setattr(star_finder, 'detectable_count', lambda *_: count)
+    monkeypatch.setattr('starcal_ros.stars.detection.detectable_count', lambda *_: count)
     part, _ = searched(1)
     assert part.catalog_id.tolist() == whole.catalog_id.tolist()
     assert set(part.refused_catalog_id) == set(whole.refused_catalog_id)

@@ -16,7 +16,7 @@ from starcal_ros.identification.star_finder import Exposure, observe_stars, Star
 from starcal_ros.identification.tracking import start_tracking, track_stars
 from starcal_ros.records import StarObservations
 from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.stars.psf_field import Instrument
+from starcal_ros.stars.image_model import Instrument
 
 SCENARIO = scenario('tiny', seed=8)
 FOCAL_PX = float(SCENARIO.truth.camera.parameters[0])

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from bench.lost_in_space import camera, Frame, frames
+from bench.lost_in_space import camera, find_sky, Frame, frames
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind.pattern_index import (
@@ -28,7 +28,6 @@ from starcal_ros.identification.blind.pattern_index import (
 from starcal_ros.identification.blind.search import (
     confirm_sky,
     find_in_any,
-    find_sky,
     matched_again,
     mirror,
     mirrored_camera,
