@@ -60,7 +60,7 @@ _LEAST_ELECTRONS = 200.0  # of the faintest star that is measured
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """One line for each field, with attitudes, without, with trails; half an hour or a minute."""
+    """One line for each field, with attitudes, without, with trails; ten minutes or one."""
     kinds = [
         *((field_deg, blind, 0.0) for field_deg in FIELDS_DEG for blind in (False, True)),
         *((field_deg, False, 0.0) for field_deg in WIDE_DEG),

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property, lru_cache, partial
 import hashlib
+import itertools
 import math
 from pathlib import Path
 
@@ -163,9 +164,8 @@ class StarCatalog:
     def near(self, direction_icrs: Floats, radius_rad: float) -> NDArray[np.intp]:
         """Rows (m,), ascending, of the stars near any of some directions (n, 3), as `cone`."""
         chord = 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
-        about = direction_tree(direction_icrs)
-        pairs = about.sparse_distance_matrix(self.tree, chord, output_type='ndarray')
-        return np.unique(pairs['j'])
+        rows = self.tree.query_ball_point(direction_icrs, chord)
+        return np.unique(np.fromiter(itertools.chain.from_iterable(rows), np.intp))
 
     def select(self, rows: Mask | Indices | NDArray[np.intp] | slice) -> StarCatalog:
         """Return the stars selected by a mask (n,), row numbers or a slice, in that order."""

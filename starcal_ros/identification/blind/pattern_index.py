@@ -45,6 +45,7 @@ _ORDERS = np.array(
     ]
 )
 _AT_ONCE = 600  # discs, whose arrays fit into a cache
+_MANY = 2000  # discs, from which a walk through two trees is faster than one search for each
 _CELL = 0.04  # about twice the tolerance: two cells along each place, and a table of a few MB
 # A and B are the farthest apart, and C is nearer to A: C and D lie in a lens of this corner.
 _LOW = (0.0, -0.88, 0.0, -0.88)
@@ -205,9 +206,13 @@ def sphere_points(count: int) -> Floats:
 def brightest_within(stars: cKDTree, centres: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (p, count) of the brightest of sorted stars about centres (p, 3); -1: none."""
     chord = 2 * math.sin(radius_rad / 2)
-    discs = direction_tree(centres)
-    pairs = discs.sparse_distance_matrix(stars, chord, output_type='ndarray')
-    of_centre, star = np.divmod(np.sort(pairs['i'] * stars.n + pairs['j']), stars.n)
+    if len(centres) > _MANY:
+        pairs = direction_tree(centres).sparse_distance_matrix(stars, chord, output_type='ndarray')
+        of_centre, star = np.divmod(np.sort(pairs['i'] * stars.n + pairs['j']), stars.n)
+    else:
+        inside = stars.query_ball_point(centres, chord, return_sorted=True)
+        of_centre = np.repeat(np.arange(len(inside)), [len(rows) for rows in inside])
+        star = np.fromiter(itertools.chain.from_iterable(inside), np.int64)
     first = np.searchsorted(of_centre, np.arange(len(centres)))
     rank = np.arange(len(star)) - first[of_centre]
     rows = np.full((len(centres), count), -1, np.int64)
