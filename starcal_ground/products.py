@@ -36,8 +36,8 @@ RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
     product_files.CALIBRATION_FILE,
     CAMERA_INFO_FILE,
-    OBSERVATIONS_FILE,
     RESIDUALS_FILE,
+    OBSERVATIONS_FILE,
     REPORT_FILE,
 )
 """Names of the products of a calibration, without the thumbnails."""

@@ -61,7 +61,7 @@ FILES = {
     'residuals.npz': 'report HERE/out',
     'observations.mcap': 'report HERE/out',
     'DIR of lookup': 'lookup FILE -o HERE/o.csv',
-    'DIR of export': 'export FILE --to csv -o HERE/o',
+    'DIR of export': 'export FILE --to ros -o HERE/o',
     '--kernels': 'export HERE/out --to ck --spacecraft-id -999 -o HERE/o --kernels FILE',
     'kernel of a meta-kernel': (
         'export HERE/out --to ck --spacecraft-id -999 -o HERE/o --kernels HERE/meta.tm'
@@ -71,7 +71,6 @@ FILES = {
     '--velocity': f'{_IMPORT} --velocity FILE',
     '--times': _IMPORT.replace('HERE/frames/times.csv', 'FILE'),
     '--camera': f'{_IMPORT} --camera FILE',
-    '--cameras': 'trend HERE/out -o HERE/o --cameras FILE',
     '--params of trend': 'trend HERE/bag -o HERE/o --params FILE',
 }
 """Arguments and options that name a file; images are in the tests of their readers."""
