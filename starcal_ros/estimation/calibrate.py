@@ -39,15 +39,9 @@ from starcal_ros.estimation.problem import (
     reference_degc,
     star_tracker_names,
     State,
+    why_unsupported,
 )
-from starcal_ros.estimation.search import (
-    minimise,
-    Minimum,
-    moved_to_stars,
-    problem_of,
-    start_of,
-    supported_terms,
-)
+from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.shared_errors import (
     observation_groups,
     pixel_variance_px2,
@@ -217,7 +211,12 @@ def estimate_calibration(
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
     problem = problem_of(ensemble, prior, options)
-    order, with_rate, note = supported_terms(ensemble, options)
+    order, with_rate = options.focal_temperature_order, options.alignment_temperature
+    note = (order or with_rate) and why_unsupported(
+        np.array([image.temperature_degc for image in ensemble.images]), order
+    )
+    if note:
+        order, with_rate = 0, False
     stated_rad = assumed_tracker_sigma_rad(options)
     data = Data(
         table,

@@ -20,6 +20,7 @@ _FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
 _STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
 _FEWEST_ATTITUDES = 3  # whose scatter shows that one of them does not fit
 _MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
+_MOST_OF_A_LINE = 200  # attitudes: their 20,000 pairs give a slope to a hundredth of a sigma
 _EFFICIENCY = 0.37  # of the median of squares against their mean
 _CHANCE = 1e-5  # that the attitude of an image lies beyond the limit
 _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
@@ -99,6 +100,7 @@ def misfit_images(
     variance: Floats,
     seen: Mask,
     star_tracker: Indices,
+    time_ns: Indices,
     is_stated: bool,
 ) -> Mask:
     """
@@ -116,17 +118,17 @@ def misfit_images(
 
     Notes
     -----
-    Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images: a star
-    tracker that drifts has no misfits.  Where the sigma is a guess, a scatter of few images
-    determines none: the limit is that of Student's t.  With more misfits than a third there is no
-    majority that they could fail to fit.
+    Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
+    line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
+    guess, a scatter of few images determines none: the limit is that of Student's t.  With more
+    misfits than a third there is no majority that they could fail to fit.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):
         here = seen & (star_tracker == k)
         if np.count_nonzero(here) < _FEWEST_ATTITUDES:
             continue
-        left = error[here] - np.median(error[here], axis=0)
+        left = error[here] - _line_in_time(time_ns[here], error[here])
         spread2 = np.median(left**2, axis=0) / _MEDIAN_OF_SQUARE
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
@@ -136,3 +138,18 @@ def misfit_images(
         if 3 * np.count_nonzero(found) <= np.count_nonzero(here):
             misfit[here] = found
     return misfit
+
+
+def _line_in_time(time_ns: Indices, error: Floats) -> Floats:
+    """Return robust lines (k, 3) through errors (k, 3): median of slopes, median of the rest."""
+    time = (time_ns - time_ns.mean()) / max(float(np.ptp(time_ns)), 1.0)
+    some = np.arange(0, len(time), -(-len(time) // _MOST_OF_A_LINE))
+    one, other = (some[k] for k in np.triu_indices(len(some), 1))
+    apart = time[other] - time[one]
+    # Neighbours in time have slopes of noise alone.
+    far = np.abs(apart) > 0.25
+    slope = np.zeros(3)
+    if len(time) > 2 * _FEWEST_ATTITUDES and far.any():
+        slope = np.median((error[other] - error[one])[far] / apart[far, None], axis=0)
+    line = time[:, None] * slope
+    return np.asarray(line + np.median(error - line, axis=0))

@@ -38,7 +38,6 @@ from starcal_ros.estimation.problem import (
     reference_degc,
     star_tracker_names,
     State,
-    why_unsupported,
 )
 from starcal_ros.estimation.star_equations import Measurements, StarTable, turned
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
@@ -172,14 +171,6 @@ def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
     centre_px = options.principal_point_prior * max(camera.width, camera.height)
     of_lens = options.lens_prior * np.linalg.norm(corner) / effect * falling
     return np.concatenate([[0.0, 0.0, 0.0, centre_px, centre_px], of_lens])
-
-
-def supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool, str]:
-    """Return order of the focal terms, True for an alignment rate, and why they are left out."""
-    order, with_rate = options.focal_temperature_order, options.alignment_temperature
-    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
-    note = why_unsupported(temperatures_degc, order) if order or with_rate else ''
-    return (0, False, note) if note else (order, with_rate, '')
 
 
 def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: bool) -> State:

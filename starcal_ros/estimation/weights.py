@@ -348,7 +348,9 @@ def tracker_attitudes(
         )
         return Attitudes(error, covariance, seen, np.zeros(m, bool), trackers, images)
     is_stated = tracker_sigma_is_given(data.options)
-    misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, is_stated)
+    misfit = misfit_images(
+        error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
+    )
     found_images, found_trackers, found_correlations = [], [], []
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
