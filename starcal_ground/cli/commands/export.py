@@ -2,9 +2,10 @@
 """
 Write a calibration in the format of another tool.
 
-Writes SPICE kernels (FK and IK, or CK with the attitude of each image), YAML of OpenCV, kalibr or
-ROS, arguments of GIANT, a model of mrcal, or C99 source; prints the parts that the format cannot
-represent and the error in pixels that this causes. SPICE kernels and C represent the whole camera.
+Writes SPICE kernels (FK and IK, or CK with the attitude of each image), an ALE fragment and ISIS
+keywords, YAML of OpenCV, kalibr or ROS, arguments of GIANT, a model of mrcal, a table of lines of
+sight, or C99 source; prints the parts that the format cannot represent and the error in pixels
+that this causes. SPICE kernels, tables and C represent the whole camera.
 
   # frame and instrument kernel, including the star tracker frame
   starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-id -999100
@@ -39,7 +40,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     what = 'calibration.json or its folder'
     add('calibration', type=Path, metavar='DIR', help=what)
-    what = 'format: spice, ck, opencv, kalibr, ros, giant, mrcal or c'
+    what = 'format: spice, ck, isd, opencv, kalibr, ros, giant, mrcal, csv or c'
     add('--to', required=True, metavar='FORMAT', help=what)
     what = 'folder for the files, created if absent'
     add('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
             f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}'
         )
     if not math.isfinite(done.worst_px):
-        terminal.print_text('the format cannot see the whole detector: use spice or opencv')
+        terminal.print_text('the format cannot see the whole detector: use spice, opencv or csv')
     else:
         terminal.print_text(
             f'largest error of a pixel against the calibration: {significant(done.worst_px, 3)} px'

@@ -42,7 +42,7 @@ Value = int | str | Sequence[float] | Sequence[str]
 _INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
 _SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
 _WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
-_UM_PER_MM = 1000.0
+UM_PER_MM = 1000.0
 
 _MODEL_IN_WORDS = {
     'plumb_bob': (
@@ -205,7 +205,7 @@ def _instrument_kernel(
     values |= _lens_values(camera)
     if names.pixel_size_um:
         mm = np.sqrt(camera.intrinsics[0] * camera.intrinsics[2]) * names.pixel_size_um
-        values |= {'FOCAL_LENGTH': [mm / _UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
+        values |= {'FOCAL_LENGTH': [mm / UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
     terms = calibration.temperature
     if terms is not None:
         values['REFERENCE_DEGC'] = [terms.reference_degc]
@@ -215,7 +215,7 @@ def _instrument_kernel(
     values['PARAMETERS'] = calibration.parameter_names
     values['PARAMETER_SIGMAS'] = calibration.sigma.tolist()
     comments = [*_lens_comments(camera, names), '', *about]
-    return _kernel('IK', f'Camera {camera_frame}', comments, _assignments(values, prefix))
+    return kernel_text(f'Camera {camera_frame}', comments, prefix, values)
 
 
 _FIELD_IN_WORDS = (
@@ -278,6 +278,13 @@ def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
         'BORESIGHT is the line of sight of the middle of the detector.',
         'PARAMETER_SIGMAS are the 1-sigma of PARAMETERS: px, for alignment angles rad.',
     ]
+
+
+def kernel_text(
+    title: str, comments: Iterable[str], prefix: str, values: Mapping[str, Value]
+) -> str:
+    """Text of an IK with comments and assignments."""
+    return _kernel('IK', title, comments, _assignments(values, prefix))
 
 
 def _kernel(kind: str, title: str, comments: Iterable[str], data: Iterable[str]) -> str:

@@ -45,7 +45,7 @@ def test_export_states_the_cost_of_each_part(folder: Path, tmp_path: Path, capsy
     ('line', 'words'),
     [
         ('--to spice', '--spacecraft-id'),
-        ('--to matlab', "'matlab' is not one of spice, ck, opencv"),
+        ('--to matlab', "'matlab' is not one of spice, ck, isd, opencv"),
         ('--to spice --spacecraft-id 5', 'not a negative NAIF ID'),
     ],
 )
@@ -60,11 +60,11 @@ def test_export_warns_of_a_refused_calibration(folder, tmp_path, capsys, accepte
     reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
     judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
     write_calibration(judged, folder / 'calibration.json')
-    assert main(f'export {folder} --to c -o {tmp_path}'.split()) == 0
+    assert main(f'export {folder} --to csv -o {tmp_path}'.split()) == 0
     expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
     assert capsys.readouterr().err.splitlines() == expected
 
 
 def test_export_needs_a_calibration(tmp_path: Path, capsys) -> None:
-    assert main(f'export {tmp_path} --to c -o {tmp_path}'.split()) == 2
+    assert main(f'export {tmp_path} --to csv -o {tmp_path}'.split()) == 2
     assert 'holds no calibration.json' in capsys.readouterr().err

@@ -16,6 +16,7 @@ from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+import spiceypy
 import yaml
 
 from starcal_ground.mission.export.export_formats import export, Exported, FORMATS
@@ -180,6 +181,16 @@ def test_a_model_of_mrcal_has_the_error_it_states(tmp_path: Path, model: str) ->
     assert content['extrinsics'][3:] == [0.0, 0.0, 0.0]
 
 
+def test_csv_is_the_table_of_lines_of_sight(tmp_path: Path) -> None:
+    made = calibration(with_field=True)
+    done = export(made, 'csv', tmp_path, None)
+    table = np.genfromtxt(done.files[0], delimiter=',', names=True)
+    assert len(table) == 65 * 65
+    pixels = np.c_[table['u_px'], table['v_px']]
+    expected = line_of_sight(made.geometry.camera, pixels)
+    assert (np.c_[table['x'], table['y'], table['z']] == expected).all()
+
+
 def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path: Path) -> None:
     done = export(calibration(skew=0.0, temperature=True), 'opencv', tmp_path, None)
     cost = {loss.part: loss.cost_px for loss in done.losses}
@@ -228,7 +239,7 @@ def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:
         export(calibration(), 'opencvv', tmp_path, None)
     with pytest.raises(OptionError, match=r'--spacecraft-id'):
         export(calibration(), 'spice', tmp_path, None)
-    assert len(FORMATS) == 8
+    assert len(FORMATS) == 10
 
 
 def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
@@ -264,6 +275,57 @@ def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(
         made = dataclasses.replace(made, geometry=turned, parent_frame=frame)
         text = export(made, kind, tmp_path, None).files[0].read_text()
         assert (ROTATIONS[kind] in text) is bool(frame)
+
+
+CENTER = ('BORESIGHT_SAMPLE', 'BORESIGHT_LINE')
+
+
+def usgs_pixels(isd: dict, directions: np.ndarray) -> np.ndarray:
+    """Pixels of directions by the equations of usgscsm's frame camera, radtan as in OpenCV."""
+    x = directions[:, :2] / directions[:, 2:]
+    focal = isd['focal_length_model']['focal_length']
+    D = np.array(isd['optical_distortion']['radtan']['coefficients'])
+    flat = np.c_[x, np.ones(len(x))]
+    distorted = opencv_pixels(flat, np.eye(3), D, fisheye=False) * focal
+    affine = [isd['focal2pixel_samples'], isd['focal2pixel_lines']]
+    center = [isd['detector_center'][side] for side in ('sample', 'line')]
+    at = [c + a[0] + distorted @ a[1:] for c, a in zip(center, affine, strict=True)]
+    return np.stack(at, axis=-1) - 0.5  # (0.5, 0.5) is the centre of the first pixel
+
+
+@pytest.mark.parametrize('pixel_size_um', [0.0, 5.5])
+@pytest.mark.parametrize('with_field', [False, True])
+@pytest.mark.parametrize('model', ['plumb_bob', 'thin_prism', 'equidistant'])
+def test_isd_and_isis_keywords_have_the_errors_they_state(
+    tmp_path: Path, model: str, with_field: bool, pixel_size_um: float
+) -> None:
+    made = calibration(model, with_field=with_field)
+    names = SpiceNames(-999, pixel_size_um=pixel_size_um)
+    done = export(made, 'isd', tmp_path, names)
+    pixels, directions = grid_of(made)
+    isd = json.loads(done.files[0].read_text())
+    found_px = worst_px(usgs_pixels(isd, directions), pixels)
+    assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
+    if model == 'plumb_bob' and not with_field:
+        assert found_px < SAME_PX
+    spiceypy.kclear()
+    spiceypy.furnsh(str(done.files[1]))
+    key = {
+        name: np.array(spiceypy.gdpool(f'INS-999001_{name}', 0, 9))
+        for name in ('FOCAL_LENGTH', *CENTER, 'TRANSX', 'TRANSY', 'OD_K')
+    }
+    spiceypy.kclear()
+    # ISIS: pixel to focal plane, radial distortion removed, then the direction.
+    center = np.concatenate([key[name] for name in CENTER]) - 1.0
+    at = np.c_[np.ones(len(pixels)), pixels - center]
+    x, y = at @ key['TRANSX'], at @ key['TRANSY']
+    r2 = x**2 + y**2
+    k = key['OD_K']
+    scale = 1 - (k[0] + r2 * (k[1] + r2 * k[2]))
+    sights = np.c_[x * scale, y * scale, np.full(len(x), key['FOCAL_LENGTH'][0])]
+    isis_px = worst_px(project(made.geometry.camera, sights), pixels)
+    assert isis_px == pytest.approx(done.losses[-1].cost_px, abs=1e-6)  # digits of a text kernel
+    assert isis_px < 1.0
 
 
 @pytest.mark.parametrize('form', ['opencv', 'kalibr', 'ros'])
