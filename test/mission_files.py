@@ -6,6 +6,7 @@ from __future__ import annotations
 from datetime import datetime, timezone
 import functools
 from pathlib import Path
+from typing import Any
 
 from astropy.io import fits
 from astropy.time import Time
@@ -13,6 +14,7 @@ import cv2
 import erfa
 import numpy as np
 import spiceypy
+import yaml
 
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import (
@@ -36,6 +38,17 @@ def attitudes() -> tuple[tuple[int, np.ndarray], ...]:
     """Stamps and quaternions, icrf_from_star_tracker."""
     raw = reader.read_raw([TINY], ['/star_tracker/attitude'])
     return tuple(attitude_from_message(reader.decode(message)) for message in raw)
+
+
+def params_with(folder: Path, **changes: Any) -> Path:
+    """Write a parameter file of the small bag with changed values; None takes one out."""
+    content = yaml.safe_load((TINY / 'params.yaml').read_text())
+    values = content['/**']['ros__parameters'] | {'camera_info_url': str(TINY / 'camera.yaml')}
+    values = {name: value for name, value in (values | changes).items() if value is not None}
+    content['/**']['ros__parameters'] = values
+    path = folder / 'params.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return path
 
 
 def write_velocities(path: Path) -> Path:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 
+from mission_files import params_with  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -156,11 +157,7 @@ def test_observations_are_not_calibrated_in_place(tiny_products: Path, tmp_path:
 
 
 def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
-    content = yaml.safe_load((TINY / 'params.yaml').read_text())
-    values = content['/**']['ros__parameters']
-    values |= {'camera_info_url': str(TINY / 'camera.yaml'), 'max_change_px': 1e-6}
-    params = tmp_path / 'params.yaml'
-    params.write_text(yaml.safe_dump(content))
+    params = params_with(tmp_path, max_change_px=1e-6)
     done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
     assert done.returncode == 3
     assert done.stderr == ''

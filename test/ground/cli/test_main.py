@@ -18,9 +18,9 @@ import subprocess
 import sys
 import time
 
+from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-import yaml
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli import main, node_processes
@@ -31,8 +31,6 @@ from starcal_ros.constants import software_version
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.processes import module_command
 from starcal_ros.records import Image
-
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 
 Run = Callable[..., 'tuple[int, str, str]']
 
@@ -61,23 +59,6 @@ def assert_refused(result: tuple[int, str, str], *words: str) -> None:
     assert 'Traceback' not in err
     for word in words:
         assert word in err
-
-
-@pytest.fixture
-def params(tmp_path: Path) -> Callable[..., Path]:
-    """Write the tiny bag's parameter file with some values changed; None takes one out."""
-
-    def write(**changes: object) -> Path:
-        content = yaml.safe_load((TINY / 'params.yaml').read_text())
-        values = content['/**']['ros__parameters']
-        values['camera_info_url'] = str(TINY / 'camera.yaml')
-        values.update(changes)
-        content['/**']['ros__parameters'] = {k: v for k, v in values.items() if v is not None}
-        path = tmp_path / 'params.yaml'
-        path.write_text(yaml.safe_dump(content))
-        return path
-
-    return write
 
 
 def test_no_command_prints_the_help(run: Run) -> None:
@@ -241,13 +222,11 @@ def test_topics_that_are_not_there(
     ],
 )
 def test_bad_parameters(
-    run: Run,
-    tmp_path: Path,
-    params: Callable[..., Path],
-    changes: dict[str, object],
-    words: list[str],
+    run: Run, tmp_path: Path, changes: dict[str, object], words: list[str]
 ) -> None:
-    result = run('calibrate', TINY, '--params', params(**changes), '-o', tmp_path / 'out')
+    result = run(
+        'calibrate', TINY, '--params', params_with(tmp_path, **changes), '-o', tmp_path / 'out'
+    )
     assert_refused(result, *words)
     assert not (tmp_path / 'out').exists()
 
@@ -405,9 +384,7 @@ def test_several_image_topics_must_be_named(run: Run, tmp_path: Path) -> None:
     assert_refused(result, '/left, /right')
 
 
-def test_a_temperature_topic_must_be_there(
-    run: Run, tmp_path: Path, params: Callable[..., Path]
-) -> None:
+def test_a_temperature_topic_must_be_there(run: Run, tmp_path: Path) -> None:
     files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     result = run('calibrate', TINY, *files, '--temperature-topic', '/box')
     assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
@@ -419,7 +396,7 @@ def test_a_temperature_topic_must_be_there(
             writer.write_temperature(topic, 5, 20.0, 'camera')
     # Two thermometers: which one, is asked only where it matters.
     assert_refused(run('calibrate', two, *files), 'No image of 1 can be used', 'as blank')
-    asks = params(focal_temperature_order=1)
+    asks = params_with(tmp_path, focal_temperature_order=1)
     result = run('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
     assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
 
@@ -609,10 +586,10 @@ def test_without_ros_one_line_names_the_remedy(
 
 
 @pytest.mark.slow
-def test_parameters_of_the_nodes_are_known_to_the_tool(
-    run: Run, tmp_path: Path, params: Callable[..., Path]
-) -> None:
-    shared = params(autostart=True, attitude_timeout_s=2.0, use_sim_time=True, max_change_px=1e-6)
+def test_parameters_of_the_nodes_are_known_to_the_tool(run: Run, tmp_path: Path) -> None:
+    shared = params_with(
+        tmp_path, autostart=True, attitude_timeout_s=2.0, use_sim_time=True, max_change_px=1e-6
+    )
     status, _, err = run('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
     assert (status, err) == (3, '')
 

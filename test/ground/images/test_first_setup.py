@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import json
 from pathlib import Path
 import re
 import shutil
 
 import cv2
+from mission_files import images, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,6 @@ from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Image
 
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 TRUTH = json.loads((TINY / 'truth.json').read_text())
 IMAGES = '/opnav/image_raw'
 ATTITUDES = '/star_tracker/attitude'
@@ -31,26 +32,21 @@ ALIGNMENT_DEG = 0.1  # noise of the star tracker in the bag: 0.011; a prior must
 COLUMNS = 80
 
 
-@pytest.fixture(scope='module')
-def tiny_images() -> list[Image]:
-    return [image for image in reader.read_images([TINY], IMAGES) if isinstance(image, Image)]
-
-
-def with_attitudes(path: Path, images: list[Image], sign: int = 1, shift_s: int = 0) -> Path:
+def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
     """The bag with attitudes that are late, or inverted (-1): from ICRF to the star tracker."""
     with BagWriter(path) as writer:
         for raw in reader.read_raw([TINY], [ATTITUDES]):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
             time_ns += shift_s * 10**9
             writer.write_attitude(ATTITUDES, time_ns, xyzw * [sign, sign, sign, 1], 'star_tracker')
-        for image in images:
+        for image in images():
             writer.write_image(IMAGES, image, 'camera')
     return path
 
 
-def write_pngs(folder: Path, images: list[Image]) -> Path:
+def write_pngs(folder: Path, written: Sequence[Image]) -> Path:
     folder.mkdir()
-    for k, image in enumerate(images):
+    for k, image in enumerate(written):
         cv2.imwrite(str(folder / f'{k}.png'), image.pixels)
     return folder
 
@@ -60,13 +56,12 @@ def write_pngs(folder: Path, images: list[Image]) -> Path:
 def test_a_bag_of_which_nothing_is_stated(
     tmp_path: Path,
     direction: str,
-    tiny_images: list[Image],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv('COLUMNS', str(COLUMNS))
     is_plain = direction == 'st_to_inertial'
-    bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', tiny_images, -1)
+    bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', -1)
     monkeypatch.chdir(tmp_path)
     out = Path('out')
     assert main(['calibrate', str(bag), '-o', str(out)]) == 0
@@ -106,9 +101,9 @@ def test_a_bag_of_which_nothing_is_stated(
 
 @pytest.mark.slow
 def test_attitudes_that_do_not_fit_are_diagnosed(
-    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag = with_attitudes(tmp_path / 'b.mcap', tiny_images, shift_s=5)
+    bag = with_attitudes(tmp_path / 'b.mcap', shift_s=5)
     assert main(['calibrate', str(bag), '-o', str(tmp_path / 'out'), '--quiet']) == 2
     error = capsys.readouterr().err
     assert error.count('\n') == 1
@@ -137,9 +132,9 @@ def test_streaks_that_are_measured_are_identified_too(
 
 @pytest.mark.slow
 def test_photographs_of_which_nothing_is_stated(
-    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    night, out = write_pngs(tmp_path / 'night', tiny_images[:3]), tmp_path / 'out'
+    night, out = write_pngs(tmp_path / 'night', images()[:3]), tmp_path / 'out'
     command = ['calibrate', str(night), '-o', str(out), '--no-report']
     assert main([*command, '--focal-length-mm', '50', '--pixel-size-um', '10']) in (0, 3)
     text, notes = capsys.readouterr()
@@ -178,10 +173,10 @@ def test_a_requirement_is_answered_for_people_and_programs(
     assert reason.endswith(f'over the limit of 0.055 px (requirements); {check["note"]}')
 
 
-def of_colour(path: Path, images: list[Image]) -> None:
+def of_colour(path: Path) -> None:
     """Write a bag of colour images."""
     with BagWriter(path) as writer:
-        for image in images[:3]:
+        for image in images()[:3]:
             grey = (image.pixels >> 4).astype(np.uint8)
             message = make_message(
                 IMAGE_TYPE, header=make_header(image.time_ns, 'camera', make_message),
@@ -236,18 +231,18 @@ WRONG = [
 
 
 @pytest.fixture(scope='module')
-def inputs(tmp_path_factory: pytest.TempPathFactory, tiny_images: list[Image]) -> Path:
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the inputs of the table."""
     folder = tmp_path_factory.mktemp('inputs')
     for name in ('params.yaml', 'camera.yaml'):
         shutil.copy(TINY / name, folder)
-    write_pngs(folder / 'night', tiny_images[:3])
+    write_pngs(folder / 'night', images()[:3])
     (folder / 'nothing').mkdir()
     (folder / 'nothing' / 'notes.txt').write_text('notes')
     with BagWriter(folder / 'night.mcap') as writer:
-        for image in tiny_images[:3]:
+        for image in images()[:3]:
             writer.write_image(IMAGES, image, 'camera')
-    of_colour(folder / 'colour.mcap', tiny_images)
+    of_colour(folder / 'colour.mcap')
     with BagWriter(folder / 'observations.mcap') as writer:
         from starcal_ros.records import refused_image
 

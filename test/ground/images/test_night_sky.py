@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import dataclasses
-import functools
 import json
 import os
 from pathlib import Path
 
 from astropy.io import fits
 import cv2
+from mission_files import images as tiny_images  # type: ignore[import-not-found]
+from mission_files import TINY
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,7 +28,6 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.pipeline.setup import load_setup
@@ -36,14 +36,7 @@ from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import CameraGeometry, Image, refused_image
 from starcal_ros.sky.catalog import load_catalog
 
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 TOPIC = '/camera/image_raw'
-
-
-@functools.cache
-def tiny_images() -> tuple[Image, ...]:
-    topic = next(t.name for t in reader.topics([TINY]) if t.type_name.endswith('/Image'))
-    return tuple(one for one in reader.read_images([TINY], topic) if isinstance(one, Image))
 
 
 def write_pngs(images: Sequence[Pixels], folder: Path) -> Path:

@@ -9,6 +9,8 @@ import math
 from pathlib import Path
 
 import cv2
+from mission_files import images as tiny_images  # type: ignore[import-not-found]
+from mission_files import TINY
 import numpy as np
 import pytest
 
@@ -27,7 +29,6 @@ from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image, refused_image
 
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 PARAMS = TINY / 'params.yaml'
 ASKED = Topics()
 IMAGE, ATTITUDE = simulated_bag.IMAGE_TOPIC, simulated_bag.ATTITUDE_TOPIC
@@ -36,11 +37,6 @@ IMAGE, ATTITUDE = simulated_bag.IMAGE_TOPIC, simulated_bag.ATTITUDE_TOPIC
 @pytest.fixture(scope='module')
 def setup() -> Setup:
     return read_setup(PARAMS)
-
-
-@pytest.fixture(scope='module')
-def tiny_images() -> list[Image]:
-    return [i for i in reader.read_images([TINY], IMAGE) if isinstance(i, Image)]
 
 
 @pytest.mark.parametrize(
@@ -95,11 +91,9 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
 
 
 @pytest.mark.slow
-def test_verdicts_are_those_of_the_calibration(
-    tmp_path: Path, setup: Setup, tiny_images: list[Image]
-) -> None:
+def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> None:
     path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images)
+    write_spoilt(path, tiny_images())
     quick = inspect.inspect([path], ASKED)
     assert {r.reason: r.count for r in quick.refused} == {
         'no_attitude': 2,
@@ -119,18 +113,18 @@ def test_verdicts_are_those_of_the_calibration(
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')
-    assert gap.first_ns == tiny_images[1].time_ns and 'over 2 s' in gap.detail
+    assert gap.first_ns == tiny_images()[1].time_ns and 'over 2 s' in gap.detail
     assert full.status is not None and full.status.images == 5
     assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
 
 
 def test_an_attitude_gap_that_is_not_recorded_is_nan(
-    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
     path = tmp_path / 'images.mcap'
     with BagWriter(path) as writer:
-        writer.write_image(IMAGE, tiny_images[0], 'camera')
+        writer.write_image(IMAGE, tiny_images()[0], 'camera')
         writer.write_attitude(ATTITUDE, 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
     assert math.isnan(inspect.inspect([path], ASKED).longest_attitude_gap_s)
     assert main.main(['inspect', str(path), '--json']) == EXIT_REFUSED
@@ -139,17 +133,17 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(
     assert 'longest attitude gap' not in capsys.readouterr().out
 
 
-def test_the_topics_are_told(tmp_path: Path, tiny_images: list[Image]) -> None:
+def test_the_topics_are_told(tmp_path: Path) -> None:
     path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images)
+    write_spoilt(path, tiny_images())
     attitude, image = sorted(inspect.inspect([path], ASKED).topics, key=lambda t: -t.bad)
     assert (attitude.name, attitude.bad) == (ATTITUDE, 4)
     assert attitude.rate_hz == pytest.approx(2.0) and attitude.count == 34
     assert image.name == IMAGE and image.count == 12 and image.bad == 0
     assert image.kinds == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
     assert image.rate_hz == pytest.approx(0.25) and image.longest_gap_s == pytest.approx(10.0)
-    assert image.first_ns == tiny_images[0].time_ns
-    assert image.last_ns == tiny_images[-1].time_ns + 10**10
+    assert image.first_ns == tiny_images()[0].time_ns
+    assert image.last_ns == tiny_images()[-1].time_ns + 10**10
 
 
 def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path: Path) -> None:
@@ -166,19 +160,19 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
     assert 'starcal import' in found.problems[0] and '/lens' in found.problems[0]
 
 
-def test_compressed_images_are_told_apart(tmp_path: Path, tiny_images: list[Image]) -> None:
+def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / 'png.mcap'
     with BagWriter(path) as writer:
         for k, ending in enumerate(('.png', '.jpg', '.bmp')):
-            pixels = tiny_images[k].pixels
+            pixels = tiny_images()[k].pixels
             coded = cv2.imencode(ending, pixels if ending == '.png' else pixels.astype(np.uint8))
             message = make_message(
                 COMPRESSED_TYPE,
-                header=make_header(tiny_images[k].time_ns, 'camera', make_message),
+                header=make_header(tiny_images()[k].time_ns, 'camera', make_message),
                 format=ending[1:],
                 data=np.asarray(coded[1]).ravel(),
             )
-            writer.write('/image', COMPRESSED_TYPE, tiny_images[k].time_ns, message)
+            writer.write('/image', COMPRESSED_TYPE, tiny_images()[k].time_ns, message)
         for raw in reader.read_raw([TINY], [ATTITUDE]):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
@@ -189,9 +183,9 @@ def test_compressed_images_are_told_apart(tmp_path: Path, tiny_images: list[Imag
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 
-def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path, tiny_images: list[Image]) -> None:
+def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     cut = tmp_path / 'cut.mcap'
-    write_spoilt(cut, tiny_images)
+    write_spoilt(cut, tiny_images())
     cut.write_bytes(cut.read_bytes()[:-10_000])  # in the second chunk
     found = inspect.inspect([cut], ASKED)
     (damage,) = found.damage
@@ -208,10 +202,10 @@ def test_recorded_observations_need_no_parameters(tiny_products: Path) -> None:
 
 @pytest.mark.slow
 def test_the_tool_says_it_to_people_and_programs(
-    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images)
+    write_spoilt(path, tiny_images())
     assert main.main(['inspect', str(path)]) == 0
     out = capsys.readouterr().out
     assert '5 of 12 images' in out and 'attitude_gap' in out
@@ -224,11 +218,11 @@ def test_the_tool_says_it_to_people_and_programs(
 
 
 def test_a_bag_that_cannot_be_calibrated_ends_with_3(
-    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / 'two.mcap'
     with BagWriter(path) as writer:
-        for image in tiny_images[:2]:
+        for image in tiny_images()[:2]:
             writer.write_image(IMAGE, image, 'camera')
         writer.write_attitude(ATTITUDE, 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
     assert main.main(['inspect', str(path)]) == 3
@@ -239,7 +233,7 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
         for raw in reader.read_raw([TINY], [ATTITUDE]):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
-        for image in tiny_images[:2]:
+        for image in tiny_images()[:2]:
             writer.write_image(IMAGE, image, 'camera')
     assert main.main(['inspect', str(few)]) == 3
     assert '2 different images, 3 are needed' in capsys.readouterr().out

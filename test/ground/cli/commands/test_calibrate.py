@@ -7,8 +7,8 @@ import dataclasses
 import json
 from pathlib import Path
 import shutil
-from typing import Any
 
+from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
@@ -19,22 +19,6 @@ from starcal_ground.products import NOT_CALIBRATED_FILE, OBSERVATIONS_TOPIC, wri
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.records import refused_image
 
-TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
-
-
-def params_with(folder: Path, **changes: Any) -> str:
-    """A parameter file of the tiny bag; None removes a parameter."""
-    content = yaml.safe_load((TINY / 'params.yaml').read_text())
-    values = content['/**']['ros__parameters']
-    values['camera_info_url'] = str(TINY / 'camera.yaml')
-    for name, value in changes.items():
-        values[name] = value
-        if value is None:
-            del values[name]
-    path = folder / 'params.yaml'
-    path.write_text(yaml.safe_dump(content))
-    return str(path)
-
 
 @pytest.mark.slow
 def test_a_failure_replaces_an_older_calibration(
@@ -43,7 +27,7 @@ def test_a_failure_replaces_an_older_calibration(
     out = tmp_path / 'out'
     shutil.copytree(tiny_products, out)
     assert 'Accepted' in (out / 'report.html').read_text()
-    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
     assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
     complaint = capsys.readouterr().err
     assert 'Set attitude_direction: st_to_inertial.' in complaint
@@ -118,7 +102,7 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
 def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr('starcal_ground.report.page.write_failure_page', broken)
     monkeypatch.setattr('starcal_ground.report.thumbnails._expected_picture', broken)
-    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
     out = tmp_path / 'out'
     assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
     words = capsys.readouterr().err.splitlines()
@@ -131,7 +115,7 @@ def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monk
 def test_alignment_and_tracker_sigma_are_found_and_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    params = params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None)
+    params = str(params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None))
     out = tmp_path / 'out'
     assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 0
     said = capsys.readouterr()
@@ -157,7 +141,7 @@ def test_rates_that_no_image_has_are_said(
     rates = np.full(3, rate)
     images = [dataclasses.replace(image, star_tracker_rate_rad_s=rates) for image in recorded]
     write_observations(images, tmp_path, 'camera')
-    out, params = str(tmp_path / 'out'), params_with(tmp_path, shutter=None)
+    out, params = str(tmp_path / 'out'), str(params_with(tmp_path, shutter=None))
     bag = str(tmp_path / OBSERVATIONS_FILE)
     assert main.main(['calibrate', bag, '--params', params, '-o', out, '--no-report']) == 0
     said = ' '.join(capsys.readouterr().out.split())

@@ -6,24 +6,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import pytest
-import yaml
 
 from starcal_ground.cli import main
 from starcal_ros.pipeline.diagnosis.diagnose import CAUSES
-
-TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 
 
 @pytest.fixture
 def wrong_params(tmp_path: Path) -> Path:
     """The parameters of the tiny bag with the conjugate of the attitudes asked for."""
-    content = yaml.safe_load((TINY / 'params.yaml').read_text())
-    values = content['/**']['ros__parameters']
-    values['camera_info_url'] = str(TINY / 'camera.yaml')
-    values['attitude_direction'] = 'inertial_to_st'
-    path = tmp_path / 'params.yaml'
-    path.write_text(yaml.safe_dump(content))
+    path: Path = params_with(tmp_path, attitude_direction='inertial_to_st')
     return path
 
 

@@ -11,6 +11,7 @@ import re
 from typing import Any
 
 import cv2
+from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
@@ -27,7 +28,6 @@ from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TY
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
-TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 IMAGES = 4
 
 Write = Callable[[BagWriter, Image], None]
@@ -90,15 +90,6 @@ def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None =
     return path
 
 
-def params(folder: Path, camera: Path = TINY / 'camera.yaml', **changes: Any) -> Path:
-    """Write a parameter file of the tiny bag with changed values."""
-    content = yaml.safe_load((TINY / 'params.yaml').read_text())
-    content['/**']['ros__parameters'] |= {'camera_info_url': str(camera), **changes}
-    path = folder / 'params.yaml'
-    path.write_text(yaml.safe_dump(content))
-    return path
-
-
 def rescaled_camera(folder: Path, scale: float) -> Path:
     """Write the prior camera of the tiny bag with another focal length."""
     content = yaml.safe_load((TINY / 'camera.yaml').read_text())
@@ -156,7 +147,7 @@ def test_a_mistake_of_the_bag(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', write, shift_s)
-    for text in said(capsys, tmp_path, path, params(tmp_path)).values():
+    for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
         for word in words:
             assert word.lower() in text.lower(), text
 
@@ -167,7 +158,7 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(
 ) -> None:
     """With the attitudes of one image only no shift can be found."""
     path = bag(tmp_path / 'bag.mcap', _raw, 7200.0, cut=4)
-    for text in said(capsys, tmp_path, path, params(tmp_path)).values():
+    for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
         assert 'two clocks' in text and '2026-05-15 09:19:59.250 UTC' in text
         assert 'stamp_offset_s' in text
 
@@ -180,7 +171,7 @@ def test_a_focal_length_of_other_pixels(
     scale: float, commands: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The search takes each command 7 s: each meets one of the two mistakes."""
-    parameters = params(tmp_path, rescaled_camera(tmp_path, scale))
+    parameters = params_with(tmp_path, camera_info_url=str(rescaled_camera(tmp_path, scale)))
     path = bag(tmp_path / 'bag.mcap', _raw)
     for text in said(capsys, tmp_path, path, parameters, commands).values():
         assert ('100 % too long' if scale > 1 else '50 % too short') in text
@@ -197,12 +188,9 @@ def test_a_focal_length_of_other_pixels(
     ],
 )
 def test_a_mistake_of_the_parameters(
-    changes: dict[str, Any],
-    words: list[str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    changes: dict[str, Any], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for text in said(capsys, tmp_path, TINY, params(tmp_path, **changes)).values():
+    for text in said(capsys, tmp_path, TINY, params_with(tmp_path, **changes)).values():
         for word in words:
             assert word in text
 
@@ -263,7 +251,7 @@ def test_a_bag_without_attitudes_is_named(
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', _raw, None)
     for command in ('inspect', 'diagnose'):
-        main.main([command, str(path), '--params', str(params(tmp_path))])
+        main.main([command, str(path), '--params', str(params_with(tmp_path))])
         text = ' '.join(capsys.readouterr())
         assert 'attitudes of the star tracker' in text and 'starcal import' in text
 
