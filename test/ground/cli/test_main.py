@@ -452,6 +452,7 @@ def test_each_command_has_examples_that_it_takes() -> None:
         parser().parse_args(words[1:])  # exits where it does not understand
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_the_first_steps_run_in_an_empty_folder(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

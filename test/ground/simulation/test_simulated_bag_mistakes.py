@@ -37,9 +37,9 @@ def test_each_is_named(
     options: list[str], cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = tmp_path / 'bag'
-    made = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--images', '5', *options]
+    made = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--images', '4', *options]
     assert main.main(made) == 0
-    assert json.loads((bag / 'truth.json').read_text())['images'] == 5
+    assert json.loads((bag / 'truth.json').read_text())['images'] == 4
     capsys.readouterr()
     status = main.main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), '--json'])
     found = json.loads(capsys.readouterr().out)
