@@ -31,7 +31,7 @@ _SPARSE_PX = 256
 _MOST_SLOPE = 0.05  # noise per pixel, over cells of 256 px: this slope pulls a star by 0.25 sigma
 _SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their pixels
 # Matched filter of detection; stars of 0.7 to 1.5 px lose under 10 % of S/N.
-_DETECTION_SIGMA_PX = 1.0
+_DETECTION_SIGMA_PX, _FILTER_PX = 1.0, (7, 7)
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
 NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
@@ -271,9 +271,9 @@ def detect(
     """
     height, width = pixels.shape
     level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
-    image: Singles = np.subtract(pixels, level, dtype=np.float32)
+    image: Singles = np.subtract(pixels, level, out=np.asarray(level, np.float32))
     filtered: Singles = np.asarray(
-        cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
+        cv2.GaussianBlur(image, _FILTER_PX, _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
         np.float32,
     )
     lowest = detection_sigma * NOISE_LEFT * float(background.noise_mesh.min())
@@ -341,7 +341,7 @@ def brightest_near(
         # filter carries over a joint.
         cv2.GaussianBlur(
             windows.reshape(-1, 2 * half + 1),
-            (7, 7),
+            _FILTER_PX,
             _DETECTION_SIGMA_PX,
             dst=filtered.reshape(-1, 2 * half + 1),
         )

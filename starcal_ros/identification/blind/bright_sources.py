@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.arrays import Floats, Indices, Pixels, Singles
 from starcal_ros.stars.detection import Background, detect, measure_background, stamps_at_edges
 
 _STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
@@ -52,32 +52,26 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     found = detect(pixels, background)
     centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
     stamps, outside = stamps_at_edges(pixels, centre, _STAMP_PX)
-    light = stamps - background.level_at(centre)[:, None, None]
+    light = np.asarray(stamps - background.level_at(centre)[:, None, None], np.float32)
     light[outside | (light < 3.0 * background.noise_at(centre)[:, None, None])] = 0.0
-    reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
+    reach = np.arange(-_STAMP_PX, _STAMP_PX + 1, dtype=np.float32)
     # The second round is centred on the first centroid: neighbours at the rim then count less.
-    offset = np.zeros((len(centre), 2))
+    offset = np.zeros((len(centre), 2), np.float32)
     for radius_px in (4.0, 5.0):
         u2, v2 = ((reach - offset[:, k, None]) ** 2 for k in (0, 1))
         weight = light * (u2[:, None] + v2[:, :, None] <= radius_px**2)
         flux = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
         middle = [weight.sum(axis=axis) @ reach / flux for axis in (1, 2)]
         offset = np.stack(middle, axis=-1)
-    long_px, wide_px, along_rad = _extents(light, reach)
-    total = light.sum(axis=(1, 2))
+    total = light.sum(axis=(1, 2), dtype=np.float64)
     order = np.argsort(-total, kind='stable')
     order = order[total[order] > 0]
     xy_px = (centre + offset)[order]
-    order = order[_apart(xy_px)][:_KEPT]
-    return BrightSources(
-        (centre + offset)[order],
-        total[order],
-        stamps.max(axis=(1, 2))[order] if len(stamps) else total[order],
-        long_px[order],
-        wide_px[order],
-        along_rad[order],
-        background,
-    )
+    kept = _apart(xy_px)[:_KEPT]
+    order = order[kept]
+    peak_dn = stamps[order].max(axis=(1, 2), initial=0.0)
+    extents = _extents(light[order], reach)
+    return BrightSources(xy_px[kept], total[order], peak_dn, *extents, background)
 
 
 def smear(sources: BrightSources) -> tuple[float, float] | None:
@@ -98,14 +92,13 @@ def smear(sources: BrightSources) -> tuple[float, float] | None:
     return length_px, 0.5 * float(np.angle(double))
 
 
-def _extents(light: Floats, reach: Indices) -> tuple[Floats, Floats, Floats]:
+def _extents(light: Singles, reach: Singles) -> tuple[Floats, Floats, Floats]:
     """Longest and shortest 1-sigma extent (n,) in windows, and the direction of the longest."""
-    flux = np.maximum(light.sum(axis=(1, 2)), 1e-9)
-    u = (light.sum(axis=1) * reach).sum(axis=1) / flux
-    v = (light.sum(axis=2) * reach).sum(axis=1) / flux
-    uu = (light.sum(axis=1) * reach**2).sum(axis=1) / flux - u * u
-    vv = (light.sum(axis=2) * reach**2).sum(axis=1) / flux - v * v
-    uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
+    along_u, along_v = (light.sum(axis=axis, dtype=np.float64) for axis in (1, 2))
+    flux = np.maximum(along_u.sum(axis=1), 1e-9)
+    u, v = along_u @ reach / flux, along_v @ reach / flux
+    uu, vv = along_u @ reach**2 / flux - u * u, along_v @ reach**2 / flux - v * v
+    uv = light @ reach @ reach / flux - u * v
     mean, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
     return (
         np.sqrt(np.maximum(mean + half, 0.0)),
