@@ -57,10 +57,11 @@ _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
 _NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
+_ONE_LENS = 0.3  # tangent of a half diagonal to which the lenses are the same within a pixel
 _OTHERS = 20, 80  # percentiles between which the focal lengths of one camera lie
 _SAME_FOCAL = 0.1  # error of a data sheet that needs no word
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
-_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 1e-3  # as of the first search of the estimate
+_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 0.1  # as of the first search of the estimate
 _FREE_ARCSEC = 7200.0  # of the rotation of an image, which trades with its principal point
 _FEWEST_STARS, _MORE_STARS = 30, 1.02  # of all images, and over those of the camera before
 _SIGMA_ARCSEC = 60.0  # of the rotations, above what refraction and aberration change in them
@@ -212,7 +213,7 @@ def count_of_stars(pixels: Pixels) -> int:
 
 
 def _count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
-    low, middle, high = np.percentile(pixels[::4, ::4], [10, 50, 90])
+    low, middle, high = np.percentile(pixels[::8, ::8], [10, 50, 90])
     brightest = sources.peak_dn[:_BRIGHTEST]
     # By day and by lamps the peaks are hardly above the rest of the picture.
     if not len(brightest) or np.median(brightest) - middle < _LEAST_CONTRAST * (high - low):
@@ -230,7 +231,9 @@ def _noise(pixels: Pixels) -> Floats:
     part = pixels[v : v + _NOISE_SIDE_PX, u : u + _NOISE_SIDE_PX].astype(np.float64)
     rows, columns = (side // 2 for side in part.shape)
     # Compression keeps little of the noise of single pixels.
-    binned = part[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+    part = part[: 2 * rows, : 2 * columns]
+    part = part[::2] + part[1::2]
+    binned = 0.25 * (part[:, ::2] + part[:, 1::2])
     noise = binned - uniform_filter(binned, 5)
     sigma = 1.4826 * float(np.median(np.abs(noise)))
     noise[np.abs(noise) > 3.0 * sigma] = 0.0
@@ -273,7 +276,10 @@ def _first_match(
 
 def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMatch:
     """A match of sources (n, 2), or the same with an equidistant lens where that shows more."""
-    if sky.camera.model == _EQUIDISTANT:
+    corner = (
+        0.5 * math.hypot(sky.camera.width, sky.camera.height) / float(sky.camera.parameters[0])
+    )
+    if sky.camera.model == _EQUIDISTANT or corner < _ONE_LENS:
         return sky
     # Without distortion: coefficients fitted to a perspective lens bend corners without stars.
     size, focal_px = (sky.camera.width, sky.camera.height), _focal_px(sky.camera, _EQUIDISTANT)

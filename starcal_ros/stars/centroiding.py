@@ -8,6 +8,7 @@ and the saturation level of `image_model`.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -305,7 +306,8 @@ def _without_neighbours(
     if not len(star):
         return stamps, parameters, done, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
-    separated = stamps
+    separated = stamps.select(np.empty(0, np.intp))
+    parameters, done = parameters.copy(), done.copy()
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
     light: Floats = np.zeros((len(star), stamps.width**2))
@@ -324,22 +326,24 @@ def _without_neighbours(
         lit = light.max(axis=1, initial=0.0) > little_dn
         # These include stars that get back light which was subtracted before.
         touched[star[lit]] = True
-        again = np.flatnonzero(touched)
-        neighbours = np.zeros((len(stamps), stamps.width**2))
-        np.add.at(neighbours, star[lit], light[lit])
+        # Few of the stars: passes over the windows of all would cost as much as these fits.
+        again = stamps.select(np.flatnonzero(touched))
+        neighbours = np.zeros((len(again), stamps.width**2))
+        np.add.at(neighbours, (np.cumsum(touched) - 1)[star[lit]], light[lit])
         # The light is subtracted, its photon noise stays.
-        separated = psf_fit.Stamps(
-            stamps.data_dn - neighbours.reshape(stamps.data_dn.shape),
-            sigma_px,
-            stamps.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
-            stamps.out,
-            stamps.streak_px,
+        separated = dataclasses.replace(
+            again,
+            data_dn=again.data_dn - neighbours.reshape(again.data_dn.shape),
+            noise2_dn2=again.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
         )
-        parameters, done = parameters.copy(), done.copy()
-        parameters[again], done[again] = psf_fit.approach(
-            separated.select(again), parameters[again], noise
+        parameters[touched], done[touched] = psf_fit.approach(
+            separated, parameters[touched], noise
         )
-    return separated, parameters, done, modelled
+    every = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape)
+    data_dn, noise2_dn2 = stamps.data_dn.copy(), every.copy()
+    data_dn[touched], noise2_dn2[touched] = separated.data_dn, separated.noise2_dn2
+    stamps = dataclasses.replace(stamps, data_dn=data_dn, noise2_dn2=noise2_dn2)
+    return stamps, parameters, done, modelled
 
 
 def _single_pixels(

@@ -32,7 +32,7 @@ _SPARSE_PX = 256
 _MOST_SLOPE = 0.05  # noise per pixel, over cells of 256 px: this slope pulls a star by 0.25 sigma
 _SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their pixels
 # Matched filter of detection; stars of 0.7 to 1.5 px lose under 10 % of S/N.
-_DETECTION_SIGMA_PX = 1.0
+_DETECTION_SIGMA_PX, _FILTER_PX = 1.0, (7, 7)
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
 NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
@@ -266,9 +266,9 @@ def detect(
     """
     height, width = pixels.shape
     level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
-    image: Singles = np.subtract(pixels, level, dtype=np.float32)
+    image: Singles = np.subtract(pixels, level, out=np.asarray(level, np.float32))
     filtered: Singles = np.asarray(
-        cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
+        cv2.GaussianBlur(image, _FILTER_PX, _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
         np.float32,
     )
     lowest = detection_sigma * NOISE_LEFT * float(background.noise_mesh.min())
@@ -336,7 +336,7 @@ def brightest_near(
         # filter carries over a joint.
         cv2.GaussianBlur(
             windows.reshape(-1, 2 * half + 1),
-            (7, 7),
+            _FILTER_PX,
             _DETECTION_SIGMA_PX,
             dst=filtered.reshape(-1, 2 * half + 1),
         )
@@ -408,15 +408,23 @@ def windows_inside(shape: tuple[int, ...], centre: Indices, radius: int) -> Mask
     return (u >= radius) & (u < width - radius) & (v >= radius) & (v < height - radius)
 
 
-def second_moments(light: Floats) -> tuple[Floats, Floats, Floats]:
+def centres(light: Floats | Singles) -> Floats:
+    """Centres (n, 2) of stamps (n, side, side) from their middles."""
+    reach = np.arange(light.shape[1], dtype=light.dtype) - light.shape[1] // 2
+    along = [light.sum(axis=axis) for axis in (1, 2)]
+    flux = np.maximum(along[0].sum(axis=1), 1e-9)
+    return np.stack([line @ reach / flux for line in along], axis=-1).astype(np.float64)
+
+
+def second_moments(light: Floats | Singles) -> tuple[Floats, Floats, Floats]:
     """Sums (n,), centres (n, 2) from the middles, second moments (n, 3) uu, vv, uv of stamps."""
-    reach = np.arange(light.shape[1]) - light.shape[1] // 2
-    across, down = light.sum(axis=1), light.sum(axis=2)
+    reach = np.arange(light.shape[1], dtype=np.float64) - light.shape[1] // 2
+    across, down = (light.sum(axis=axis, dtype=np.float64) for axis in (1, 2))
     total = across.sum(axis=1)
     flux = np.maximum(total, 1e-9)
     u, v = across @ reach / flux, down @ reach / flux
     uu, vv = across @ reach**2 / flux - u * u, down @ reach**2 / flux - v * v
-    uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
+    uv = light @ reach @ reach / flux - u * v
     return total, np.stack([u, v], axis=-1), np.stack([uu, vv, uv], axis=-1)
 
 

@@ -52,29 +52,29 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     found = detection.detect(pixels, background)
     centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
     stamps, outside = detection.stamps_at_edges(pixels, centre, _STAMP_PX)
-    light = stamps - background.level_at(centre)[:, None, None]
+    light = np.asarray(stamps - background.level_at(centre)[:, None, None], np.float32)
     light[outside | (light < 3.0 * background.noise_at(centre)[:, None, None])] = 0.0
-    reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
+    reach = np.arange(-_STAMP_PX, _STAMP_PX + 1, dtype=np.float32)
     # The second round is centred on the first centroid: neighbours at the rim then count less.
     offset: Floats = np.zeros((len(centre), 2))
     for radius_px in (4.0, 5.0):
-        u2, v2 = ((reach - offset[:, k, None]) ** 2 for k in (0, 1))
+        u2, v2 = (np.asarray((reach - offset[:, k, None]) ** 2, np.float32) for k in (0, 1))
         weight = light * (u2[:, None] + v2[:, :, None] <= radius_px**2)
-        _, offset, _ = detection.second_moments(weight)
-    total, _, moments_px2 = detection.second_moments(light)
-    uu, vv, uv = moments_px2.T
-    mean, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+        offset = detection.centres(weight)
+    total = light.sum(axis=(1, 2), dtype=np.float64)
     order = np.argsort(-total, kind='stable')
     order = order[total[order] > 0]
-    xy_px = (centre + offset)[order]
-    order = order[detection.apart(xy_px, _APART_PX)][:_KEPT]
+    order = order[detection.apart((centre + offset)[order], _APART_PX)][:_KEPT]
+    _, _, moments_px2 = detection.second_moments(light[order])
+    uu, vv, uv = moments_px2.T
+    mean, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
     return BrightSources(
         (centre + offset)[order],
         total[order],
-        stamps.max(axis=(1, 2))[order] if len(stamps) else total[order],
-        np.sqrt(np.maximum(mean + half, 0.0))[order],
-        np.sqrt(np.maximum(mean - half, 0.0))[order],
-        (0.5 * np.arctan2(2 * uv, uu - vv))[order],
+        stamps[order].max(axis=(1, 2), initial=0.0),
+        np.sqrt(np.maximum(mean + half, 0.0)),
+        np.sqrt(np.maximum(mean - half, 0.0)),
+        0.5 * np.arctan2(2 * uv, uu - vv),
         background,
     )
 

@@ -272,19 +272,17 @@ def _result(
     """Result of a fit with all sources that match it."""
     # Stars fainter than the sources would match only false ones.
     deepest = 2 * len(image.xy_px)
-    pairs = sky_fit.match(image, catalog, fit, max(radius_px, 1.5), deepest, 10_000)
-    xy_px = image.xy_px[pairs[:, 1]]
-    order = np.argsort(pairs[:, 0])
-    stars, placed = sky_fit.predicted(catalog, fit, deepest)
-    residual = xy_px[order] - placed[np.searchsorted(stars, pairs[order, 0])]
+    stars, placed_px = sky_fit.predicted(catalog, fit, deepest)
+    rank, source, apart_px = sky_fit.mutual(image, placed_px, max(radius_px, 1.5), 10_000)
+    xy_px = image.xy_px[source]
     return SkyMatch(
         camera_from_icrf=fit.camera_from_icrf,
         camera=fit.camera,
-        catalog_index=pairs[order, 0],
-        xy_px=(mirror(xy_px, image.camera.width) if mirrored else xy_px)[order],
+        catalog_index=stars[rank],
+        xy_px=mirror(xy_px, image.camera.width) if mirrored else xy_px,
         mirrored=mirrored,
         log10_p_value=log10_p,
-        residual_px=float(np.sqrt((residual**2).mean())),
+        residual_px=float(np.sqrt(0.5 * (apart_px**2).mean())),
     )
 
 

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import betainc
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import CameraModel, line_of_sight, project, rotation_jacobian
+from starcal_ros.camera import CameraModel, project, rotation_jacobian
 from starcal_ros.camera.lens import coefficient_jacobian, distort, ideal_points
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -33,6 +33,7 @@ _JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p
 _DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
 _LOOKS = 10.0  # number of independent tests among these depths, which share most stars
 _ORDERED = 30  # brightest matches whose order is judged: more would not change a verdict
+_LATER = np.triu(np.ones((_ORDERED, _ORDERED), bool), 1)
 _WIDEST_RAD = math.radians(80.0)  # largest half diagonal: sources are matched in a tangent plane
 _ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
 
@@ -70,15 +71,10 @@ class SourceImage:
         """Half of the diagonal, px."""
         return 0.5 * math.hypot(self.camera.width, self.camera.height)
 
-    @functools.cached_property
+    @property
     def half_diagonal_rad(self) -> float:
         """Mean angle of the corners from the axis of the prior camera."""
-        x, y = self.camera.width - 0.5, self.camera.height - 0.5
-        corners = np.array([[-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]])
-        cosine = line_of_sight(self.camera, corners)[:, 2]
-        # A corner that a strong distortion folds over has no line of sight.
-        seen = cosine[np.isfinite(cosine)]
-        return min(float(np.arccos(seen).mean()), _WIDEST_RAD) if len(seen) else _WIDEST_RAD
+        return min(self.camera.half_diagonal_rad, _WIDEST_RAD)
 
     @functools.cached_property
     def area_px2(self) -> float:
@@ -115,7 +111,7 @@ def refined(
         radius_px = max(part * half_px, 2.0)
         sources = int(_CROWDED * image.area_px2 / (math.pi * radius_px**2)) + 6
         stars, xy_px = predicted(catalog, fit, 2 * min(sources, len(image.xy_px)))
-        rank, source, _ = _mutual(image, xy_px, radius_px, sources)
+        rank, source, _ = mutual(image, xy_px, radius_px, sources)
         if _like_chance(image, rank, radius_px, sources):
             return None
         pairs = np.stack([stars[rank], source], axis=-1)
@@ -165,7 +161,7 @@ def match(
 ) -> Indices:
     """Pairs (k, 2) of catalog row and source that are mutually nearest within a radius."""
     stars, xy_px = predicted(catalog, fit, most_stars)
-    rank, source, _ = _mutual(image, xy_px, radius_px, most_sources)
+    rank, source, _ = mutual(image, xy_px, radius_px, most_sources)
     return np.stack([stars[rank], source], axis=-1)
 
 
@@ -187,22 +183,34 @@ def _pixels(fit: SkyFit, directions_icrs: Floats) -> Floats:
     return project(fit.camera, directions_icrs @ fit.camera_from_icrf.as_matrix().T)
 
 
-def _mutual(
+def mutual(
     image: SourceImage, xy_px: Floats, radius_px: float, most_sources: int
 ) -> tuple[Indices, Indices, Floats]:
     """Rows of the mutually nearest predictions (n, 2) and sources, and their distances, px."""
-    none = np.empty(0, np.int64)
-    seen = image.xy_px[:most_sources]
-    if len(xy_px) == 0 or len(seen) == 0:
-        return none, none, np.empty(0)
-    # Axis by axis: a sum over an axis of length two takes several times as long.
-    apart = (xy_px[:, 0, None] - seen[:, 0]) ** 2
-    apart += (xy_px[:, 1, None] - seen[:, 1]) ** 2
-    source = apart.argmin(axis=1)
-    rank = np.arange(len(xy_px))
-    nearest = apart[rank, source]
-    good = (apart.argmin(axis=0)[source] == rank) & (nearest < radius_px**2)
-    return rank[good], source[good], np.sqrt(nearest[good])
+    return _nearest(_apart(image, xy_px, radius_px), len(xy_px), most_sources)
+
+
+Apart = tuple[Indices, Indices, Floats]
+"""Rows of predictions and of sources, and their distances, px."""
+
+
+def _apart(image: SourceImage, xy_px: Floats, radius_px: float) -> Apart:
+    """All predictions (n, 2) and sources within a radius, in the order of the predictions."""
+    pairs = cKDTree(xy_px).sparse_distance_matrix(image.tree, radius_px, output_type='ndarray')
+    pairs = pairs[np.argsort(pairs['i'], kind='stable')]
+    return pairs['i'], pairs['j'], pairs['v']
+
+
+def _nearest(apart: Apart, most: int, most_sources: int) -> Apart:
+    """Those of the first predictions and sources that are mutually nearest."""
+    rank, source, apart_px = apart
+    among = (rank < most) & (source < most_sources)
+    rank, source, apart_px = rank[among], source[among], apart_px[among]
+    of_rank, of_source = np.full((2, max(most, most_sources)), np.inf)
+    np.minimum.at(of_rank, rank, apart_px)
+    np.minimum.at(of_source, source, apart_px)
+    good = (apart_px == of_rank[rank]) & (apart_px == of_source[source])
+    return rank[good], source[good], apart_px[good]
 
 
 def _step(
@@ -260,12 +268,17 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
     """
     _, xy_px = predicted(catalog, fit, _MOST_STARS)
     radii_px = np.array(_JUDGED_PX)
-    crowded = np.array([_crowded(image, xy_px, radius_px) for radius_px in _JUDGED_PX])
+    apart = _apart(image, xy_px, _ALONE * _JUDGED_PX[-1])
+    # Probability that another source lies within a radius, from the density about each star.
+    near = [np.bincount(apart[0][apart[2] < _ALONE * r], minlength=len(xy_px)) for r in _JUDGED_PX]
+    crowded = np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0)
+    close = apart[2] < _JUDGED_PX[-1]
+    apart = apart[0][close], apart[1][close], apart[2][close]
     positions = np.array([_log10_positions(image, radius_px) for radius_px in _JUDGED_PX])
     best, best_radius_px = math.inf, _JUDGED_PX[-1]
     for n in [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]:
         sources = min(len(image.xy_px), 4 * n)
-        _, source, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
+        _, source, apart_px = _nearest(apart, n, sources)
         hits = np.count_nonzero(apart_px < radii_px[:, None], axis=1)
         enough = np.flatnonzero(hits >= 5)
         if not len(enough):
@@ -285,12 +298,6 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
     return best, best_radius_px
 
 
-def _crowded(image: SourceImage, xy_px: Floats, radius_px: float) -> Floats:
-    """Probability (n,) that another source lies within a radius, from the density about it."""
-    near = image.tree.query_ball_point(xy_px, _ALONE * radius_px, return_length=True)
-    return np.asarray(np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0))
-
-
 def _chance_of_order(source: Indices) -> float:
     """
     Probability that matched sources are by chance as well sorted by brightness as these (k,).
@@ -300,8 +307,9 @@ def _chance_of_order(source: Indices) -> float:
     chance (Kendall 1938, Biometrika 30, 81).
     """
     brightest = source[:_ORDERED]
-    wrong = np.triu(brightest[:, None] > brightest[None], 1)
-    return float(_orderings(len(brightest))[np.count_nonzero(wrong)])
+    k = len(brightest)
+    wrong = (brightest[:, None] > brightest) & _LATER[:k, :k]
+    return float(_orderings(k)[np.count_nonzero(wrong)])
 
 
 @functools.lru_cache(maxsize=_ORDERED)
