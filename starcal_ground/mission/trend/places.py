@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _ETAGS = ('ETag', 'etag', 'md5Hash')  # of S3, Google and Azure
 _TIMES = ('LastModified', 'last_modified', 'updated', 'mtime', 'created')
 _LONGEST_REASON = 200
+_TOGETHER = 100_000  # files that are listed at once: 0.2 GB in the clients of stores
 ANSWER_S = 60.0  # for a request and all its repetitions
 LIST_S = 300.0  # for a list: a hundred requests in turn
 _SLOWEST = 64 * 1024  # bytes a second of the largest file
@@ -66,8 +67,9 @@ def listings(root: str) -> Iterator[list[Entry]]:
     """
     Files below a root in lists, each with all files of a folder or none; raises OSError.
 
-    A local list is that of one folder, that of a store has all files below the root: 2 kB each in
-    its client.
+    A local list is that of one folder.  A request to a store lists 1000 files below one folder, so
+    a list is that of all files below a subfolder of the root (of the first folder with several),
+    or of all files below the root where they are fewer than about 100,000.
     """
     if not is_remote(root):
         for folder, folders, files in os.walk(root):
@@ -78,8 +80,21 @@ def listings(root: str) -> Iterator[list[Entry]]:
         return
     with _remote(root) as (fs, base):
         fs.invalidate_cache()
-        found = fs.find(base, detail=True, **_within(fs, LIST_S))
-        yield _remote_entries(fs, base, found)
+        limits = {'detail': True, **_within(fs, LIST_S)}
+        top, infos = base, fs.ls(base, **limits)
+        # The marker of an empty folder has the name of the folder.
+        while [i['type'] for i in infos] == ['directory'] and len(infos[0]['name']) > len(top):
+            top = infos[0]['name']
+            infos = fs.ls(top, **limits)
+        below = [info['name'] for info in infos if info['type'] == 'directory']
+        if not below or len(below) * len(fs.find(below[0], **limits)) < _TOGETHER:
+            yield _remote_entries(fs, base, fs.find(top, **limits))
+            return
+        files_here = {info['name']: info for info in infos if info['type'] != 'directory'}
+        yield _remote_entries(fs, base, files_here)
+        for folder in below:
+            fs.invalidate_cache()  # it keeps each listing
+            yield _remote_entries(fs, base, fs.find(folder, **limits))
 
 
 def exists(place: str) -> bool:

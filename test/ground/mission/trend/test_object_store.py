@@ -230,8 +230,11 @@ def test_a_store_that_falls_silent_ends_the_run(
     assert '1 new, 1 known, 0 failed' in capsys.readouterr().out
 
 
-def test_a_bucket_is_listed_in_one_request(store: Store) -> None:
-    (entries,) = places.listings('s3://archive')
-    assert len(entries) == 4
-    (request,) = store.requests
-    assert 'list-type=2' in request
+def test_a_bucket_is_listed_by_folders_with_a_request_each(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(places, '_TOGETHER', 1)
+    assert [len(found) for found in places.listings('s3://archive')] == [0, 2, 2]
+    # The bucket, its one folder, a probe of the first folder below it; then each of these.
+    assert len(store.requests) == 5
+    assert all('list-type=2' in line for line in store.requests)
