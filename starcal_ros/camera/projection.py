@@ -189,6 +189,11 @@ def check_plausible(camera: CameraModel) -> None:
     for name, centre_px, size in (('cx', cx, width), ('cy', cy, height)):
         if not -0.5 * size < centre_px < 1.5 * size:
             raise ValueError(f'{name}: {centre_px:.6g} px is far outside of the {size} px')
+    if 0 < abs(cx) < 0.05 * width and 0 < abs(cy) < 0.05 * height:
+        raise ValueError(
+            f'cx, cy: ({cx:.6g}, {cy:.6g}) is in the first corner of an image of {width} x'
+            f' {height}; is it in mm? give it in pixels'
+        )
     coefficients = camera.distortion
     if (np.abs(coefficients) > _MAX_COEFFICIENT).any() or _part_seen(camera) < _SEEN:
         raise ValueError(

@@ -62,11 +62,6 @@ class _CameraInfo:
         parameters = np.r_[fx, skew, fy, cx, cy, distortion]
         camera = CameraModel(self.image_width, self.image_height, parameters, model)
         check_plausible(camera)
-        if 0 < abs(cx) < 0.05 * camera.width and 0 < abs(cy) < 0.05 * camera.height:
-            raise ValueError(
-                f'cx, cy: ({cx:.6g}, {cy:.6g}) is in the first corner of an image of'
-                f' {camera.width} x {camera.height}; is it in mm? give it in pixels'
-            )
         return camera
 
 

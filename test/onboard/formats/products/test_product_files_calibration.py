@@ -67,7 +67,7 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
-    fx=st.floats(1e3, 6e5),
+    fx=st.floats(1e3, 1e7),
     others=st.lists(st.floats(-1e-3, 1e-3), min_size=8, max_size=8),
     covariance=st.lists(finite, min_size=169, max_size=169),
     quaternion=st.tuples(*[st.floats(0.1, 1.0)] * 4),
