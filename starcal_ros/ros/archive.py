@@ -63,9 +63,10 @@ _EMPTIED = 'ensemble.emptied'
 _REFUSED = 'refused.json'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
-# Numbers in the names of files that are not read count as given too, but for longer ones: after
-# those there would be none.
+# Numbers in the names of files that are not read count as given up to this one: a calibrator does
+# not reach it, and a file with a longer number would leave none for those after it.
 _NUMBERED = re.compile(r'\.?(\d{8})[._]')
+_LAST_NUMBER = 999_999_999
 _MOST_BYTES = 64 << 20  # of a file: an image of 10,000 stars has 1 MB
 _MOST_COUNT = 2**32 - 1  # of refused images: that of the message
 _LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
@@ -215,7 +216,8 @@ class Archive:
         self._events: dict[int, Path] = {}  # those on disk
         self._lock = _locked(folder)
         self._finish_emptying()
-        for stale in folder.glob(f'*/.*{PART}'):
+        # That of `ros2 bag reindex` would hide the images after it from readers of the folder.
+        for stale in (*folder.glob(f'*/.*{PART}'), folder / _ENSEMBLE / 'metadata.yaml'):
             with contextlib.suppress(OSError):
                 stale.unlink()
 
@@ -312,6 +314,7 @@ class Archive:
     def _keep_event(self, record: Activation) -> None:
         if record.event in self._events:
             return
+        _check_number(record.event)
         content = {
             **product_files.calibration_content(record.calibration),
             'archive': json_object(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
@@ -327,6 +330,7 @@ class Archive:
             stale.path.unlink(missing_ok=True)
             del self._images[image.time_ns]
         number = self._next_image
+        _check_number(number)
         try:
             data = observations_bag(TOPIC, image, self._frame_id)
         except BagError as error:
@@ -519,6 +523,14 @@ def _free_name(path: Path) -> Path:
         [path], (path.with_name(f'{path.name}{k}') for k in itertools.count(2))
     )
     return next(name for name in names if not os.path.lexists(name))
+
+
+def _check_number(number: int) -> None:
+    if number > _LAST_NUMBER:
+        raise ArchiveError(
+            f'state_dir: number {number} has too many digits; move the files with the highest '
+            'numbers to another place'
+        )
 
 
 def _locked(folder: Path) -> int:

@@ -51,7 +51,7 @@ _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _TIMEOUT_S = 5.0  # of set_camera_info, and of its answer: a driver may write to flash memory
 _LOOK_S = 0.5  # period of checks for the service and the timeout
-_LONGEST_PAUSE_S = 300.0  # between two attempts at a driver that does not answer
+_LONGEST_PAUSE_S = 300.0  # beyond the time limit, before a driver is called again
 _RETRY_S = 1.0  # after a failed write
 _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB

@@ -70,6 +70,28 @@ def test_the_ensemble_is_a_bag(tmp_path: Path) -> None:
     assert [one.time_ns for one in found] == [one.time_ns for one in images()[:12]]
 
 
+def test_no_metadata_lacks_an_image(tmp_path: Path) -> None:
+    """A description that another program left is removed: all images are read."""
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:2]), ())
+    (tmp_path / 'ensemble/metadata.yaml').write_text('of ros2 bag reindex')
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble((*archive.read_ensemble().images, images()[2])), ())
+    assert len(list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))) == 3
+
+
+def test_the_last_number_ends_with_the_remedy(tmp_path: Path) -> None:
+    """A file of a longer number would not be read again."""
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:1]), ())
+    (path,) = (tmp_path / 'ensemble').glob('*.mcap')
+    path.rename(path.with_name('999999999.mcap'))
+    with opened(tmp_path) as archive:
+        kept = archive.read_ensemble().images
+        with pytest.raises(ArchiveError, match='move the files with the highest numbers'):
+            archive.keep(Ensemble((*kept, images()[1])), ())
+
+
 def test_what_goes_from_the_ensemble_goes_from_the_disk(tmp_path: Path) -> None:
     with opened(tmp_path) as archive:
         archive.keep(Ensemble(images()[:4], {'no_stars': 1}), ())

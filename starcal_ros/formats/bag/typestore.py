@@ -57,7 +57,8 @@ def typestore_of(type_name: str, definition: str) -> Typestore:
     """
     Types by the definition in a bag, if another version of starcal wrote it; else `typestore`.
 
-    A definition that `check_definition` refuses is not taken: the message then is not readable.
+    A definition that `check_definition` refuses is not taken: the message is then decoded as one
+    of this version, which mostly fails.
     """
     own = typestore()
     is_own = type_name.startswith('starcal/') and type_name in own.types
@@ -77,8 +78,8 @@ def check_definition(type_name: str, definition: str) -> dict[str, Any]:
     Types of a definition that differs from that of this version in its fields alone.
 
     Code is generated from it.  Fields may lack, and others may be added that are numbers, texts or
-    lists of them.  Raises ValueError for any other difference, and exceptions of any class for
-    what is no definition.
+    lists of them without a fixed length.  Raises ValueError for any other difference, and
+    exceptions of any class for what is no definition.
     """
     if len(definition) > _MOST_CHARACTERS:
         raise ValueError(f'longer than {_MOST_CHARACTERS} characters')

@@ -209,7 +209,9 @@ def _nearest(apart: Apart, most: int, most_sources: int) -> Apart:
     of_rank, of_source = np.full((2, max(most, most_sources)), np.inf)
     np.minimum.at(of_rank, rank, apart_px)
     np.minimum.at(of_source, source, apart_px)
-    good = (apart_px == of_rank[rank]) & (apart_px == of_source[source])
+    good = np.flatnonzero((apart_px == of_rank[rank]) & (apart_px == of_source[source]))
+    # Of stars at one place, as in catalogs of doubles, the brightest.
+    good = np.sort(good[np.unique(source[good], return_index=True)[1]])
     return rank[good], source[good], apart_px[good]
 
 

@@ -119,11 +119,11 @@ def test_streaks_that_are_measured_are_identified_too(
 ) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '4']
+    line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '5']
     assert main(line) == 0
     capsys.readouterr()
-    assert main(['calibrate', str(bag), '-o', str(out), '--no-report']) in (0, 3)
-    assert '4 of 4 images identified by their stars' in capsys.readouterr().err
+    assert main(['calibrate', str(bag), '-o', str(out), '--no-report']) == 0
+    assert '5 of 5 images identified by their stars' in capsys.readouterr().err
     calibration = read_calibration(out / 'calibration.json')
     truth = json.loads((bag / 'truth.json').read_text())['k_true'][0]
     # One draw: 4 sigma are exceeded once in 16,000.

@@ -214,8 +214,8 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); on the ground state the site (observer); in '
-                'space estimate with temperature'
+                'of 0.2 px (max_image_variation_px); on the ground state the site (observer); '
+                'else use temperatures, or one focus'
             ),
         ),
         (
@@ -463,7 +463,7 @@ def test_the_cause_comes_before_the_statistics() -> None:
         ),
     )
     given = reasons(found, GateOptions())
-    assert 'on the ground state the site' in given[0]
+    assert '(max_image_variation_px)' in given[0]
     assert limits_in(given)[-1] == 'max_cross_validated_residual'
     # One part of the data and what to do, not a list of eighteen.
     assert len(given[-1]) < 200

@@ -22,12 +22,13 @@ from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.calibrate import residuals_px
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.problem import Problem
 from starcal_ros.estimation.search import minimise, Minimum, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.records import Ensemble
+from studies.trials import shared_covariance
 
 Residuals = Callable[[np.ndarray], np.ndarray]
 
@@ -149,18 +150,25 @@ def jacobian(residuals: Residuals, unit: np.ndarray) -> np.ndarray:
     return np.asarray(np.stack(columns, axis=-1) / unit)
 
 
-def covariance(minimum: Minimum) -> np.ndarray:
-    """Covariance of the shared unknowns, the images eliminated."""
-    normal = minimum.normal
-    hidden = np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
-    return inverse(normal.A - hidden)
-
-
 def unit_of(minimum: Minimum, images: int) -> np.ndarray:
     """About one sigma of each unknown."""
-    sigma = np.sqrt(np.diag(covariance(minimum)))
+    sigma = np.sqrt(np.diag(shared_covariance(minimum.normal)))
     angle = sigma[len(FREE) + len(minimum.state.focal) :][:3].min()
     return np.asarray(np.r_[sigma, np.full(3 * images, angle)])
+
+
+def test_residuals_are_measured_minus_predicted() -> None:
+    problem, minimum = searched(ensemble(), EIGHT)
+    table, state = star_table(ensemble().images), minimum.state
+    residual_px = residuals_px(problem, state, table)
+    rotations = state.camera_from_icrf.as_matrix()
+    for k in (0, 17, 40, len(table) - 1):
+        direction_camera = rotations[table.image[k]] @ table.direction_icrf[k]
+        (expected_px,) = table.measured_px[k] - predicted_px(
+            state.parameters, direction_camera[None]
+        )
+        # Roundings of 1000 px.
+        np.testing.assert_allclose(residual_px[k], expected_px, rtol=0, atol=1e-10)
 
 
 def test_the_same_minimum() -> None:
@@ -191,7 +199,7 @@ def test_the_same_covariance(thermal: bool) -> None:
     # One Gauss-Newton step of the dense problem goes nowhere: the same minimum.
     step = dense @ (J.T @ residuals(np.zeros(len(unit)))) / np.sqrt(np.diag(dense))
     assert np.abs(step).max() < 1e-4
-    ours = covariance(minimum)
+    ours = shared_covariance(minimum.normal)
     n = len(ours)
     dense = (dense * np.outer(unit, unit))[:n, :n]
     sigma = np.sqrt(np.diag(dense))
@@ -204,7 +212,7 @@ def test_the_same_covariance(thermal: bool) -> None:
 def test_the_prior_of_the_tracker_is_in_the_cost() -> None:
     # With a tighter tracker the alignment is another one.
     sigmas = [
-        np.sqrt(np.diag(covariance(searched(ensemble(), options)[1])))[-3]
+        np.sqrt(np.diag(shared_covariance(searched(ensemble(), options)[1].normal)))[-3]
         for options in (
             dataclasses.replace(EIGHT, star_tracker_sigma_arcsec=(size,) * 3)
             for size in (0.1, 3600.0)

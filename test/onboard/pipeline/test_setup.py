@@ -103,6 +103,8 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
     load_setup(values(camera_yaml, autostart=False))
     with pytest.raises(OptionError, match='autstart: no such parameter .did you mean autostart'):
         load_setup(values(camera_yaml, autstart=False))
+    with pytest.raises(OptionError, match='autostart: .*maybe'):
+        load_setup(values(camera_yaml, autostart='maybe'))
 
 
 def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(

@@ -37,6 +37,7 @@ from starcal_ros.identification.blind.search import (
 from starcal_ros.identification.blind.sky_fit import (
     _chance_of_order,
     FOUND,
+    mutual,
     Ranges,
     SourceImage,
     STATED,
@@ -182,6 +183,14 @@ def test_the_index_has_all_patterns_of_the_brightest_stars_of_each_disc(
     order, shape = shapes(catalog.direction_icrs[index.quads[index.grid.rows]])
     same = (order == np.arange(4)).all(axis=1) & (abs(index.grid.shape - shape) < 1e-3).all(axis=1)
     assert same.mean() > 0.9999  # two orders may be equal to rounding
+
+
+def test_of_stars_at_one_place_the_brightest_matches() -> None:
+    image = SourceImage(np.array([[10.0, 10.0], [50.0, 50.0]]), camera(15))
+    predicted_px = np.array([[50.2, 50.0], [10.0, 10.1], [50.2, 50.0]])
+    rank, source, apart_px = mutual(image, predicted_px, 2.0, 10)
+    assert rank.tolist() == [0, 1] and source.tolist() == [1, 0]
+    np.testing.assert_allclose(apart_px, [0.2, 0.1], rtol=0, atol=1e-9)
 
 
 def test_the_chance_of_an_order_is_that_among_all_permutations() -> None:
