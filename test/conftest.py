@@ -273,6 +273,11 @@ def few_images(made_once: MadeOnce) -> Path:
 
         few = dataclasses.replace(scenario.scenario('tiny'), image_count=3)
         simulated_bag.write_bag(few, folder / 'tiny')
+        params = folder / 'tiny/params.yaml'
+        # The folder is renamed once it is whole: the camera is named relative to the parameters.
+        text = params.read_text().replace(f'file://{folder.resolve()}/tiny/', '')
+        assert 'camera_info_url: camera.yaml' in text
+        params.write_text(text)
 
     return made_once('few', write) / 'tiny'
 
