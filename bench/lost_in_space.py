@@ -61,7 +61,7 @@ class Frame:
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """Frames to be found, then random points; hours, or some minutes."""
+    """Frames to be found, then random points."""
     count, scrambled = (5, 20) if quick else (FRAMES, SCRAMBLED)
     catalog = load_catalog()
     yield found(catalog, count)

@@ -236,12 +236,6 @@ def _rows(estimate: Estimate) -> Indices:
     return estimate.linear.layout.of(['camera', 'alignment', 'field'])
 
 
-def _with(errors: ErrorParts, T: Floats, seen: _Seen) -> Floats:
-    """Return the variances (k,) of the estimator of the root ``L T``."""
-    inner = np.eye(T.shape[1]) + T.T @ errors.excess @ T
-    return seen.variances(T @ inner @ T.T)
-
-
 def _gain(errors: ErrorParts, T: Floats, seen: _Seen) -> Floats:
     """Return the variances (k,) that the estimator of the root ``L T`` does not have."""
     inner = np.eye(T.shape[1]) + T.T @ errors.excess @ T

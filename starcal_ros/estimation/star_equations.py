@@ -28,8 +28,7 @@ from starcal_ros.camera.lens import (
 )
 from starcal_ros.records import StarObservations
 
-# Rows and columns of the matrix of an image; the camera's are as many as the model has parameters.
-CAMERA = slice(0, -4)
+# Rows and columns of the matrix of an image, after those of the camera.
 ROTATION = slice(-4, -1)
 RESIDUAL = -1
 _MOST_TURNS = 64  # unknowns that turn the lines of sight: velocity, site, read-out and others

@@ -178,7 +178,7 @@ def test_known_unknowns_leave_their_schur_complement(names: list[str]) -> None:
     left = C - C[:, known] @ np.linalg.pinv(C[np.ix_(known, known)], rcond=1e-12) @ C[known]
     np.testing.assert_allclose(root @ T @ T.T @ root.T, left, atol=1e-6)
     seen = budget._Seen(np.stack([root.T @ root] * 2), root.reshape(1, -1, root.shape[1]))
-    np.testing.assert_allclose(budget._with(bare, T, seen), np.trace(left), rtol=1e-6)
+    np.testing.assert_allclose(budget._gain(bare, T, seen), np.trace(C - left), rtol=1e-6)
 
 
 def test_known_unknowns_do_not_depend_on_their_units() -> None:
