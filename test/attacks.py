@@ -30,7 +30,7 @@ from starcal_ros.records import Calibration, Ensemble, StarObservations
 
 BAG = Path(__file__).parents[1] / 'bags' / 'tiny'
 # A case that takes longer counts as a hang; processor time, since the machine may be busy.
-LONGEST_S = 5.0
+LONGEST_S = 60.0
 
 
 def many(count: int) -> int:

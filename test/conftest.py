@@ -28,7 +28,7 @@ import pytest
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
-SLOW_S = 5.0  # of processor time: more than a test of one second takes on any machine
+SLOW_S = 5.0  # of processor time: more than a test of one second takes on most machines
 FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 # Files of ten seconds and more, longest first: at the end, one of them would keep one worker while
@@ -77,12 +77,23 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
-    """Fail a test that takes `SLOW_S` of processor time and is not marked ``slow``."""
+    """Note a test that takes `SLOW_S` of processor time and is not marked ``slow``."""
     before_s = sum(os.times()[:4])
     yield
     took_s = sum(os.times()[:4]) - before_s
     if took_s > SLOW_S and not {'slow', 'nodes'} & {mark.name for mark in item.iter_markers()}:
-        pytest.fail(f'mark it slow: it took {took_s:.1f} s of processor time', pytrace=False)
+        item.user_properties.append(('to_mark_slow_s', took_s))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name those tests; none fails, since a busy machine makes every test slow."""
+    for report in terminalreporter.getreports('passed'):
+        if report.when == 'call':
+            for name, took_s in report.user_properties:
+                if name == 'to_mark_slow_s':
+                    terminalreporter.write_line(
+                        f'mark it slow: {report.nodeid} took {took_s:.1f} s of processor time'
+                    )
 
 
 MadeOnce = Callable[[str, Callable[[Path], object]], Path]

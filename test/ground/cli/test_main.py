@@ -16,7 +16,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
@@ -72,12 +71,10 @@ def test_version(run: Run) -> None:
 
 
 def test_help_is_there_at_once() -> None:
-    start = time.monotonic()
     done = subprocess.run(
         [sys.executable, '-X', 'importtime', '-m', 'starcal_ground.cli.main', '--help'],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    assert time.monotonic() - start < 10  # only so that a hang is noticed
     for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
         assert command in done.stdout
     for heavy in ('numpy', 'scipy', 'cv2', 'contourpy', 'rclpy', 'rich', 'argcomplete'):

@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 from pathlib import Path
 import shutil
-import time
 
 import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
@@ -38,30 +37,6 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(fleet, 'compute', unread)
     assert trend(mission) == 0
     assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_three_thousand_known_files_are_passed_over_in_6_s(tmp_path: Path) -> None:
-    """The limit of the bench of fleets is 20 s for ten thousand; this one takes a second."""
-    write(tmp_path / 'one', 1)
-    content = (tmp_path / 'one/calibration.json').read_bytes()
-    for k in range(3_000):
-        (tmp_path / f'fleet/{k:05d}').mkdir(parents=True)
-        (tmp_path / f'fleet/{k:05d}/calibration.json').write_bytes(content)
-    found = list(fleet.find(str(tmp_path / 'fleet'), Cameras()))
-    (task,) = fleet.find(str(tmp_path / 'one'), Cameras())
-    first = fleet.compute(task).row
-    assert first
-    (tmp_path / 'out').mkdir()
-    table = Table(tmp_path / 'out')
-    with table.transaction():
-        for k, task in enumerate(found):
-            table.add(dataclasses.replace(first, key=f'{k:064d}'[::-1], stamp=task.stamp))
-    start_s = time.process_time()
-    again = list(fleet.find(str(tmp_path / 'fleet'), Cameras()))
-    done = fleet.update(Table(tmp_path / 'out'), again)
-    assert done == fleet.Done(known=3_000)
-    assert time.process_time() - start_s < 6.0
 
 
 def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(
