@@ -230,8 +230,8 @@ def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'mixed') as writer:
         writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
         writer.write('/image', IMAGE_TYPE, 7, bad)
-        number, _ = writer.messages._channels['/image']
-        writer.messages._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
+        number, _ = writer._channels['/image']
+        writer._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
         writer.write_image('/image', Image(9, np.zeros((2, 3), np.uint8)), '')
     first, second, third, last = images_of(tmp_path / 'mixed', stamp_offset_s=1e-9)
     assert isinstance(first, Image) and first.time_ns == 7
