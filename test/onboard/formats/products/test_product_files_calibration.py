@@ -183,7 +183,9 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
         (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
         (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
-        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not at least 0'),
+        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
+        # No message can hold it, so that a calibrator could not publish it.
+        (lambda c: c.update(iterations=2**32), 'iterations: 4294967296 is not within 0 to '),
         (lambda c: c.update(images_used=2**70), 'images_used: .* is not within 64 bit'),
         (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
         (lambda c: c.update(residual_rms_px=True), 'residual_rms_px: True is not a number'),
