@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections import Counter
 import contextlib
 from pathlib import Path
-import sys
 from types import TracebackType
 from typing import IO, TYPE_CHECKING
 
@@ -19,6 +18,7 @@ from starcal_ros.files import replacing
 from starcal_ros.formats.bag import writer as mcap
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages import message_codec as codec
+from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.record_messages import observations_to_message
 from starcal_ros.records import Image, StarObservations
 
@@ -172,18 +172,7 @@ class BagWriter:
 
 def image_to_message(image: Image, frame_id: str, make: codec.Make) -> codec.Message:
     """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
-    pixels = np.ascontiguousarray(image.pixels)
-    height, width = pixels.shape
-    return make(
-        codec.IMAGE_TYPE,
-        header=codec.make_header(image.time_ns, frame_id, make),
-        height=height,
-        width=width,
-        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
-        is_bigendian=int(sys.byteorder == 'big'),
-        step=width * pixels.itemsize,
-        data=pixels.reshape(-1).view(np.uint8),
-    )
+    return sensor_messages.image_to_message(image.time_ns, image.pixels, frame_id, make)
 
 
 def attitude_to_message(

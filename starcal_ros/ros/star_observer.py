@@ -430,7 +430,7 @@ class StarObserver(StarcalNode):
         picture = annotation.annotate(image, observations, geometry)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
-            sensor_messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
+            sensor_messages.image_to_message(image.time_ns, picture, frame_id, make_message)
         )
 
 
