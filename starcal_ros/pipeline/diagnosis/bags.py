@@ -91,17 +91,6 @@ def diagnose_bags(
     return of_refusals(by_itself, count) or diagnosis
 
 
-def of_a_failure(
-    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused]
-) -> Diagnosis | None:
-    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
-    try:
-        diagnosis = diagnose_bags(paths, requested, setup, refused)
-    except BagError:
-        return None
-    return None if diagnosis.cause == 'none' else diagnosis
-
-
 def aligned_by_bags(paths: Sequence[Path], requested: Topics, setup: Setup) -> tuple[Setup, str]:
     """
     A setup with the alignment that the images show, since none is given, and a sentence on it.

@@ -318,12 +318,6 @@ class Diagnosis:
     also: tuple[str, ...] = ()
     images: int = 0
 
-    def in_lines(self) -> list[str]:
-        """The sentence, the evidence and the remedy, as lines for a terminal."""
-        lines = [self.sentence, '', 'evidence:', *(f'  {line}' for line in self.evidence)]
-        mend = ['', 'in the parameter file:', *(f'  {line}' for line in self.mend)]
-        return lines + mend if self.mend else lines
-
     def in_a_sentence(self, command: str = 'starcal diagnose') -> str:
         """Cause and remedy, as the end of a complaint; ``command`` gives the evidence, if any."""
         said = [self.sentence]
