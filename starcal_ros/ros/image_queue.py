@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.pipeline.diagnosis.diagnose import (
@@ -45,7 +44,6 @@ _MORE = 2  # times the longest of them: it has fallen silent
 KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
 DIAGNOSED = 5  # images in a row without a match
 _LOWEST_PRIORITY = 19  # of a diagnosis that no image waits for
-_ATTITUDES = 20_000  # of the last minutes, for the search of a shift of clocks
 
 
 @dataclass(frozen=True)
@@ -294,12 +292,13 @@ class Unmatched:
     a prior alignment after each image from the third on.  Safe to use from several threads.
     """
 
-    def __init__(self, setup: Setup, on_answer: Callable[[Diagnosis], None]) -> None:
-        self._setup = setup
+    def __init__(
+        self, setup: Setup, attitudes: AttitudeHistory, on_answer: Callable[[Diagnosis], None]
+    ) -> None:
+        self._setup, self._attitudes = setup, attitudes
         self._on_answer = on_answer
         self._lock = threading.Lock()
         self._images: deque[Image] = deque(maxlen=KEPT)
-        self._attitudes: deque[tuple[int, Floats]] = deque(maxlen=_ATTITUDES)
         self._in_a_row = 0
         self._next = DIAGNOSED if setup.is_aligned else IMAGES_OF_AN_ALIGNMENT
         self._process: ChildProcess | None = None
@@ -312,11 +311,6 @@ class Unmatched:
         """Why the last images matched nothing; None: not asked yet, or they match again."""
         with self._lock:
             return self._diagnosis
-
-    def add_attitude(self, time_ns: int, quaternion: Floats) -> None:
-        """Keep an attitude as it was sent."""
-        with self._lock:
-            self._attitudes.append((time_ns, quaternion))
 
     def matched(self) -> None:
         """Forget the diagnosis: an image matched."""
@@ -333,12 +327,9 @@ class Unmatched:
             if busy or self._in_a_row < self._next:
                 return
             self._next = 2 * self._in_a_row if self._setup.is_aligned else self._in_a_row + 1
-            stamps, quaternions = (
-                zip(*self._attitudes, strict=True) if self._attitudes else ((), ())
-            )
             question = (
                 tuple(self._images),
-                wire_attitudes(stamps, quaternions),
+                wire_attitudes(self._attitudes, self._setup.attitude.attitude_direction),
                 dataclasses.replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
             )
             self._thread = threading.Thread(
