@@ -156,42 +156,34 @@ class Recent:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._start_s = clock_s()
-        self._times_s: deque[float] = deque(maxlen=_MOST)
-        self._values: deque[float] = deque(maxlen=_MOST)
+        self._numbers: deque[tuple[float, float]] = deque(maxlen=_MOST)  # times, s, and values
         self._lock = threading.Lock()
 
     def add(self, value: float) -> None:
         """Add a number that has just arrived."""
         with self._lock:
-            self._forget()
-            self._times_s.append(self._clock_s())
-            self._values.append(value)
+            self._numbers.append((self._clock_s(), value))
 
     def rate_hz(self) -> float:
         """Numbers per second in the window, or since the start if that is shorter."""
-        with self._lock:
-            now_s = self._forget()
-            passed_s = min(now_s - self._start_s, WINDOW_S)
-            return len(self._times_s) / passed_s if passed_s > 0 else 0.0
+        passed_s = min(self._clock_s() - self._start_s, WINDOW_S)
+        return len(self._values()) / passed_s if passed_s > 0 else 0.0
 
     def median(self) -> float | None:
         """Median; None without numbers."""
-        with self._lock:
-            self._forget()
-            return float(np.median(self._values)) if self._values else None
+        values = self._values()
+        return float(np.median(values)) if values else None
 
     def largest(self) -> float | None:
         """Largest number; None without numbers."""
-        with self._lock:
-            self._forget()
-            return max(self._values, default=None)
+        return max(self._values(), default=None)
 
-    def _forget(self) -> float:
-        now_s = self._clock_s()
-        while self._times_s and self._times_s[0] < now_s - WINDOW_S:
-            self._times_s.popleft()
-            self._values.popleft()
-        return now_s
+    def _values(self) -> list[float]:
+        """Numbers in the window; those before it are forgotten."""
+        with self._lock:
+            while self._numbers and self._numbers[0][0] < self._clock_s() - WINDOW_S:
+                self._numbers.popleft()
+            return [value for _, value in self._numbers]
 
 
 class StarTrackers:
