@@ -77,7 +77,7 @@ def attitude_sample(
 
 
 def with_direction(xyzw: Floats, direction: str) -> Floats:
-    """Quaternions (..., 4) of a message as `st_to_inertial`, or of these as the message's."""
+    """Quaternions (..., 4) of messages as ``icrf_from_star_tracker``, or those as messages."""
     return xyzw * [-1.0, -1.0, -1.0, 1.0] if direction == 'inertial_to_st' else xyzw
 
 
