@@ -9,7 +9,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table, movement
 from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
@@ -23,12 +22,22 @@ from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
 from starcal_ros.estimation.unknowns import unknowns_in_state
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    CameraGeometry,
+    Correlation,
+    DetectorMaps,
+    Ensemble,
+    EnsembleStatus,
+    MapCovariance,
+    StarObservations,
+)
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
 MAP_ROWS, MAP_COLS = 16, 20  # enough for a polynomial surface of degree seven
 
 
-def coverage(ensemble: records.Ensemble, camera: CameraModel) -> NDArray[np.int64]:
+def coverage(ensemble: Ensemble, camera: CameraModel) -> NDArray[np.int64]:
     """Count of star observations in each focal-plane cell, (8, 10)."""
     return stars_in_cells(star_table(ensemble.images).measured_px, camera)
 
@@ -45,9 +54,7 @@ def stars_in_cells(pixels: Floats, camera: CameraModel) -> NDArray[np.int64]:
 
 
 def image_information(
-    images: tuple[records.StarObservations, ...],
-    prior: records.CameraGeometry,
-    options: CalibrationOptions,
+    images: tuple[StarObservations, ...], prior: CameraGeometry, options: CalibrationOptions
 ) -> Floats:
     """
     Information (m, k, k) of each image on the k unknowns that all images share, at the prior.
@@ -56,7 +63,7 @@ def image_information(
     and the alignment if the method has one; the rotation of the image is eliminated.  An image
     with fewer than three stars in front of the camera has zero information.
     """
-    ensemble = records.Ensemble(images)
+    ensemble = Ensemble(images)
     order, with_rate = _supported_terms(ensemble, options)
     problem, state, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
     layout = unknowns_in_state(problem, state)
@@ -69,17 +76,17 @@ def image_information(
 def estimated_names(options: CalibrationOptions, model: str) -> tuple[str, ...]:
     """Names of the estimated unknowns: camera, temperature terms, alignment, alignment rate."""
     estimated_names = set(estimated_parameters(options, model))
-    rate = records.ALIGNMENT_NAMES if options.alignment_temperature else ()
+    rate = ALIGNMENT_NAMES if options.alignment_temperature else ()
     return (
         *(name for name in parameter_names(model) if name in estimated_names),
         *(f'focal_temperature_{i + 1}' for i in range(options.focal_temperature_order)),
-        *records.ALIGNMENT_NAMES,
+        *ALIGNMENT_NAMES,
         *(f'{name}_temperature' for name in rate),
     )
 
 
 def predicted_sigma(
-    ensemble: records.Ensemble, prior: records.CameraGeometry, options: CalibrationOptions
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Floats:
     """
     1-sigma (k,) of `estimated_names` that a calibration would report, predicted at the prior.
@@ -99,7 +106,7 @@ def predicted_sigma(
     return np.array([found.get(name, np.inf) for name in names])
 
 
-def _supported_terms(ensemble: records.Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
+def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
     """Order of the focal terms, and True for an alignment rate: if requested and supported."""
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
@@ -109,8 +116,8 @@ def _supported_terms(ensemble: records.Ensemble, options: CalibrationOptions) ->
 
 
 def _at_the_prior(
-    ensemble: records.Ensemble,
-    prior: records.CameraGeometry,
+    ensemble: Ensemble,
+    prior: CameraGeometry,
     options: CalibrationOptions,
     order: int,
     with_rate: bool,
@@ -127,8 +134,8 @@ def _at_the_prior(
 
 
 def _sigma_with(
-    ensemble: records.Ensemble,
-    prior: records.CameraGeometry,
+    ensemble: Ensemble,
+    prior: CameraGeometry,
     options: CalibrationOptions,
     order: int,
     with_rate: bool,
@@ -164,10 +171,10 @@ def _sigma_with(
 
 
 def ensemble_status(
-    ensemble: records.Ensemble, prior: records.CameraGeometry, options: CalibrationOptions
-) -> records.EnsembleStatus:
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> EnsembleStatus:
     """Counts, coverage and predicted sigmas of an ensemble."""
-    return records.EnsembleStatus(
+    return EnsembleStatus(
         time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
         images=len(ensemble.images),
         stars=ensemble.star_count,
@@ -213,8 +220,8 @@ def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floa
 
 
 def keep_most_informative(
-    ensemble: records.Ensemble, prior: records.CameraGeometry, options: CalibrationOptions
-) -> records.Ensemble:
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> Ensemble:
     """
     Ensemble without its least informative images, at most ``max_images``.
 
@@ -235,7 +242,7 @@ def keep_most_informative(
     return replace(ensemble, images=images)
 
 
-def map_sigma_px(camera: CameraModel, covariance: records.MapCovariance) -> Floats:
+def map_sigma_px(camera: CameraModel, covariance: MapCovariance) -> Floats:
     """1-sigma (GRID * GRID,) of the shape of the map, in pixels at the centre."""
     table = line_of_sight_table(camera, covariance, pixel_grid(camera, GRID, GRID))
     return np.asarray(table.shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
@@ -249,26 +256,24 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
     Infinite if a pixel has no line of sight, where the distortion folds.
     """
     unturned = np.array([0.0, 0.0, 0.0, 1.0])
-    before, after = records.CameraGeometry(found, unturned), records.CameraGeometry(true, unturned)
+    before, after = CameraGeometry(found, unturned), CameraGeometry(true, unturned)
     _, left_px = movement(before, after, GRID, GRID)
     return float(np.sqrt(np.mean(left_px**2)))
 
 
-def detector_maps(
-    camera: CameraModel, covariance: records.MapCovariance, pixels: Floats
-) -> records.DetectorMaps:
+def detector_maps(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> DetectorMaps:
     """Maps of a camera and its covariance, which stars at pixels (n, 2) determined."""
     table = line_of_sight_table(camera, covariance, pixel_grid(camera, MAP_COLS, MAP_ROWS))
-    return records.DetectorMaps(
+    return DetectorMaps(
         stars_in_cells(pixels, camera),
         table.sigma_arcsec.reshape(MAP_ROWS, MAP_COLS),
         table.shape_sigma_arcsec.reshape(MAP_ROWS, MAP_COLS),
     )
 
 
-def correlation(covariance: Floats, names: tuple[str, ...]) -> records.Correlation:
+def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
     """Correlations of a covariance (k, k), without the rows of zero variance."""
     sigma = np.sqrt(np.diag(covariance))
     known = np.nonzero(sigma > 0)[0]
     matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
-    return records.Correlation(tuple(names[i] for i in known), matrix)
+    return Correlation(tuple(names[i] for i in known), matrix)
