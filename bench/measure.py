@@ -45,9 +45,9 @@ def run(quick: bool) -> Iterator[Table]:
     )
     ways: dict[str, Callable[[], int]] = {
         'starcal, tracking': lambda: len(observe.observe_next(image, attitudes, setup, track)[0]),
-        'starcal, first image': lambda: len(observe.observe(image, attitudes, setup, setup.prior)),
+        'starcal, first image': lambda: len(observe.observe_next(image, attitudes, setup)[0]),
         f'starcal, alignment {ACQUISITION_DEG} deg off': lambda: len(
-            observe.observe(image, attitudes, setup, shifted)
+            observe.observe_next(image, attitudes, setup, observe.Track(shifted))[0]
         ),
     }
     if importlib.util.find_spec('sep'):

@@ -98,7 +98,7 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
     found['frozen'] = (frozen, observe.observe_next(frozen, held, SETUP, track)[0])
     image = Image(time_ns, pixels)
     jumped = attitudes(reported=FIELD + 1)
-    found['no_match'] = (image, observe.observe(image, jumped, SETUP, SETUP.prior))
+    found['no_match'] = (image, observe.observe_next(image, jumped, SETUP)[0])
     return found
 
 
@@ -110,9 +110,9 @@ def drawn(image: Image, observations: StarObservations) -> Picture:
 
 def spoilt_stars() -> tuple[Image, StarObservations]:
     """Frame with faults at single stars, and its observations."""
-    plain = observe.observe(
-        Image(SCENARIO.time_ns(FIELD), expose(electrons())), attitudes(), SETUP, SETUP.prior
-    )
+    plain = observe.observe_next(
+        Image(SCENARIO.time_ns(FIELD), expose(electrons())), attitudes(), SETUP
+    )[0]
     places = plain.measured_px[np.argsort(-plain.snr)]
     inside = ((places > 40) & (places < np.array([SHAPE[1], SHAPE[0]]) - 41)).all(axis=1)
     burnt, crossed, hot, moved = np.rint(places[inside][[3, 30, 40, 20]]).astype(int)
@@ -129,7 +129,7 @@ def spoilt_stars() -> tuple[Image, StarObservations]:
         SETUP, hot=dataclasses.replace(SETUP.hot, index=np.array([number], np.int64))
     )
     image = Image(SCENARIO.time_ns(FIELD), bright)
-    return image, observe.observe(image, attitudes(), known, known.prior)
+    return image, observe.observe_next(image, attitudes(), known)[0]
 
 
 def star_sheet(image: Image, observations: StarObservations) -> Picture:

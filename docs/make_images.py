@@ -66,7 +66,7 @@ def observe(scenario: Scenario, setup: Setup, image: Image, index: int) -> StarO
     attitudes = AttitudeHistory()
     for sample in synthetic.attitude_samples(scenario, index):
         attitudes.add(sample.time_ns, sample)
-    return observing.observe(image, attitudes, setup, setup.prior)
+    return observing.observe_next(image, attitudes, setup)[0]
 
 
 def part_of(

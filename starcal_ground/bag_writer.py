@@ -3,20 +3,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 import contextlib
 from pathlib import Path
-import sys
 from types import TracebackType
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
+import yaml
 
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.bag.writer import MessageWriter
+from starcal_ros.formats.bag import writer as mcap
+from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages import message_codec as codec
+from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.record_messages import observations_to_message
 from starcal_ros.records import Image, StarObservations
 
@@ -41,13 +43,17 @@ class BagWriter:
         self.file = path if is_file else path / f'{path.name}_0.mcap'
         self._metadata_file = None if is_file else path / 'metadata.yaml'
         self._replacing: contextlib.AbstractContextManager[IO[bytes]] | None = None
+        self._channels: dict[str, tuple[int, str]] = {}  # number and type by topic
+        self._counts: Counter[str] = Counter()
+        self._first_ns: int | None = None
+        self._last_ns = 0
 
     def __enter__(self) -> Self:
         """Open a temporary file in the folder of the bag."""
         with errors_as(BagError, self.file, 'written'):
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self._replacing = replacing(self.file)
-            self.messages = MessageWriter(self._replacing.__enter__())
+            self._writer = mcap.started(self._replacing.__enter__())
         return self
 
     def __exit__(
@@ -64,10 +70,10 @@ class BagWriter:
         with errors_as(BagError, self.file, 'written'):
             with contextlib.ExitStack() as stack:
                 stack.push(self._replacing)
-                self.messages.finish()
+                self._writer.finish()  # type: ignore[no-untyped-call]
             if self._metadata_file is not None:
                 with replacing(self._metadata_file) as file:
-                    file.write(self.messages.metadata(self.file.name).encode())
+                    file.write(self._metadata().encode())
 
     def outputs(self) -> list[Path]:
         """Files of the bag to write, and those of any bag in its folder."""
@@ -78,8 +84,61 @@ class BagWriter:
 
     def write(self, topic: str, type_name: str, time_ns: int, message: codec.Message) -> None:
         """Write a message; raises BagError where the disk is full or a field cannot hold it."""
+        # A recording time is not negative; the stamp in the message is written as it is.
+        time_ns = max(time_ns, 0)
         with errors_as(BagError, self.file, 'written'):
-            self.messages.write(topic, type_name, time_ns, message)
+            number, of_topic = self._channels.get(topic) or self._open(topic, type_name)
+            if of_topic != type_name:
+                raise ValueError(f'topic: {topic} holds {of_topic}, not {type_name}')
+            data = mcap.serialised(topic, type_name, message)
+            self._writer.add_message(
+                number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
+            )
+        self._counts[topic] += 1
+        self._first_ns = time_ns if self._first_ns is None else min(self._first_ns, time_ns)
+        self._last_ns = max(self._last_ns, time_ns)
+
+    def _open(self, topic: str, type_name: str) -> tuple[int, str]:
+        self._channels[topic] = mcap.opened(self._writer, topic, type_name), type_name
+        return self._channels[topic]
+
+    def _metadata(self) -> str:
+        """Content of the metadata.yaml."""
+        first_ns = self._first_ns or 0
+
+        def span() -> dict[str, object]:  # twice the same object would be an alias in YAML
+            return {
+                'starting_time': {'nanoseconds_since_epoch': first_ns},
+                'duration': {'nanoseconds': max(self._last_ns - first_ns, 0)},
+                'message_count': sum(self._counts.values()),
+            }
+
+        topics = [
+            {
+                'topic_metadata': {
+                    'name': topic,
+                    'type': type_name,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': [mcap.offered_qos()],
+                    'type_description_hash': typestore().hash_rihs01(type_name),
+                },
+                'message_count': self._counts[topic],
+            }
+            for topic, (_, type_name) in self._channels.items()
+        ]
+        information = {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            'relative_file_paths': [self.file.name],
+            **span(),
+            'topics_with_message_count': topics,
+            'compression_format': '',
+            'compression_mode': '',
+            'files': [{'path': self.file.name, **span()}],
+            'custom_data': None,
+            'ros_distro': 'jazzy',
+        }
+        return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=True)
 
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
@@ -113,18 +172,7 @@ class BagWriter:
 
 def image_to_message(image: Image, frame_id: str, make: codec.Make) -> codec.Message:
     """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
-    pixels = np.ascontiguousarray(image.pixels)
-    height, width = pixels.shape
-    return make(
-        codec.IMAGE_TYPE,
-        header=codec.make_header(image.time_ns, frame_id, make),
-        height=height,
-        width=width,
-        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
-        is_bigendian=int(sys.byteorder == 'big'),
-        step=width * pixels.itemsize,
-        data=pixels.reshape(-1).view(np.uint8),
-    )
+    return sensor_messages.image_to_message(image.time_ns, image.pixels, frame_id, make)
 
 
 def attitude_to_message(

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import is_marked, same_as_one_of
+from starcal_ros.files import is_marked
 from starcal_ros.untrusted import regular_file
 
 OBSERVATIONS_FILE, REPORT_FILE = 'observations.mcap', 'report.html'
@@ -47,4 +47,17 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
 def _is_own(path: Path) -> bool:
     with contextlib.suppress(OSError, ValueError), regular_file(path, False) as file:
         return is_marked(file)
+    return False
+
+
+def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
+    """True if a path names the same file, by whatever name, as one of the others."""
+    try:
+        own = path.stat()
+    except OSError:
+        return False  # there is no such file
+    for other in others:
+        with contextlib.suppress(OSError):
+            if os.path.samestat(own, other.stat()):
+                return True
     return False

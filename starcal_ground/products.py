@@ -18,12 +18,12 @@ import numpy as np
 import yaml
 
 from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.camera.lens import ros_distortion
-from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.formats.bag import rosbag2
+from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
 from starcal_ros.record_fields import json_object, plain_record, read_record
@@ -67,27 +67,23 @@ def write_camera_info(
 
     Raises ProductError when the file cannot be written.
     """
-    fitted, _ = ros_fit(camera)
-    fx, _, fy, cx, cy = fitted.intrinsics.tolist()
-    distortion_model, D = ros_distortion(fitted.model, fitted.distortion)
+    info = camera_info_fields(camera)
     content = {
-        'image_width': fitted.width,
-        'image_height': fitted.height,
+        'image_width': info['width'],
+        'image_height': info['height'],
         'camera_name': camera_name,
-        'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        'distortion_model': distortion_model,
-        'distortion_coefficients': _matrix(1, len(D), D.tolist()),
-        'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
-        'projection_matrix': _matrix(
-            3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
-        ),
+        'camera_matrix': _matrix(3, info['k']),
+        'distortion_model': info['distortion_model'],
+        'distortion_coefficients': _matrix(1, info['d']),
+        'rectification_matrix': _matrix(3, info['r']),
+        'projection_matrix': _matrix(3, info['p']),
     }
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
     product_files.write_atomically(path, text)
 
 
-def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
-    return {'rows': rows, 'cols': cols, 'data': data}
+def _matrix(rows: int, values: Floats) -> dict[str, object]:
+    return {'rows': rows, 'cols': len(values) // rows, 'data': values.tolist()}
 
 
 def write_observations(

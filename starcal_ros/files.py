@@ -12,7 +12,7 @@ it wrote the file and that nothing has changed it since.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import contextlib
 import fcntl
 import hashlib
@@ -98,16 +98,3 @@ def sync_folder(folder: Path) -> None:
         os.fsync(number)
     finally:
         os.close(number)
-
-
-def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
-    """True if a path names the same file, by whatever name, as one of the others."""
-    try:
-        own = path.stat()
-    except OSError:
-        return False  # there is no such file
-    for other in others:
-        with contextlib.suppress(OSError):
-            if os.path.samestat(own, other.stat()):
-                return True
-    return False

@@ -35,8 +35,8 @@ def option(
     default: OptionValue,
     description: str,
     *,
-    low: float | None = None,
-    high: float | None = None,
+    low: float = -MOST,
+    high: float = MOST,
     choices: tuple[str, ...] = (),
     length: int | None = None,
     basic: bool = False,
@@ -49,45 +49,33 @@ def option(
     ``basic`` marks the few options that most cameras need; the others are advanced.  ``is_path``
     marks a path, in which ``~`` stands for a home folder.
     """
-    return dataclasses.field(
-        default=default,
-        metadata={
-            'description': description,
-            'low': low,
-            'high': high,
-            'choices': choices,
-            'length': length,
-            'basic': basic,
-            'is_path': is_path,
-        },
-    )
-
-
-def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
-    """Value in the type of its option; raises OptionError with what is allowed."""
-    meta, default = field.metadata, field.default
-    low, high = meta['low'], meta['high']
-    kind = FieldType(
-        type(default[0]) if isinstance(default, tuple) else type(default),
-        low=-MOST if low is None else low,
-        high=MOST if high is None else high,
+    kind = item = FieldType(
+        type(default[0] if isinstance(default, tuple) else default),
+        low=low,
+        high=high,
         is_finite=True,
-        choices=meta['choices'],
+        choices=choices,
         most_characters=_MOST_CHARACTERS,
     )
     if isinstance(default, tuple):
         kind = FieldType(
             tuple,
-            item=kind,
-            dimensions=(meta['length'] or '',),
+            item=item,
+            dimensions=(length or '',),
             most_items=_MOST_ITEMS,
-            are_different=bool(meta['choices']),
+            are_different=bool(choices),
         )
+    metadata = {'description': description, 'kind': kind, 'item': item, 'basic': basic}
+    return dataclasses.field(default=default, metadata={**metadata, 'is_path': is_path})
+
+
+def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
+    """Value in the type of its option; raises OptionError with what is allowed."""
     try:
-        checked: OptionValue = read_value(kind, value, field.name, {})
+        checked: OptionValue = read_value(field.metadata['kind'], value, field.name, {})
     except ValueError as error:
         raise OptionError(str(error)) from error
-    return with_home(field.name, str(checked)) if meta['is_path'] else checked
+    return with_home(field.name, str(checked)) if field.metadata['is_path'] else checked
 
 
 def with_home(name: str, path: str) -> str:

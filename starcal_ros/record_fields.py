@@ -99,7 +99,8 @@ class Named:
     in_messages: str
 
 
-Count = Annotated[int, Within(0)]
+Count = Annotated[int, Within(0, 2**32 - 1)]
+"""A number of things, as messages hold it."""
 Stamp = Annotated[int, Within(0, MAX_STAMP_NS)]
 """Nanoseconds since 1970 that a ROS stamp can hold: until 2038."""
 Quaternion = Annotated[Floats, Finite(), Shape((4,))]

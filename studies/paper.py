@@ -44,7 +44,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.star_equations import squared_sigmas, star_table
-from starcal_ros.pipeline.observe import observe
+from starcal_ros.pipeline.observe import observe_next
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, StarObservations
@@ -156,7 +156,7 @@ def observe_frame(seed: int, index: int) -> StarObservations:
     for sample in attitude_samples(night, index):
         attitudes.add(sample.time_ns, sample)
     image = render(night, scene(night, index), index, pattern)
-    return observe(image, attitudes, setup, setup.prior)
+    return observe_next(image, attitudes, setup)[0]
 
 
 def observe_frame_of(seed: int, images: int, index: int) -> StarObservations:

@@ -11,6 +11,7 @@ from typing import Any
 
 from starcal_ros.options import option_fields
 from starcal_ros.pipeline import setup
+from starcal_ros.record_fields import MOST
 
 FILE = Path(__file__).parents[1] / 'config' / 'starcal.yaml'
 HEAD = """\
@@ -74,15 +75,15 @@ def group(title: str, fields: Sequence[dataclasses.Field[Any]]) -> str:
 
 def allowed(field: dataclasses.Field[Any]) -> str:
     """Text of the choices or the inclusive range of a parameter."""
-    low, high = field.metadata['low'], field.metadata['high']
-    if field.metadata['choices']:
+    item = field.metadata['item']
+    if item.choices:
         each = 'each one of ' if isinstance(field.default, tuple) else ''
-        return '; ' + each + ' | '.join(field.metadata['choices'])
-    if low is not None and high is not None:
-        return f'; {low:g} to {high:g}'
-    if low is not None or high is not None:
-        return f'; at least {low:g}' if high is None else f'; at most {high:g}'
-    return ''
+        return '; ' + each + ' | '.join(item.choices)
+    if item.low > -MOST and item.high < MOST:
+        return f'; {item.low:g} to {item.high:g}'
+    if item.high < MOST:
+        return f'; at most {item.high:g}'
+    return f'; at least {item.low:g}' if item.low > -MOST else ''
 
 
 def as_yaml(value: object) -> str:

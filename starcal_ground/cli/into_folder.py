@@ -18,7 +18,6 @@ from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
-from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import campaign
@@ -33,7 +32,7 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
     Raises OptionError or ProductError naming the folder or the file.
     """
     bag_files = reader.files_of_bags(bags)
-    if same_as_one_of(folder, [file.parent for file in bag_files]):
+    if outputs.same_as_one_of(folder, [file.parent for file in bag_files]):
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
     written = [folder / name for name in (*products.PRODUCT_FILES, products.NOT_CALIBRATED_FILE)]
     pictures = thumbnails.thumbnails_in(folder / thumbnails.THUMBNAILS_FOLDER)
@@ -153,7 +152,8 @@ def _drawn(
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals, refusals
+    from starcal_ground.planning.inspect import of_a_failure
+    from starcal_ros.pipeline.diagnosis.bags import of_refusals, refusals
 
     source, count = observed.source, len(observed.observations)
     groups = refusals(observed.observations)

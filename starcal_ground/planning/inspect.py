@@ -22,6 +22,7 @@ from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.campaign import ThroughAir
 from starcal_ros.pipeline.diagnosis import bags
 from starcal_ros.pipeline.diagnosis.bags import Refused
+from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
@@ -233,10 +234,21 @@ def _causes(
 ) -> list[str]:
     """The cause for which all images are refused, in a sentence; ``command`` gives details."""
     if setup and not chosen.observations:
-        cause = bags.of_a_failure(paths, chosen, setup, refused)
+        cause = of_a_failure(paths, chosen, setup, refused)
     else:
         cause = bags.of_refusals(refused, sum(group.count for group in refused))
     return [cause.in_a_sentence(command)] if cause else []
+
+
+def of_a_failure(
+    paths: Sequence[Path], requested: bag_topics.Topics, setup: Setup, refused: Sequence[Refused]
+) -> Diagnosis | None:
+    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
+    try:
+        diagnosis = bags.diagnose_bags(paths, requested, setup, refused)
+    except BagError:
+        return None
+    return None if diagnosis.cause == 'none' else diagnosis
 
 
 def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) -> list[str]:

@@ -18,6 +18,7 @@ import logging
 import math
 from pathlib import Path
 
+import cv2
 import jinja2
 from markupsafe import Markup
 import numpy as np
@@ -34,18 +35,22 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.annotation import LETTERS, STAR_MARKS
+from starcal_ros.pipeline.annotation import STAR_MARKS
 from starcal_ros.record_fields import nearest
-from starcal_ros.records import (
-    Calibration,
-    IMAGE_REFUSALS,
-    parts_that_matter,
-    STAR_REFUSALS,
-    StarObservations,
-    TOTAL,
-)
+from starcal_ros.records import Calibration, IMAGE_REFUSALS, STAR_REFUSALS, StarObservations, TOTAL
 from starcal_ros.text import significant
 from starcal_ros.untrusted import json_value
+
+# Shape of a mark -> a letter like it.
+_LETTERS = {
+    cv2.MARKER_TRIANGLE_DOWN: '\N{WHITE DOWN-POINTING TRIANGLE}',
+    cv2.MARKER_TRIANGLE_UP: '\N{WHITE UP-POINTING TRIANGLE}',
+    cv2.MARKER_SQUARE: '\N{WHITE SQUARE}',
+    cv2.MARKER_DIAMOND: '\N{WHITE DIAMOND}',
+    cv2.MARKER_TILTED_CROSS: '\N{MULTIPLICATION SIGN}',
+    cv2.MARKER_CROSS: '+',
+    cv2.MARKER_STAR: '*',
+}
 
 
 def typeset(rows: Sequence[Row]) -> list[Row]:
@@ -183,7 +188,7 @@ def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str,
     return [
         (
             '#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)),
-            LETTERS[STAR_MARKS[reason].shape],
+            _LETTERS[STAR_MARKS[reason].shape],
             reason,
         )
         for reason, count in _counts(observations).items()
@@ -433,7 +438,7 @@ def charts_of(
         charts['shape'] = detector_figures.line_of_sight_sigma(maps, camera, is_alone=True)
         charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
     if calibration.sigma_budget:
-        parts = parts_that_matter(calibration.sigma_budget)
+        parts = verdict.parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
         charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if residuals is not None and residuals.used.any():

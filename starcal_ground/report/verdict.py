@@ -30,6 +30,7 @@ VISIBLE_PX = 0.001
 """Length below which a field or a variation is shown as none: no campaign of images shows it."""
 
 _MOST_OF_DETECTOR = 0.98
+_MATTERS = 0.05  # fraction of the variance
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
 
 
@@ -41,6 +42,20 @@ _UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
 }
 """By parameter; the coefficients of the lens have none."""
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
+
+
+def parts_that_matter(budget: Sequence[records.SigmaPart]) -> list[records.SigmaPart]:
+    """Return the total, then the causes of more than 5 % of a variance, the largest first."""
+    if not budget:
+        return []
+    total = next(part for part in budget if part.cause == records.TOTAL)
+
+    def share(part: records.SigmaPart) -> float:
+        of_map = part.map_arcsec**2 / max(total.map_arcsec**2, 1e-300)
+        return max(of_map, part.pointing_arcsec**2 / max(total.pointing_arcsec**2, 1e-300))
+
+    causes = [part for part in budget if part.cause != records.TOTAL and share(part) > _MATTERS]
+    return [total, *sorted(causes, key=share, reverse=True)]
 
 
 def check_rows(
@@ -74,7 +89,7 @@ def checks_sentence(gate: Sequence[records.GateCheck]) -> str:
 
 def precision_sentences(calibration: records.Calibration) -> list[str]:
     """1-sigma of the lines of sight over the detector, and its largest causes."""
-    maps, budget = calibration.maps, records.parts_that_matter(calibration.sigma_budget)
+    maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
     if maps is None:
         return []
     sentences = [_precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec')]
@@ -139,7 +154,7 @@ def next_step(calibration: records.Calibration) -> str:
 
 def _against_sigma(calibration: records.Calibration) -> list[str]:
     """A sentence with the measure against the largest cause of each sigma."""
-    causes = records.parts_that_matter(calibration.sigma_budget)[1:]
+    causes = parts_that_matter(calibration.sigma_budget)[1:]
     if not causes:
         return []
     steps = []

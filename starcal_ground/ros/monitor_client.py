@@ -21,10 +21,11 @@ from rich.live import Live
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.cli.monitor_view import Received, view
+from starcal_ros import records
+from starcal_ros.formats.messages.message_codec import record_from_message
 from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     observations_from_message,
-    status_from_message,
 )
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import end_quietly, is_overdue, until_told_to_end
@@ -70,7 +71,7 @@ class Monitor(Node):
         self.received = self.received.with_image(observations_from_message(message))
 
     def _on_status(self, message: Any) -> None:
-        self._set(status=status_from_message(message))
+        self._set(status=record_from_message(records.EnsembleStatus, message))
 
     def _on_calibration(self, message: Any) -> None:
         # An earlier candidate has been replaced by this decision.

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import textwrap
 
 import cv2
 import numpy as np
@@ -47,17 +48,6 @@ STAR_MARKS: Mapping[str, Mark] = {
     'ambiguous': Mark(cv2.MARKER_STAR, (80, 80, 255)),
 }
 """Name of `STAR_REFUSALS` -> its mark."""
-
-LETTERS: Mapping[int, str] = {
-    cv2.MARKER_TRIANGLE_DOWN: '\N{WHITE DOWN-POINTING TRIANGLE}',
-    cv2.MARKER_TRIANGLE_UP: '\N{WHITE UP-POINTING TRIANGLE}',
-    cv2.MARKER_SQUARE: '\N{WHITE SQUARE}',
-    cv2.MARKER_DIAMOND: '\N{WHITE DIAMOND}',
-    cv2.MARKER_TILTED_CROSS: '\N{MULTIPLICATION SIGN}',
-    cv2.MARKER_CROSS: '+',
-    cv2.MARKER_STAR: '*',
-}
-"""Shape of a mark -> a letter like it, for the text below a picture."""
 
 _UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason from another version
 
@@ -137,25 +127,14 @@ def _draw_banner(picture: Picture, observations: StarObservations, size: float) 
     if not observations.refusal:
         return 0
     scale, line = 0.8 * size, round(32 * size)
-    words = f'REFUSED {observations.refusal}: {observations.detail}'.split()
-    rows = list(_wrapped(words, scale, picture.shape[1] - round(20 * size)))
+    words = f'REFUSED {observations.refusal}: {observations.detail}'
+    room_px = 0.9 * (picture.shape[1] - 20 * size)  # letters differ in width
+    rows = textwrap.wrap(words, max(1, int(len(words) * room_px / _width_px(words, scale))))
     bottom = line * len(rows) + round(10 * size)
     cv2.rectangle(picture, (0, 0), (picture.shape[1], bottom), _BANNER, cv2.FILLED)
     for k, row in enumerate(rows):
         _write(picture, row, (round(10 * size), line * (k + 1)), scale, _TEXT)
     return bottom
-
-
-def _wrapped(words: list[str], scale: float, room_px: int) -> Iterator[str]:
-    """Wrap words to lines of a given width."""
-    row = ''
-    for word in words:
-        longer = f'{row} {word}'.strip()
-        if row and _width_px(longer, scale) > room_px:
-            yield row
-            longer = word
-        row = longer
-    yield row
 
 
 def _draw_legend(

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starcal_ros.assessment.predictions import Residuals
+from starcal_ros.formats.bag import reader
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.setup import Setup
@@ -44,7 +45,8 @@ class Source:
     @property
     def image_count(self) -> int:
         """Number of images, or of recorded observations."""
-        return bag_topics.count(self.bags, self.topics)
+        wanted = self.topics.observations or self.topics.image
+        return sum(topic.count for topic in reader.topics(self.bags) if topic.name == wanted)
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def observe_next(
     image: Image,
     attitudes: AttitudeHistory,
     setup: Setup,
-    track: Track,
+    track: Track | None = None,
     velocity_m_s: Floats | None = None,
     temperature_degc: float = math.nan,
     more_attitudes: Sequence[AttitudeHistory] = (),
@@ -86,6 +86,9 @@ def observe_next(
     """
     Observations of the next image of a sequence, and the state of the sequence after it.
 
+    Without a ``track`` the image is the first, and the prior predicts its stars.
+    ``velocity_m_s`` (3,) is the observer's barycentric velocity, ICRF axes; None: that of the
+    options, else the Earth's.
     ``more_attitudes`` belong to the additional star trackers of the setup.  The star tracker with
     the fewest images is tried first; if its attitude leads to a refusal, the next one is tried.
     ``detail`` records that refusal, and the star tracker is then tried less often.
@@ -96,7 +99,7 @@ def observe_next(
     with that image: a clock was set back, or a recording is played again.  An image that repeats
     the pixels of the previous image, used or not, with another stamp is refused.
     """
-    track = _after_order(track, image.time_ns)
+    track = _after_order(track or Track(setup.prior), image.time_ns)
     velocity = velocity_of(setup.site, velocity_m_s)
     known: dict[str, object] = {
         'temperature_degc': temperature_degc,
@@ -212,22 +215,6 @@ def _with_one(
         taken=taken,
         others={**track.others, name: dataclasses.replace(after, others={})},
     )
-
-
-def observe(
-    image: Image,
-    attitudes: AttitudeHistory,
-    setup: Setup,
-    geometry: CameraGeometry,
-    velocity_m_s: Floats | None = None,
-) -> StarObservations:
-    """
-    Observations of one image, or the record of its refusal; never raises for a bad image.
-
-    ``geometry`` predicts the stars: the prior or the active calibration.  ``velocity_m_s`` (3,) is
-    the observer's barycentric velocity, ICRF axes; None: that of the options, else the Earth's.
-    """
-    return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
 
 
 def _without_dark(image: Image, setup: Setup) -> Image:

@@ -253,9 +253,3 @@ def stated_tracker(options: Mapping[str, object]) -> list[str]:
     return [
         name for name, value in values.items() if not isinstance(value, Iterable) or any(value)
     ]
-
-
-def count(paths: Sequence[Path], topics: Topics) -> int:
-    """Count the observations that `read` yields."""
-    wanted = topics.observations or topics.image
-    return sum(topic.count for topic in reader.topics(paths) if topic.name == wanted)

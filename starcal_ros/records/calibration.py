@@ -8,7 +8,7 @@ detector in addition to the lens model, with the covariance of lines of sight.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
 import functools
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 TOTAL = 'total'
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
-_MATTERS = 0.05  # fraction of the variance
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
 
@@ -750,20 +749,6 @@ def check_drawable(geometry: CameraGeometry) -> None:
     rotation = geometry.star_tracker_from_camera_xyzw
     if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
         raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
-
-
-def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:
-    """Return the total, then the causes of more than 5 % of a variance, the largest first."""
-    if not budget:
-        return []
-    total = next(part for part in budget if part.cause == TOTAL)
-
-    def share(part: SigmaPart) -> float:
-        of_map = part.map_arcsec**2 / max(total.map_arcsec**2, 1e-300)
-        return max(of_map, part.pointing_arcsec**2 / max(total.pointing_arcsec**2, 1e-300))
-
-    causes = [part for part in budget if part.cause != TOTAL and share(part) > _MATTERS]
-    return [total, *sorted(causes, key=share, reverse=True)]
 
 
 _DIGITS = 9  # parameters and field cancel to a thousandth and less in the factor

@@ -33,27 +33,16 @@ import shutil
 import stat
 from typing import Any
 
-import numpy as np
-
 from starcal_ros.errors import ArchiveError, BagError, errors_as, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
-from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.bag.writer import observations_bag
-from starcal_ros.formats.messages import message_codec as codec
-from starcal_ros.formats.messages import record_messages
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import Count, json_object, read_record
-from starcal_ros.records import (
-    Activation,
-    Calibration,
-    counted_refusal,
-    Ensemble,
-    StarObservations,
-)
+from starcal_ros.records import Activation, counted_refusal, Ensemble, StarObservations
 from starcal_ros.untrusted import json_value, read_bytes
 
 ARCHIVE_SCHEMA = 1
@@ -444,7 +433,6 @@ class Archive:
                 raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
             if keys.before >= event:
                 raise ValueError(f'archive.before: {keys.before} is not before {event}')
-            check_publishable(calibration)
         except (ProductError, ValueError) as error:
             self._set_aside(path, str(error))
             return None
@@ -496,25 +484,6 @@ def _content(path: Path) -> bytes:
 def _unreadable(path: Path, error: OSError) -> ArchiveError:
     remedy = 'start the calibrator as the user who owns it, or move it to another place'
     return ArchiveError(f'state_dir: {path} cannot be read: {error.strerror}; {remedy}')
-
-
-def check_publishable(calibration: Calibration) -> None:
-    """
-    Check that the messages of a calibration can hold its values.
-
-    Raises ValueError naming the message.
-    """
-    for kind, make in (
-        (codec.CALIBRATION_TYPE, record_messages.calibration_to_message),
-        (codec.CAMERA_INFO_TYPE, record_messages.camera_info_to_message),
-        (codec.ALIGNMENT_TYPE, record_messages.alignment_to_message),
-    ):
-        try:
-            with np.errstate(all='ignore'):
-                typestore().serialize_cdr(make(calibration, make_message), kind)
-        # The exceptions of a value that its field cannot hold have no common base class.
-        except Exception as error:
-            raise ValueError(f'does not fit into a {kind}: {error}') from error
 
 
 def _free_name(path: Path) -> Path:

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.pipeline.diagnosis.diagnose import (
@@ -45,7 +44,6 @@ _MORE = 2  # times the longest of them: it has fallen silent
 KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
 DIAGNOSED = 5  # images in a row without a match
 _LOWEST_PRIORITY = 19  # of a diagnosis that no image waits for
-_ATTITUDES = 20_000  # of the last minutes, for the search of a shift of clocks
 
 
 @dataclass(frozen=True)
@@ -158,42 +156,34 @@ class Recent:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._start_s = clock_s()
-        self._times_s: deque[float] = deque(maxlen=_MOST)
-        self._values: deque[float] = deque(maxlen=_MOST)
+        self._numbers: deque[tuple[float, float]] = deque(maxlen=_MOST)  # times, s, and values
         self._lock = threading.Lock()
 
     def add(self, value: float) -> None:
         """Add a number that has just arrived."""
         with self._lock:
-            self._forget()
-            self._times_s.append(self._clock_s())
-            self._values.append(value)
+            self._numbers.append((self._clock_s(), value))
 
     def rate_hz(self) -> float:
         """Numbers per second in the window, or since the start if that is shorter."""
-        with self._lock:
-            now_s = self._forget()
-            passed_s = min(now_s - self._start_s, WINDOW_S)
-            return len(self._times_s) / passed_s if passed_s > 0 else 0.0
+        passed_s = min(self._clock_s() - self._start_s, WINDOW_S)
+        return len(self._values()) / passed_s if passed_s > 0 else 0.0
 
     def median(self) -> float | None:
         """Median; None without numbers."""
-        with self._lock:
-            self._forget()
-            return float(np.median(self._values)) if self._values else None
+        values = self._values()
+        return float(np.median(values)) if values else None
 
     def largest(self) -> float | None:
         """Largest number; None without numbers."""
-        with self._lock:
-            self._forget()
-            return max(self._values, default=None)
+        return max(self._values(), default=None)
 
-    def _forget(self) -> float:
-        now_s = self._clock_s()
-        while self._times_s and self._times_s[0] < now_s - WINDOW_S:
-            self._times_s.popleft()
-            self._values.popleft()
-        return now_s
+    def _values(self) -> list[float]:
+        """Numbers in the window; those before it are forgotten."""
+        with self._lock:
+            while self._numbers and self._numbers[0][0] < self._clock_s() - WINDOW_S:
+                self._numbers.popleft()
+            return [value for _, value in self._numbers]
 
 
 class StarTrackers:
@@ -294,12 +284,13 @@ class Unmatched:
     a prior alignment after each image from the third on.  Safe to use from several threads.
     """
 
-    def __init__(self, setup: Setup, on_answer: Callable[[Diagnosis], None]) -> None:
-        self._setup = setup
+    def __init__(
+        self, setup: Setup, attitudes: AttitudeHistory, on_answer: Callable[[Diagnosis], None]
+    ) -> None:
+        self._setup, self._attitudes = setup, attitudes
         self._on_answer = on_answer
         self._lock = threading.Lock()
         self._images: deque[Image] = deque(maxlen=KEPT)
-        self._attitudes: deque[tuple[int, Floats]] = deque(maxlen=_ATTITUDES)
         self._in_a_row = 0
         self._next = DIAGNOSED if setup.is_aligned else IMAGES_OF_AN_ALIGNMENT
         self._process: ChildProcess | None = None
@@ -312,11 +303,6 @@ class Unmatched:
         """Why the last images matched nothing; None: not asked yet, or they match again."""
         with self._lock:
             return self._diagnosis
-
-    def add_attitude(self, time_ns: int, quaternion: Floats) -> None:
-        """Keep an attitude as it was sent."""
-        with self._lock:
-            self._attitudes.append((time_ns, quaternion))
 
     def matched(self) -> None:
         """Forget the diagnosis: an image matched."""
@@ -333,12 +319,9 @@ class Unmatched:
             if busy or self._in_a_row < self._next:
                 return
             self._next = 2 * self._in_a_row if self._setup.is_aligned else self._in_a_row + 1
-            stamps, quaternions = (
-                zip(*self._attitudes, strict=True) if self._attitudes else ((), ())
-            )
             question = (
                 tuple(self._images),
-                wire_attitudes(stamps, quaternions),
+                wire_attitudes(self._attitudes, self._setup.attitude.attitude_direction),
                 dataclasses.replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
             )
             self._thread = threading.Thread(

@@ -491,17 +491,6 @@ def _spin(node: StarcalNode, executor: Executor) -> None:
             node.count_error(error)
 
 
-_CODES = {
-    np.dtype(np.int8): 'b',
-    np.dtype(np.uint8): 'B',
-    np.dtype(np.int16): 'h',
-    np.dtype(np.uint32): 'I',
-    np.dtype(np.int64): 'q',
-    np.dtype(np.float32): 'f',
-    np.dtype(np.float64): 'd',
-}
-
-
 def make_message(type_name: str, /, **fields: Any) -> Message:
     """
     Return a generated message of type ``'pkg/msg/Name'`` with the given fields.
@@ -532,6 +521,6 @@ def _as_field(value: Any, kind: str) -> Any:
     if not isinstance(value, np.ndarray) or not kind.startswith('sequence'):
         return value  # rclpy also uses numpy for fixed-size arrays
     # rclpy assigns an array.array without conversion: 0.6 ms for 8 MB; an ndarray takes 540 ms.
-    numbers = array.array(_CODES[value.dtype])
+    numbers = array.array(value.dtype.char.replace('l', 'q'))  # 64 bit have one code in rclpy
     numbers.frombytes(np.ascontiguousarray(value).view(np.uint8).data)
     return numbers

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import dataclasses
 import itertools
 from pathlib import Path
-import sys
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -23,6 +22,7 @@ from rclpy.parameter import Parameter
 from starcal_ros import options
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline.setup import paths_from
+from starcal_ros.record_fields import MOST
 
 
 class OptionParameters:
@@ -139,27 +139,19 @@ def _as_parameter(default: Any) -> Any:
 
 
 def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
-    meta = field.metadata
-    description = meta['description']
-    if meta['choices']:
-        description += ': ' + ' | '.join(meta['choices'])
+    item, description = field.metadata['item'], field.metadata['description']
+    if item.choices:
+        description += ': ' + ' | '.join(item.choices)
     # Dynamic typing: check_value accepts 2 for 2.0, as the tool does, and lists may be empty.
     descriptor = ParameterDescriptor(description=description, dynamic_typing=True)
-    low, high = meta['low'], meta['high']
-    if (low is None and high is None) or isinstance(field.default, (bool, tuple)):
+    low, high = item.low, item.high
+    if (low, high) == (-MOST, MOST) or isinstance(field.default, (bool, tuple)):
         return descriptor
     if isinstance(field.default, int):
-        bounds = IntegerRange(
-            from_value=-(2**63) if low is None else int(low),
-            to_value=2**63 - 1 if high is None else int(high),
-        )
-        descriptor.integer_range = [bounds]
+        whole = int(max(low, -(2**63))), int(min(high, 2**63 - 1))
+        descriptor.integer_range = [IntegerRange(from_value=whole[0], to_value=whole[1])]
     else:
-        most = sys.float_info.max
-        bounds = FloatingPointRange(
-            from_value=-most if low is None else float(low),
-            to_value=most if high is None else float(high),
-        )
+        bounds = FloatingPointRange(from_value=float(low), to_value=float(high))
         descriptor.floating_point_range = [bounds]
     return descriptor
 

@@ -104,9 +104,9 @@ class StarObserver(StarcalNode):
         self._restarts = self._retried = self._retried_used = 0
         self._last_refusal = self._bad_velocity = ''
         self._velocities_left_out = 0
-        self._unmatched = Unmatched(
-            self._setup, functools.partial(self._in_worker, self._on_diagnosis)
-        )
+        first = self._star_trackers.histories[0]
+        on_diagnosis = functools.partial(self._in_worker, self._on_diagnosis)
+        self._unmatched = Unmatched(self._setup, first, on_diagnosis)
         self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
             _IMAGES, self._own.attitude_timeout_s, self._star_trackers.has_come
@@ -214,8 +214,6 @@ class StarObserver(StarcalNode):
             self._camera_infos.publish(camera_info)
 
     def _on_attitude(self, message: Any) -> None:
-        time_ns, quaternion = sensor_messages.attitude_from_message(message)
-        self._unmatched.add_attitude(time_ns, quaternion)
         history = self._star_trackers.histories[0]
         before_ns = history.latest_ns
         self._add_attitude(0, message)
@@ -430,7 +428,7 @@ class StarObserver(StarcalNode):
         picture = annotation.annotate(image, observations, geometry)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
-            sensor_messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
+            sensor_messages.image_to_message(image.time_ns, picture, frame_id, make_message)
         )
 
 

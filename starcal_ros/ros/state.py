@@ -12,19 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_ros import errors
+from starcal_ros import errors, records
 from starcal_ros.assessment.gate import judge, reasons_of, REMEDIES, requirement_answers
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method
-from starcal_ros.records import (
-    Activation,
-    Calibration,
-    counted_refusal,
-    Ensemble,
-    EnsembleStatus,
-    IMAGE_REFUSALS,
-    StarObservations,
-)
 
 if TYPE_CHECKING:
     from starcal_ros.ros.archive import Archive
@@ -42,7 +33,7 @@ class Answer:
 
     success: bool
     message: str
-    calibration: Calibration | None = None
+    calibration: records.Calibration | None = None
     active: bool = False
 
 
@@ -68,10 +59,10 @@ class CalibratorState:
         # Guards the fields below; never held during a solve.  Activations change only with both
         # locks held, `_disk` first.
         self._records = threading.Lock()
-        self._ensemble = Ensemble()
+        self._ensemble = records.Ensemble()
         self._details: dict[str, str] = {}  # of the last image refused for each reason
-        self._history: tuple[Activation, ...] = ()
-        self._active: Activation | None = None  # of the history
+        self._history: tuple[records.Activation, ...] = ()
+        self._active: records.Activation | None = None  # of the history
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
@@ -144,46 +135,46 @@ class CalibratorState:
             self._archive = None
 
     @property
-    def ensemble(self) -> Ensemble:
+    def ensemble(self) -> records.Ensemble:
         """The images collected."""
         with self._records:
             return self._ensemble
 
     @property
-    def active(self) -> Calibration | None:
+    def active(self) -> records.Calibration | None:
         """The active calibration."""
         with self._records:
             return self._active.calibration if self._active else None
 
     @property
-    def active_on_disk(self) -> Calibration | None:
+    def active_on_disk(self) -> records.Calibration | None:
         """The active calibration, once an activation under way is on disk."""
         with self._disk:
             return self.active
 
-    def add(self, observations: StarObservations) -> None:
+    def add(self, observations: records.StarObservations) -> None:
         """Add one image, or count the reason why it was refused."""
         with self._records:
             ensemble = self._ensemble
         grown = solving.add_to_ensemble(ensemble, observations, self._setup)
         with self._records:
             if self._ensemble is not ensemble:  # emptied meanwhile: start with this image
-                grown = solving.add_to_ensemble(Ensemble(), observations, self._setup)
+                grown = solving.add_to_ensemble(records.Ensemble(), observations, self._setup)
             self._ensemble = grown
             if observations.refusal:
-                self._details[counted_refusal(observations.refusal)] = observations.detail
+                self._details[records.counted_refusal(observations.refusal)] = observations.detail
         self.save()
 
     def reset(self) -> Answer:
         """Empty the ensemble."""
         with self._records:
             images = len(self._ensemble.images)
-            self._ensemble = Ensemble()
+            self._ensemble = records.Ensemble()
             self._details.clear()
         self.save()
         return self._answer(f'{images} images dropped; the active calibration stays')
 
-    def status(self) -> EnsembleStatus:
+    def status(self) -> records.EnsembleStatus:
         """Images and stars collected, and the predicted precision of a calibration from them."""
         ensemble = self.ensemble
         with self._disk:
@@ -230,7 +221,10 @@ class CalibratorState:
         reason = max(refused, key=lambda name: refused[name])
         with self._records:
             detail = self._details.get(reason, '')
-        words = (detail.rstrip('.') or IMAGE_REFUSALS.get(reason, ''), REMEDIES.get(reason, ''))
+        words = (
+            detail.rstrip('.') or records.IMAGE_REFUSALS.get(reason, ''),
+            REMEDIES.get(reason, ''),
+        )
         return f'; {refused[reason]} images refused as {reason}: {"; ".join(filter(None, words))}'
 
     def rollback(self) -> Answer:
@@ -283,10 +277,12 @@ class CalibratorState:
         last = self._history[-1].event if self._history else 0
         return 1 + max(last, self._archive.last_event if self._archive else 0)
 
-    def _activate(self, number: int, before: int, calibration: Calibration) -> Calibration:
+    def _activate(
+        self, number: int, before: int, calibration: records.Calibration
+    ) -> records.Calibration:
         """Activate a calibration from now on, and save it before anyone else can activate one."""
         active = dataclasses.replace(calibration, number=number, active_since_ns=self._now_ns())
-        record = Activation(self._next_event(), before, active)
+        record = records.Activation(self._next_event(), before, active)
         with self._records:
             self._history = (*self._history, record)[-_HISTORY:]
             self._active, self.withheld = record, ()
@@ -298,7 +294,7 @@ class CalibratorState:
         return Answer(True, message + unsaved)
 
 
-def refusals_today(calibration: Calibration, setup: Setup) -> tuple[str, ...]:
+def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str, ...]:
     """
     Reasons why a stored calibration must not become active, a sentence each; empty if it may.
 
@@ -324,7 +320,7 @@ def refusals_today(calibration: Calibration, setup: Setup) -> tuple[str, ...]:
     return reasons_of(check for check in checks if check.name not in overridden)
 
 
-def summary(calibration: Calibration) -> str:
+def summary(calibration: records.Calibration) -> str:
     """One line on a calibration."""
     fit = (
         f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
@@ -334,7 +330,7 @@ def summary(calibration: Calibration) -> str:
 
 
 def _check_size(
-    folder: str, ensemble: Ensemble, history: tuple[Activation, ...], setup: Setup
+    folder: str, ensemble: records.Ensemble, history: tuple[records.Activation, ...], setup: Setup
 ) -> None:
     """Raise OptionError where every record of a folder is of another camera."""
     prior = setup.prior.camera
@@ -351,11 +347,11 @@ def _check_size(
         )
 
 
-def _of_size(ensemble: Ensemble, archive: Archive, setup: Setup) -> Ensemble:
+def _of_size(ensemble: records.Ensemble, archive: Archive, setup: Setup) -> records.Ensemble:
     """The ensemble without images of another size, whose files are set aside."""
     size = (setup.prior.camera.width, setup.prior.camera.height)
     for image in ensemble.images:
         if (image.width, image.height) != size:
             archive.set_aside_image(image.time_ns, f'an image of {image.width} x {image.height}')
     kept = tuple(image for image in ensemble.images if (image.width, image.height) == size)
-    return Ensemble(kept, ensemble.refused)
+    return records.Ensemble(kept, ensemble.refused)

@@ -12,7 +12,7 @@ import threading
 
 import numpy as np
 
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
@@ -73,10 +73,12 @@ def attitude_sample(
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or abs(norm - 1.0) > _NORM_TOLERANCE:
         return None
-    q = q / norm
-    if direction == 'inertial_to_st':
-        q = q * np.array([-1.0, -1.0, -1.0, 1.0])
-    return AttitudeSample(time_ns, q)
+    return AttitudeSample(time_ns, with_direction(q / norm, direction))
+
+
+def with_direction(xyzw: Floats, direction: str) -> Floats:
+    """Quaternions (..., 4) of messages as ``icrf_from_star_tracker``, or those as messages."""
+    return xyzw * [-1.0, -1.0, -1.0, 1.0] if direction == 'inertial_to_st' else xyzw
 
 
 def _nanoseconds(seconds: float) -> int:
@@ -124,6 +126,15 @@ class AttitudeHistory:
                 if len(run) > 1:
                     return run.last_ns
             return self._runs[-1].last_ns if self._runs else None
+
+    def samples(self) -> tuple[Indices, Floats]:
+        """Stamps (n,), ns, and attitudes (n, 4) of the valid samples, in time order."""
+        with self._lock:
+            columns = [run.columns() for run in self._runs] or [_Run().columns()]
+        time_ns, xyzw = (np.concatenate(column) for column in zip(*columns, strict=True))
+        valid = np.isfinite(xyzw[:, 0])
+        time_ns, rows = np.unique(time_ns[valid], return_index=True)
+        return time_ns, xyzw[valid][rows]
 
     def add(self, time_ns: int, sample: AttitudeSample | None) -> None:
         """Insert a sample; None marks an invalid sample at this stamp."""
@@ -219,6 +230,11 @@ class _Run:
 
     def __len__(self) -> int:
         return len(self._times_ns) - self._start
+
+    def columns(self) -> tuple[Indices, Floats]:
+        """Stamps (n,) and attitudes (n, 4); NaN for an invalid one."""
+        xyzw = np.array(self._xyzw[4 * self._start :]).reshape(-1, 4)
+        return np.array(self._times_ns[self._start :], np.int64), xyzw
 
     @property
     def first_ns(self) -> int:

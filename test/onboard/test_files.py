@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from starcal_ros.files import is_marked, mark, replacing, same_as_one_of
+from starcal_ros.files import is_marked, mark, replacing
 
 
 def names(folder: Path) -> list[str]:
@@ -78,15 +78,3 @@ def test_unfinished_files_of_ended_writers_are_removed_and_no_others(tmp_path: P
         assert path.read_text() == 'inner'
     assert path.read_text() == 'outer'
     assert names(tmp_path) == ['.b.12345678.part', 'a[1]']
-
-
-def test_a_file_is_recognised_by_any_name(tmp_path: Path) -> None:
-    path = tmp_path / 'a'
-    path.write_text('')
-    (tmp_path / 'link').symlink_to(path)
-    (tmp_path / 'hard').hardlink_to(path)
-    (tmp_path / 'other').write_text('')
-    for name in ('a', 'link', 'hard', '../' + tmp_path.name + '/a'):
-        assert same_as_one_of(tmp_path / name, [tmp_path / 'none', path])
-    assert not same_as_one_of(tmp_path / 'other', [path])
-    assert not same_as_one_of(tmp_path / 'none', [tmp_path / 'none'])

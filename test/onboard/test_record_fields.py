@@ -91,7 +91,7 @@ def test_a_field_with_a_default_may_be_missing() -> None:
     ('key', 'value', 'error'),
     [
         ('name', 3, 'name: 3 is not a text'),
-        ('count', -1, 'count: -1 is not at least 0'),
+        ('count', -1, 'count: -1 is not within 0 to 4294967295'),
         ('count', 10, 'count: 10 is over 9'),
         ('count', 1.5, 'count: 1.5 is not a whole number'),
         ('one', None, 'one: None is not an object'),

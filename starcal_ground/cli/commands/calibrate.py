@@ -34,7 +34,6 @@ from typing import TYPE_CHECKING
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict, print_wrapped
 from starcal_ros.errors import NotFromStars, OptionError
-from starcal_ros.files import same_as_one_of
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
@@ -105,7 +104,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
     """The set-up that the arguments give, and its source; a failure is recorded in the folder."""
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
-    from starcal_ground.outputs import check_outputs, make_folder
+    from starcal_ground.outputs import check_outputs, make_folder, same_as_one_of
     from starcal_ros.assessment.gate import requirements_of
 
     requirements_of(args.require or ())
@@ -205,7 +204,7 @@ def print_calibration(
 
 
 def _print_budget(calibration: Calibration, verbose: bool) -> None:
-    from starcal_ros.records import parts_that_matter
+    from starcal_ground.report.verdict import parts_that_matter
 
     columns = 3 if calibration.has_alignment else 2
     parts = parts_that_matter(calibration.sigma_budget)

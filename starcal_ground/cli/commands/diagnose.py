@@ -39,5 +39,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         arguments.print_json(diagnosis)
     else:
-        terminal.print_text('\n'.join(diagnosis.in_lines()))
+        lines = [diagnosis.sentence, '', 'evidence:', *(f'  {x}' for x in diagnosis.evidence)]
+        if diagnosis.mend:
+            lines += ['', 'in the parameter file:', *(f'  {x}' for x in diagnosis.mend)]
+        terminal.print_text('\n'.join(lines))
     return arguments.EXIT_ACCEPTED if diagnosis.cause == 'none' else arguments.EXIT_REFUSED

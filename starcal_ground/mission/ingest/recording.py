@@ -24,7 +24,6 @@ from starcal_ground.images import photographs
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
-from starcal_ros.files import same_as_one_of
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Image
@@ -105,7 +104,7 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     """
     record, params, copied = _files_beside(bag)
     prior = [params] if camera else []
-    if camera and not same_as_one_of(copied, [camera]):
+    if camera and not outputs.same_as_one_of(copied, [camera]):
         prior.append(copied)
     outputs.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
 
@@ -295,6 +294,6 @@ def _prior_files(
         values['saturation_dn'] = (min(saturation) - scale.offset) / scale.step
     content = {'/**': {'ros__parameters': values}}
     texts = {params: yaml.safe_dump(content, sort_keys=False, default_flow_style=None)}
-    if not same_as_one_of(copied, [prior.camera]):
+    if not outputs.same_as_one_of(copied, [prior.camera]):
         texts[copied] = product_files.read_text(prior.camera, PARAMETER_BYTES)
     return texts

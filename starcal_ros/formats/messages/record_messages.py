@@ -183,21 +183,28 @@ def calibration_from_message(message: codec.Message) -> Calibration:
     return calibration
 
 
-def camera_info_to_message(calibration: Calibration, make: codec.Make) -> codec.Message:
-    """Return a sensor_msgs/CameraInfo: the best camera without skew, which readers ignore."""
-    camera, _ = ros_fit(calibration.geometry.camera)
+def camera_info_fields(camera: CameraModel) -> dict[str, Any]:
+    """Size, lens and matrices of a CameraInfo: the best camera without skew (`ros_fit`)."""
+    camera, _ = ros_fit(camera)
     fx, _, fy, cx, cy = camera.intrinsics
     distortion_model, D = ros_distortion(camera.model, camera.distortion)
+    return {
+        'height': camera.height,
+        'width': camera.width,
+        'distortion_model': distortion_model,
+        'd': D,
+        'k': np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        'r': np.eye(3).ravel(),
+        'p': np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+    }
+
+
+def camera_info_to_message(calibration: Calibration, make: codec.Make) -> codec.Message:
+    """Return a sensor_msgs/CameraInfo: the best camera without skew, which readers ignore."""
     return make(
         codec.CAMERA_INFO_TYPE,
         header=codec.make_header(calibration.time_ns, calibration.child_frame, make),
-        height=camera.height,
-        width=camera.width,
-        distortion_model=distortion_model,
-        d=D,
-        k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        r=np.eye(3).ravel(),
-        p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        **camera_info_fields(calibration.geometry.camera),
         binning_x=0,
         binning_y=0,
         roi=make(
@@ -245,8 +252,3 @@ def status_to_message(status: EnsembleStatus, frame_id: str, make: codec.Make) -
     """Return a starcal/EnsembleStatus; ``frame_id`` is the camera's."""
     values = plain_record(status)
     return make(codec.STATUS_TYPE, **codec.message_fields(EnsembleStatus, values, make, frame_id))
-
-
-def status_from_message(message: codec.Message) -> EnsembleStatus:
-    """Status of a starcal/EnsembleStatus; raises ValueError as `record_from_message`."""
-    return codec.record_from_message(EnsembleStatus, message)

@@ -9,6 +9,7 @@ import contextlib
 import math
 import operator
 import struct
+import sys
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 import zlib
@@ -315,20 +316,20 @@ def refused_from_message(
     )
 
 
-def color_image_to_message(
-    time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: codec.Make
+def image_to_message(
+    time_ns: int, pixels: NDArray[Any], frame_id: str, make: codec.Make
 ) -> codec.Message:
-    """Return a sensor_msgs/Image bgr8 of a (height, width, 3) picture."""
-    height, width, _ = bgr.shape
+    """Return a sensor_msgs/Image, mono8 or mono16 of (height, width), bgr8 of (h, w, 3)."""
+    pixels = np.ascontiguousarray(pixels)
     return make(
         codec.IMAGE_TYPE,
         header=codec.make_header(time_ns, frame_id, make),
-        height=height,
-        width=width,
-        encoding='bgr8',
-        is_bigendian=0,
-        step=width * 3,
-        data=np.ascontiguousarray(bgr).reshape(-1),
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding='bgr8' if pixels.ndim == 3 else f'mono{8 * pixels.itemsize}',
+        is_bigendian=int(sys.byteorder == 'big'),
+        step=pixels.strides[0],
+        data=pixels.reshape(-1).view(np.uint8),
     )
 
 

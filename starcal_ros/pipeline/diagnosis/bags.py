@@ -17,8 +17,7 @@ from starcal_ros.assessment.gate import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.frames import read_frames
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message
+from starcal_ros.formats.bag.frames import read_frames, read_telemetry
 from starcal_ros.identification.blind.images import LOOKED_AT
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.diagnosis.diagnose import (
@@ -74,7 +73,8 @@ def diagnose_bags(
         return unread
     if not topics.attitude:
         raise BagError(f'{paths[0]}: no attitudes of the first star tracker, only of others')
-    attitudes = _attitudes(paths, topics.attitude)
+    telemetry = read_telemetry(paths, Topics(attitude=topics.attitude), setup.attitude)
+    attitudes = wire_attitudes(telemetry.attitudes, setup.attitude.attitude_direction)
     spans = _without_common_time(first, attitudes)
     shift_ns = spans[1][0] - spans[0][0] if spans else 0
     images = _images(paths, topics.image, setup, shift_ns)
@@ -89,17 +89,6 @@ def diagnose_bags(
     count = sum(group.count for group in refused)
     by_itself = [group for group in refused if group.reason not in ('no_match', 'no_stars')]
     return of_refusals(by_itself, count) or diagnosis
-
-
-def of_a_failure(
-    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused]
-) -> Diagnosis | None:
-    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
-    try:
-        diagnosis = diagnose_bags(paths, requested, setup, refused)
-    except BagError:
-        return None
-    return None if diagnosis.cause == 'none' else diagnosis
 
 
 def aligned_by_bags(paths: Sequence[Path], requested: Topics, setup: Setup) -> tuple[Setup, str]:
@@ -131,20 +120,6 @@ def _images(paths: Sequence[Path], topic: str, setup: Setup, shift_ns: int = 0) 
     for image in reader.read_images(paths, topic, offset_s, channel=channel):
         if isinstance(image, Image):
             yield Image(image.time_ns + shift_ns, image.pixels)
-
-
-def _attitudes(paths: Sequence[Path], topic: str) -> WireAttitudes:
-    """Every attitude of bags that is a rotation, in time order."""
-    stamps: list[int] = []
-    numbers = []
-    for raw in reader.read_raw(paths, [topic]):
-        try:
-            time_ns, quaternion = attitude_from_message(reader.decode(raw))
-        except (BagError, ImageRefused):
-            continue
-        stamps.append(time_ns)
-        numbers.append(quaternion)
-    return wire_attitudes(stamps, numbers)
 
 
 def of_refusals(refused: Sequence[Refused], images: int) -> Diagnosis | None:

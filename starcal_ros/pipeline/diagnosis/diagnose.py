@@ -28,6 +28,7 @@ from starcal_ros.identification.blind.images import Identified, identify_images,
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Image
+from starcal_ros.sky.attitude import AttitudeHistory, with_direction
 from starcal_ros.sky.catalog import StarCatalog
 
 CAUSES = (
@@ -53,7 +54,6 @@ _WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance agreement is this close in o
 _TURNED_RAD = math.radians(5.0)  # roll of a mounting that is right but for quarter turns
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 _ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in range(4)]
-_NORM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,10 @@ class WireAttitudes:
     quaternion: Floats
 
 
-def wire_attitudes(stamps_ns: Sequence[int], quaternions: Sequence[Floats]) -> WireAttitudes:
-    """Valid rotations among the attitudes, in time order, the numbers as received."""
-    numbers = np.array(quaternions, np.float64).reshape(-1, 4)
-    norm = np.linalg.norm(numbers, axis=1)
-    good = np.abs(norm - 1.0) <= _NORM_TOLERANCE  # false for NaN
-    times, first = np.unique(np.array(stamps_ns, np.int64)[good], return_index=True)
-    return WireAttitudes(times, (numbers[good] / norm[good, None])[first])
+def wire_attitudes(history: AttitudeHistory, direction: str) -> WireAttitudes:
+    """The valid attitudes of a history as received; ``direction`` is `attitude_direction`."""
+    time_ns, xyzw = history.samples()
+    return WireAttitudes(time_ns, with_direction(xyzw, direction))
 
 
 @dataclass(frozen=True)
@@ -317,12 +314,6 @@ class Diagnosis:
     mend: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
     images: int = 0
-
-    def in_lines(self) -> list[str]:
-        """The sentence, the evidence and the remedy, as lines for a terminal."""
-        lines = [self.sentence, '', 'evidence:', *(f'  {line}' for line in self.evidence)]
-        mend = ['', 'in the parameter file:', *(f'  {line}' for line in self.mend)]
-        return lines + mend if self.mend else lines
 
     def in_a_sentence(self, command: str = 'starcal diagnose') -> str:
         """Cause and remedy, as the end of a complaint; ``command`` gives the evidence, if any."""

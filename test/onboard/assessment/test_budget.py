@@ -18,7 +18,7 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.posterior import with_shared_errors
-from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, parts_that_matter, SigmaPart
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart
 from studies.worlds import Campaign, simulate, World
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
@@ -230,18 +230,6 @@ def test_the_covariance_is_the_root_with_its_parts() -> None:
     # The part of the place errors on top of independent noise.
     gone = (errors.excess - again.errors.excess)[0, 0]
     assert 0.0 < gone < sum(one[0, 0] for one in errors.shared.values())
-
-
-def test_only_parts_that_matter_are_printed() -> None:
-    budget_of = [
-        SigmaPart('total', 1.0, 10.0, ''),
-        SigmaPart('stars', 0.2, 0.1, 'a'),
-        SigmaPart('velocity', 0.6, 0.1, 'b'),
-        SigmaPart('star tracker noise', 0.0, 9.9, 'c'),
-    ]
-    found = [part.cause for part in parts_that_matter(budget_of)]
-    assert found == ['total', 'star tracker noise', 'velocity']
-    assert parts_that_matter([]) == []
 
 
 def test_without_an_alignment_no_star_tracker_is_a_cause() -> None:

@@ -43,7 +43,7 @@ def setup(camera_yaml: Path) -> Setup:
 
 
 def test_stars_are_observed(setup: Setup) -> None:
-    found = observe.observe(image(), attitudes(), setup, setup.prior)
+    found = observe.observe_next(image(), attitudes(), setup)[0]
     assert found.refusal == '' and len(found) > 100
     assert found.attitude_gap_s == 0.5
     assert found.time_ns == image().time_ns
@@ -76,7 +76,7 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     moved_px = pixel_px - drawn.pixel_px
     assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
     seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
-    found = observe.observe(seen, attitudes(), made, TRUTH)
+    found = observe.observe_next(seen, attitudes(), made, observe.Track(TRUTH))[0]
     place = {
         number: (pixel, direction)
         for number, pixel, direction in zip(
@@ -100,14 +100,14 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     bent_icrf, elevation_rad = through_the_air(drawn.direction_icrf, drawn.time_ns, low.site)
     pixel_px = project(TRUTH.camera, bent_icrf @ drawn.camera_from_icrf.T)
     seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
-    upper = observe.observe(seen, attitudes(), low, TRUTH)
+    upper = observe.observe_next(seen, attitudes(), low, observe.Track(TRUTH))[0]
     used = np.isin(drawn.catalog_id, upper.catalog_id)
     assert 30 < len(upper) < len(found) and np.degrees(elevation_rad[used].min()) >= 10.0
 
 
 def test_an_image_of_another_size_is_refused(setup: Setup) -> None:
     small = Image(image().time_ns, image().pixels[:-2].copy())
-    found = observe.observe(small, attitudes(), setup, setup.prior)
+    found = observe.observe_next(small, attitudes(), setup)[0]
     assert (found.refusal, found.detail) == (
         'wrong_size',
         'image of 640 x 510, prior camera of 640 x 512',
@@ -132,16 +132,16 @@ def test_an_image_without_attitude_is_refused(setup: Setup) -> None:
         (wide, 'attitude_gap'),
         (spoilt, 'bad_attitude'),
     ):
-        found = observe.observe(image(), held, setup, setup.prior)
+        found = observe.observe_next(image(), held, setup)[0]
         assert found.refusal == reason and found.detail
         assert np.isnan(found.attitude_gap_s)
 
 
 def test_an_image_that_nothing_explains_keeps_its_attitude(setup: Setup) -> None:
     noise = np.random.default_rng(5).normal(40.0, 3.0, image().pixels.shape)
-    found = observe.observe(
-        Image(image().time_ns, noise.astype(np.uint16)), attitudes(), setup, setup.prior
-    )
+    found = observe.observe_next(
+        Image(image().time_ns, noise.astype(np.uint16)), attitudes(), setup
+    )[0]
     assert found.refusal == 'no_stars'
     assert found.attitude_gap_s == 0.5
     assert found.catalog_digest == setup.catalog.digest
@@ -273,8 +273,8 @@ def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) ->
     url = write_png(tmp_path / 'dark.png', dark)
     with_dark = load_setup(values(camera_yaml, dark_frame='file://' + url))
     np.testing.assert_array_equal(with_dark.dark, dark)
-    spoilt = observe.observe(one_image, attitudes(), without, without.prior)
-    found = observe.observe(one_image, attitudes(), with_dark, with_dark.prior)
+    spoilt = observe.observe_next(one_image, attitudes(), without)[0]
+    found = observe.observe_next(one_image, attitudes(), with_dark)[0]
     assert found.refusal == '' and len(found) > max(150, 2 * len(spoilt))
     # The noise of the image alone is left, and nothing is cut off at zero below the dark level.
     assert found.noise_dn == pytest.approx(1.2, rel=0.1)
@@ -289,14 +289,14 @@ def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
     url = write_png(tmp_path / 'dark.png', np.full((512, 640), 7, np.uint8))
     made = load_setup(values(camera_yaml, dark_frame=url))
     assert made.dark is not None and made.dark.dtype == np.uint8
-    found = observe.observe(image(), attitudes(), made, made.prior)
+    found = observe.observe_next(image(), attitudes(), made)[0]
     assert found.refusal == 'bad_encoding'
     assert found.detail == 'uint16 image, the dark frame is uint8'
     one = scene(SCENARIO, 1)
     light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 100.0
     noise = np.random.default_rng(1).normal(0, 1.0, light.shape)
     pixels = np.clip(np.rint(light + 7 + noise), 0, 255).astype(np.uint8)
-    byte = observe.observe(Image(image().time_ns, pixels), attitudes(), made, made.prior)
+    byte = observe.observe_next(Image(image().time_ns, pixels), attitudes(), made)[0]
     assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
 
 
@@ -324,7 +324,7 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
     for index in range(1, 4):
         for sample in attitude_samples(SCENARIO, index):
             held.add(sample.time_ns, sample)
-    plain = observe.observe(image(3), held, setup, setup.prior)
+    plain = observe.observe_next(image(3), held, setup)[0]
     star = np.argsort(plain.snr)[len(plain) // 2]
     u, v = np.rint(plain.measured_px[star] + [1.0, 0.0]).astype(int)
     for index in (1, 2, 3):
@@ -343,13 +343,13 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
 def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
     camera_yaml: Path, tmp_path: Path, setup: Setup
 ) -> None:
-    plain = observe.observe(image(), attitudes(), setup, setup.prior)
+    plain = observe.observe_next(image(), attitudes(), setup)[0]
     u, v = np.rint(plain.measured_px[0]).astype(int)
     dark = np.full(image().pixels.shape, 32, np.uint16)
     dark[v, u] = 60
     cv2.imwrite(str(tmp_path / 'dark.png'), dark)
     made = load_setup(values(camera_yaml, dark_frame=str(tmp_path / 'dark.png')))
-    found = observe.observe(image(), attitudes(), made, made.prior)
+    found = observe.observe_next(image(), attitudes(), made)[0]
     assert found.refused_stars['hot_pixel'] == 1
     assert plain.catalog_id[0] not in found.catalog_id
 
@@ -362,12 +362,10 @@ def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
     path = write_png(tmp_path / 'dark.png', dark)
     made = load_setup(values(camera_yaml, dark_frame=path, max_saturated_pixels=0))
     pixels = image().pixels.copy()
-    plain = observe.observe(image(), attitudes(), made, made.prior)
+    plain = observe.observe_next(image(), attitudes(), made)[0]
     u, v = np.rint(plain.measured_px[plain.snr.argmax()]).astype(int)
     pixels[v - 1 : v + 2, u - 1 : u + 2] = 4095
-    found = observe.observe(
-        dataclasses.replace(image(), pixels=pixels), attitudes(), made, made.prior
-    )
+    found = observe.observe_next(dataclasses.replace(image(), pixels=pixels), attitudes(), made)[0]
     brightest = plain.catalog_id[plain.snr.argmax()]
     reason = found.refused_reason[found.refused_catalog_id == brightest]
     assert [list(found.refused_stars)[code] for code in reason] == ['saturated']
@@ -410,7 +408,7 @@ def test_the_rate_of_the_star_tracker_is_recorded(setup: Setup) -> None:
     for time_s, turned in ((-0.5, middle * step.inv()), (0.5, middle * step)):
         time_ns = image().time_ns + round(time_s * S)
         held.add(time_ns, attitude_sample(time_ns, turned.as_quat(), 'st_to_inertial'))
-    found = observe.observe(image(), held, setup, setup.prior)
+    found = observe.observe_next(image(), held, setup)[0]
     assert not found.refusal
     expected = np.radians([0.0, 0.02, 0.0])
     np.testing.assert_allclose(found.star_tracker_rate_rad_s, expected, atol=1e-12)
@@ -448,10 +446,10 @@ def test_the_sigma_of_the_velocity_is_recorded(
     given = None if measured_m_s is None else np.array(measured_m_s)
     blank = Image(image().time_ns, np.full_like(image().pixels, 32))
     for one in (image(), blank):
-        found = observe.observe(one, attitudes(), setup, setup.prior, given)
+        found = observe.observe_next(one, attitudes(), setup, None, given)[0]
         np.testing.assert_equal(found.velocity_sigma_m_s, sigma_m_s)
     if sigma_m_s == 10.0:
-        found = observe.observe(image(), attitudes(), setup, setup.prior, given)
+        found = observe.observe_next(image(), attitudes(), setup, None, given)[0]
         stars = setup.catalog.select(np.flatnonzero(np.isin(setup.catalog.id, found.catalog_id)))
         expected = apparent_directions(stars, image().time_ns, np.array([0.0, 3e4, 0.0]))
         order, by_id = np.argsort(found.catalog_id), np.argsort(stars.id)

@@ -35,7 +35,7 @@ def response() -> np.ndarray:
 
 
 def observed(pixels: np.ndarray, setup: Setup) -> StarObservations:
-    return observe.observe(Image(image().time_ns, pixels), attitudes(), setup, setup.prior)
+    return observe.observe_next(Image(image().time_ns, pixels), attitudes(), setup)[0]
 
 
 def test_a_flat_field_restores_the_flux_of_the_stars(camera_yaml: Path, tmp_path: Path) -> None:

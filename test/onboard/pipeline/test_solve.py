@@ -179,7 +179,7 @@ def test_from_pixels_to_a_calibration_that_is_true(setup: Setup) -> None:
             held.add(sample.time_ns, sample)
     collected = Ensemble()
     for index in range(10):
-        found = observe.observe(image(index), held, setup, setup.prior)
+        found = observe.observe_next(image(index), held, setup)[0]
         collected = solve.add_to_ensemble(collected, found, setup)
     assert len(collected.images) == 10
     calibration = solve.solve(collected, setup)[0]

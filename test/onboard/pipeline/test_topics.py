@@ -93,8 +93,8 @@ def with_topics(folder: Path, kinds: dict[str, str]) -> list[Path]:
     with BagWriter(folder) as writer:
         writer.write_image('/image', images()[0], 'camera')
         for name, kind in kinds.items():
-            channel, _ = writer.messages._open(name, kind)
-            writer.messages._writer.add_message(channel, 1, b'', publish_time=1)
+            channel, _ = writer._open(name, kind)
+            writer._writer.add_message(channel, 1, b'', publish_time=1)
     return [folder]
 
 

@@ -37,7 +37,7 @@ from starcal_ros.formats.messages.message_codec import (
     IMAGE_TYPE,
     stamp_ns,
 )
-from starcal_ros.formats.messages.sensor_messages import color_image_to_message
+from starcal_ros.formats.messages.sensor_messages import image_to_message as picture_to_message
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
@@ -226,12 +226,12 @@ def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     """A colour image and an undecodable message become refusals between the other images."""
-    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', make_message)
+    bad = picture_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', make_message)
     with BagWriter(tmp_path / 'mixed') as writer:
         writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
         writer.write('/image', IMAGE_TYPE, 7, bad)
-        number, _ = writer.messages._channels['/image']
-        writer.messages._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
+        number, _ = writer._channels['/image']
+        writer._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
         writer.write_image('/image', Image(9, np.zeros((2, 3), np.uint8)), '')
     first, second, third, last = images_of(tmp_path / 'mixed', stamp_offset_s=1e-9)
     assert isinstance(first, Image) and first.time_ns == 7

@@ -62,7 +62,7 @@ def test_constants_of_the_definitions_are_those_of_the_code() -> None:
     fields = {name: value for name, _, value in store.fielddefs[CALIBRATION_TYPE][0]}
     (method,) = (f for f in dataclasses.fields(CalibrationOptions) if f.name == 'method')
     assert {fields[name] for name in ('PER_IMAGE', 'SINGLE', 'HIERARCHICAL')} == set(
-        method.metadata['choices']
+        method.metadata['item'].choices
     )
     source = Path(levenberg_marquardt.__file__).read_text()
     for name in ('CONVERGED', 'NO_DESCENT', 'ITERATION_LIMIT'):

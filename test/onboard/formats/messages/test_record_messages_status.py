@@ -11,8 +11,8 @@ import pytest
 from sample_records import plain, status, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import stamp_ns
-from starcal_ros.formats.messages.record_messages import status_from_message, status_to_message
+from starcal_ros.formats.messages.message_codec import record_from_message, stamp_ns
+from starcal_ros.formats.messages.record_messages import status_to_message
 from starcal_ros.records import EnsembleStatus
 
 
@@ -33,6 +33,6 @@ def test_a_status_has_every_number(make: Any) -> None:
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
 def test_a_status_comes_back(make: Any) -> None:
     record = status()
-    back = status_from_message(status_to_message(record, 'cam', make))
+    back = record_from_message(EnsembleStatus, status_to_message(record, 'cam', make))
     for field in dataclasses.fields(EnsembleStatus):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(record, field.name))

@@ -67,8 +67,9 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
-    fx=st.floats(1e3, 1e7),
-    others=st.lists(st.floats(-1e-3, 1e-3), min_size=8, max_size=8),
+    fx=st.floats(1e3, 5e5),
+    centre=st.tuples(st.floats(100.0, 1200.0), st.floats(100.0, 1200.0)),
+    others=st.lists(st.floats(-1e-3, 1e-3), min_size=6, max_size=6),
     covariance=st.lists(finite, min_size=169, max_size=169),
     quaternion=st.tuples(*[st.floats(0.1, 1.0)] * 4),
     number=finite,
@@ -76,12 +77,13 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 def test_any_finite_number_comes_back(
     tmp_path: Path,
     fx: float,
+    centre: tuple[float, float],
     others: list[float],
     covariance: list[float],
     quaternion: tuple[float, ...],
     number: float,
 ) -> None:
-    parameters = np.array([fx, others[0], fx, *others[1:]])
+    parameters = np.array([fx, others[0], fx, *centre, *others[1:]])
     rotation = np.array(quaternion) / np.linalg.norm(quaternion)
     record = dataclasses.replace(
         plain_calibration(),
@@ -170,6 +172,8 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         (lambda c: c.pop('covariance'), "key 'covariance' is missing"),
         (lambda c: c['intrinsics'].pop('fy'), "key 'intrinsics.fy' is missing"),
         (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
+        # As a prior camera is refused.
+        (lambda c: c['intrinsics'].update(fy=9e3), 'fx, fy: .* differ by more than a factor of'),
         (lambda c: c['distortion'].update(k1='a'), "distortion.k1: 'a' is not a number"),
         (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
         (lambda c: c['covariance'].pop(), 'covariance: 12 x 13 numbers, not 12 x 12'),
@@ -181,7 +185,9 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
         (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
         (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
-        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not at least 0'),
+        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
+        # No message can hold it, so that a calibrator could not publish it.
+        (lambda c: c.update(iterations=2**32), 'iterations: 4294967296 is not within 0 to '),
         (lambda c: c.update(images_used=2**70), 'images_used: .* is not within 64 bit'),
         (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
         (lambda c: c.update(residual_rms_px=True), 'residual_rms_px: True is not a number'),

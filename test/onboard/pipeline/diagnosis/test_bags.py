@@ -19,6 +19,7 @@ from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image
 from starcal_ros.ros.image_queue import Unmatched
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 
@@ -55,11 +56,16 @@ def test_an_alignment_not_found_is_said(unaligned: Setup) -> None:
         aligned_by_bags([TINY], Topics(), wrong)
 
 
-def test_attitudes_that_are_no_rotation_are_left_out() -> None:
-    numbers = [np.array(q) for q in ([0, 0, 0, 1.0], [0, 0, 0, 0.5], [np.nan] * 4, [1.0, 0, 0, 0])]
-    kept = wire_attitudes([30, 20, 15, 10], numbers)
+@pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
+def test_the_valid_attitudes_are_looked_at_as_they_were_received(direction: str) -> None:
+    history = AttitudeHistory()
+    assert wire_attitudes(history, direction).quaternion.shape == (0, 4)
+    sent = {30: [0.6, 0, 0, 0.8], 20: [0, 0, 0, 0.5], 15: [np.nan] * 4, 10: [1.0, 0, 0, 0]}
+    for time_ns, q in sent.items():
+        history.add(time_ns, attitude_sample(time_ns, np.array(q), direction))
+    kept = wire_attitudes(history, direction)
     assert kept.time_ns.tolist() == [10, 30]
-    assert len(wire_attitudes([], []).quaternion) == 0
+    np.testing.assert_allclose(kept.quaternion, [sent[10], sent[30]], atol=1e-15)
 
 
 @pytest.mark.slow
@@ -73,7 +79,9 @@ def test_a_process_of_its_own(
     three = tuple(i for _, i in zip(range(3), images, strict=False) if isinstance(i, Image))
     attitude = dataclasses.replace(unaligned.attitude, attitude_direction='inertial_to_st')
     answers: list[Diagnosis] = []
-    unmatched = Unmatched(dataclasses.replace(unaligned, attitude=attitude), answers.append)
+    unmatched = Unmatched(
+        dataclasses.replace(unaligned, attitude=attitude), AttitudeHistory(), answers.append
+    )
     for image in three:
         unmatched.add(image)
     assert unmatched._thread is not None

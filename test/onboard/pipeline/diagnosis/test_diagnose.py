@@ -21,13 +21,7 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.camera import CameraModel
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
-from starcal_ros.pipeline.diagnosis.diagnose import (
-    CAUSES,
-    diagnose,
-    Diagnosis,
-    wire_attitudes,
-    WireAttitudes,
-)
+from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis, WireAttitudes
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.sky.attitude import AttitudeOptions
@@ -37,6 +31,7 @@ pytestmark = pytest.mark.slow
 
 GRANASAT = Path(__file__).parents[5] / 'shared' / 'realsky' / 'granasat'
 START_NS = 1778829600_000000000
+NO_ATTITUDES = WireAttitudes(np.empty(0, np.int64), np.empty((0, 4)))
 
 
 @dataclass(frozen=True)
@@ -395,7 +390,7 @@ def test_images_of_another_size_are_named_with_their_remedy(
 ) -> None:
     setup = read_setup(Path(__file__).parents[4] / 'bags' / 'tiny' / 'params.yaml')
     pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)
-    found = diagnose([Image(k, pixels) for k in range(3)], wire_attitudes([], []), setup)
+    found = diagnose([Image(k, pixels) for k in range(3)], NO_ATTITUDES, setup)
     assert words in found.sentence and remedy in found.mend[0]
     assert f'image_width: {shape[1]}, image_height: {shape[0]}' in found.mend[0]
     if found.found == 2:
