@@ -54,6 +54,7 @@ from starcal_ros.stars.hot_pixels import hot_in_dark, HotPixels, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import CentroidOptions
 from starcal_ros.untrusted import shown
 
+_LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 # No star tracker is as good as 0.01 arcsec: 0.001 rad are 206 arcsec, 0.01 degrees 36 arcsec.
 _RADIANS_BELOW, _DEGREES_BELOW = 1e-3, 1e-2
 _FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as many
@@ -111,6 +112,30 @@ def check_field_of_stars(
         f' {in_field:.2g} in a mean field of the camera where it is deepest; raise it, or'
         ' give a deeper catalog (starcal catalog)'
     )
+
+
+def check_prior_camera(camera: CameraModel, location: str) -> None:
+    """Raise `OptionError` for an implausible camera that `camera.check_plausible` accepts."""
+    width, height = camera.width, camera.height
+    fx, _, fy, cx, cy = (float(value) for value in camera.intrinsics[:5])
+    if not 0.5 < fx / fy < 2.0:
+        raise OptionError(f'{location}: fx = {fx:g} and fy = {fy:g} px differ by a factor of two')
+    width_deg = math.degrees(2 * math.atan(width / 2 / fx))
+    if fx > _LONGEST * width:
+        raise OptionError(
+            f'{location}: focal length of {fx:g} px makes a field of {width_deg:.2g} degrees:'
+            ' it seems to be in micrometres; divide it by the size of a pixel'
+        )
+    if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
+        raise OptionError(
+            f'{location}: principal point ({cx:g}, {cy:g}) px is far outside the image of {width}'
+            f' x {height}'
+        )
+    if 0 < abs(cx) < 0.05 * width and 0 < abs(cy) < 0.05 * height:
+        raise OptionError(
+            f'{location}: principal point ({cx:g}, {cy:g}) is in the first corner of an image of'
+            f' {width} x {height}: give it in pixels, not in metres or millimetres'
+        )
 
 
 NODES = ('star_observer', 'calibrator')
@@ -492,6 +517,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
                 f'lens_model: {frames.lens_model} does not cover the field of the prior camera,'
                 f' {frames.camera_info_url}'
             )
+    check_prior_camera(camera, frames.camera_info_url)
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
