@@ -22,6 +22,7 @@ pytest.importorskip('starcal.msg')
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import rclpy
 
 from starcal_ros.ros.calibrator import Calibrator
@@ -99,8 +100,8 @@ def test_every_transition_in_every_state(
     client: Client, start_node: StartNode, tiny_bag: Path, state: str, shut_down: bool
 ) -> None:
     """Each node survives all transitions, and a signal ends it with status 0 in every state."""
-    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
-    nodes = [start_node(name, ros=ros, forked=False) for name in ('star_observer', 'calibrator')]
+    ros = parameters(tiny_bag, 'autostart:=false')
+    nodes = [start_node(name, ros=ros, forked=False) for name in BOTH]
     # Each state meets both signals; the two nodes end by the same code.
     signals = [signal.SIGINT, signal.SIGTERM]
     for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
@@ -325,8 +326,7 @@ def test_nodes_end_after_several_signals(
 ) -> None:
     """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
     rng = random.Random(seed)
-    ros = ('--params-file', str(tiny_bag / 'params.yaml'))
-    nodes = [start_node(name, ros=ros, forked=False) for name in ('star_observer', 'calibrator')]
+    nodes = [start_node(name, ros=parameters(tiny_bag), forked=False) for name in BOTH]
     managers = [Manager(client, node.name) for node in nodes]
     client.until(lambda: all(manager.state() == 'active' for manager in managers))
     for _ in range(rng.choice([2, 3])):
@@ -393,7 +393,7 @@ sys.exit(run(Slow, 'calibrator', sys.argv[1:]))
 
 def test_a_callback_that_runs_at_the_end_has_a_node(tiny_bag: Path) -> None:
     """In a destroyed one, rclpy crashes where the state is asked for."""
-    ros = ['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')]
+    ros = ['--ros-args', *parameters(tiny_bag)]
     command = [sys.executable, '-c', CALLBACK_AT_THE_END, *ros]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -402,7 +402,7 @@ def test_a_callback_that_runs_at_the_end_has_a_node(tiny_bag: Path) -> None:
 
 def test_a_destroyed_node_is_no_longer_in_the_graph(client: Client, tiny_bag: Path) -> None:
     """A process may hold several nodes, one after the other, with the same name."""
-    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
+    rclpy.init(args=['--ros-args', *parameters(tiny_bag)])
     try:
         node = Calibrator()
         client.until(lambda: 'calibrator' in client.node.get_node_names())
