@@ -241,15 +241,6 @@ def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
     assert path.exists()
 
 
-def test_one_owner(tmp_path: Path) -> None:
-    with (
-        opened(tmp_path),
-        pytest.raises(ArchiveError, match=f'{tmp_path} is in use by another calibrator'),
-    ):
-        Archive(tmp_path, 'camera')
-    Archive(tmp_path, 'camera').close()
-
-
 def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
     for path in (tmp_path / 'file', tmp_path / 'file' / 'below'):

@@ -163,11 +163,13 @@ def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_b
         assert set(values) == documented()
 
 
-def test_sensor_data_publishers_are_received(
+def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_received(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
     """Best effort, as drivers offer it: all inputs connect, remapped or not."""
-    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    node = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    client.until(lambda: f'{ATTITUDES}: no message in 5 s, from 0 pub' in node.said())
+    assert node.said().count(f'{IMAGES}: no message in 5 s') == 1
     publishers = [
         client.node.create_publisher(kind, topic, qos_profile_sensor_data)
         for kind, topic in (
@@ -275,11 +277,3 @@ def test_an_alignment_not_given_is_found_and_all_images_are_used(
     assert values['retried'] == values['retried_used'] != '0'
     assert values['diagnosis'] == 'none'
     client.until(lambda: 'prior_alignment is not given: found [' in node.said())
-
-
-def test_a_silent_topic_is_warned_of_once(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    node = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    client.until(lambda: '/star_tracker/attitude: no message in 5 s, from 0 pub' in node.said())
-    assert node.said().count('/opnav/image_raw: no message in 5 s') == 1

@@ -491,9 +491,22 @@ def test_state_outlasts_a_kill(
     np.testing.assert_array_equal(repeated.covariance, tool.covariance)
 
 
-def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Inconsistent observations are logged and counted as refused; the next ones are used."""
+def test_without_images_nothing_is_active_and_a_bad_message_ends_nothing(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """The prior is no calibration. Inconsistent observations are logged and counted."""
     calibrator = start_node('calibrator', ros=parameters(tiny_bag))
+    latched = [
+        client.latched(CameraInfo, 'camera_info'),
+        client.latched(TransformStamped, 'alignment'),
+        client.latched(Calibration, 'calibration'),
+    ]
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert not answer.success and '\n' not in answer.message
+    assert str(client.until_images(0).min_images) in answer.message
+    rollback = client.call(Trigger, '/calibrator/rollback')
+    assert not rollback.success and rollback.message == 'no calibration is active'
+    assert latched == [[], [], []]
     observations = client.publisher(StarObservations, 'observations')
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
     refused = refused_image(5, 8, 8, 'no_stars', '')
@@ -501,23 +514,6 @@ def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_ba
     client.until_refused(('bad_observations', 1), ('no_stars', 1))
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
     assert 'Traceback' not in calibrator.said()
-
-
-def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A calibration of an empty ensemble is refused; the prior is no calibration."""
-    start_node('calibrator', ros=parameters(tiny_bag))
-    latched = [
-        client.latched(CameraInfo, 'camera_info'),
-        client.latched(TransformStamped, 'alignment'),
-        client.latched(Calibration, 'calibration'),
-    ]
-    answer = client.call(Trigger, '/calibrator/calibrate')
-    assert not answer.success
-    assert str(client.until_images(0).min_images) in answer.message
-    assert '\n' not in answer.message
-    rollback = client.call(Trigger, '/calibrator/rollback')
-    assert not rollback.success and rollback.message == 'no calibration is active'
-    assert latched == [[], [], []]
 
 
 INTERRUPTED = """
@@ -561,6 +557,10 @@ def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tupl
         (lambda f, _: parameters(f, 'prior_alignment:=[1.0, 2.0]'), 'prior_alignment'),
         (lambda f, _: parameters(f, 'estimate:=[fx, fz]'), 'estimate'),
         (lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
+        (
+            lambda f, _: parameters(f, 'magnitude_limt:=6.0'),
+            'magnitude_limt: no such parameter (did you mean magnitude_limit?)',
+        ),
         (lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
         (lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
         (tiny_parameters(lambda text: text.replace(':', ':::')), 'params.yaml'),
