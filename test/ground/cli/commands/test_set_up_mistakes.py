@@ -11,7 +11,7 @@ import re
 from typing import Any
 
 import cv2
-from mission_files import params_with, TINY  # type: ignore[import-not-found]
+from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
@@ -24,7 +24,7 @@ from starcal_ground.simulation.scenario import scenario
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TYPE, make_header
+from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
@@ -35,23 +35,9 @@ Write = Callable[[BagWriter, Image], None]
 
 def _as(encoding: str, pixels: Callable[[Any], Any]) -> Write:
     """Write an image in an encoding that is not read."""
-
-    def write(writer: BagWriter, image: Image) -> None:
-        height, width = image.pixels.shape
-        data = np.ascontiguousarray(pixels(image.pixels)).reshape(-1).view(np.uint8)
-        message = make_message(
-            IMAGE_TYPE,
-            header=make_header(image.time_ns, 'camera', make_message),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=0,
-            step=len(data) // height,
-            data=data,
-        )
-        writer.write(IMAGE_TOPIC, IMAGE_TYPE, image.time_ns, message)
-
-    return write
+    return lambda writer, image: write_encoded(
+        writer, IMAGE_TOPIC, image, encoding, pixels(image.pixels)
+    )
 
 
 def _bmp(writer: BagWriter, image: Image) -> None:
