@@ -483,10 +483,9 @@ def test_state_outlasts_a_kill(
     answer = calibration_from_message(again.calibration)
     for one in (active, answer):
         np.testing.assert_array_equal(one.covariance, tool.covariance)
-    ensemble_by_tool = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate']
-    ensemble_by_tool += [str(tmp_path / 'state' / 'ensemble'), '-o', str(tmp_path / 'again')]
-    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml')]
-    subprocess.run(ensemble_by_tool, check=True, capture_output=True)
+    ensemble_by_tool = ['calibrate', str(tmp_path / 'state' / 'ensemble')]
+    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(tmp_path / 'again')]
+    assert main(ensemble_by_tool) == 0
     repeated = read_calibration(tmp_path / 'again' / CALIBRATION_FILE)
     np.testing.assert_array_equal(repeated.covariance, tool.covariance)
 

@@ -320,18 +320,6 @@ def test_two_on_one_folder(setup: Setup, tmp_path: Path) -> None:
     started(setup, tmp_path).close()
 
 
-def test_damage_is_named(
-    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
-    filled(setup, shown, tmp_path).close()
-    victim = tmp_path / 'ensemble' / '00000002.mcap'
-    victim.write_bytes(victim.read_bytes()[:-100])
-    state = started(setup, tmp_path)
-    assert len(state.damage) == 1 and '00000002.mcap.damaged' in state.damage[0]
-    assert len(state.ensemble.images) == len(shown) - 1
-    state.close()
-
-
 def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
     state = started(setup)
     assert state.rollback() == Answer(False, 'no calibration is active')
