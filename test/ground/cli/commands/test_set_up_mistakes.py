@@ -150,16 +150,14 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ('scale', 'commands'), [(2.0, ('diagnose', 'inspect')), (0.5, ('calibrate',))]
-)
+@pytest.mark.parametrize(('scale', 'command'), [(2.0, 'diagnose'), (0.5, 'calibrate')])
 def test_a_focal_length_of_other_pixels(
-    scale: float, commands: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scale: float, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The search takes each command 7 s: each meets one of the two mistakes."""
+    """The search takes a command 7 s; `inspect` shows what `diagnose` finds, as above."""
     parameters = params_with(tmp_path, camera_info_url=str(rescaled_camera(tmp_path, scale)))
     path = bag(tmp_path / 'bag.mcap', _raw)
-    for text in said(capsys, tmp_path, path, parameters, commands).values():
+    for text in said(capsys, tmp_path, path, parameters, [command]).values():
         assert ('100 % too long' if scale > 1 else '50 % too short') in text
         assert 'fx = fy = 180' in text
 
