@@ -10,25 +10,18 @@ import pytest
 
 from starcal_ground.report.verdict import model_rows
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.records import Calibration, HeldTerm
+from starcal_ros.records import HeldTerm
 
 
-@pytest.fixture
-def calibration(tiny_products: Path) -> Calibration:
-    return read_calibration(tiny_products / 'calibration.json')
-
-
-def checked(calibration: Calibration, **checks: object) -> Calibration:
-    """A calibration with other checks of its model."""
-    assert calibration.model_checks is not None
-    changed = dataclasses.replace(calibration.model_checks, **checks)  # type: ignore[arg-type]
-    return dataclasses.replace(calibration, model_checks=changed)
-
-
-def test_rows_say_what_was_found_and_what_to_do(calibration: Calibration) -> None:
+def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
     held = HeldTerm('cx', 320.0, 326.0, 2.0)
-    found = checked(calibration, field_rms_px=0.25, field_worst_px=0.86, held=(held,))
-    lens, term, *others = model_rows(dataclasses.replace(found, zero_skew_cost_px=0.5))
+    found = dataclasses.replace(checks, field_rms_px=0.25, field_worst_px=0.86, held=(held,))
+    lens, term, *others = model_rows(
+        dataclasses.replace(calibration, model_checks=found, zero_skew_cost_px=0.5)
+    )
     assert lens.found == (
         'field of 0.25 px rms per axis, at most 0.86 px; '
         'camera_info, without field and skew, differs from the calibration by at most 0.5 px'
@@ -44,9 +37,14 @@ def test_rows_say_what_was_found_and_what_to_do(calibration: Calibration) -> Non
     assert all(row.remedy for row in others)
 
 
-def test_a_length_that_no_image_shows_has_no_digits(calibration: Calibration) -> None:
-    found = checked(calibration, field_rms_px=3e-5, field_worst_px=1e-4, image_variation_px=4e-6)
-    lens, *_, camera = model_rows(found)
+def test_a_length_that_no_image_shows_has_no_digits(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
+    found = dataclasses.replace(
+        checks, field_rms_px=3e-5, field_worst_px=1e-4, image_variation_px=4e-6
+    )
+    lens, *_, camera = model_rows(dataclasses.replace(calibration, model_checks=found))
     assert lens.found.startswith('field of less than 0.001 px everywhere; ')
     minutes = (calibration.time_ns - calibration.first_image_ns) / 6e10
     assert camera.found == (
@@ -55,15 +53,19 @@ def test_a_length_that_no_image_shows_has_no_digits(calibration: Calibration) ->
     )
 
 
-def test_values_that_the_stars_do_not_contradict_share_one_row(calibration: Calibration) -> None:
+def test_values_that_the_stars_do_not_contradict_share_one_row(tiny_products: Path) -> None:
     """A velocity of 478 km/s with a sigma of 627 km/s states nothing of the spacecraft."""
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
     held = (HeldTerm('cx', 320.0, 326.0, 20.0), HeldTerm('velocity x', 0.0, 478e3, 627e3))
-    found = checked(calibration, held=held)
-    _, term, *others = model_rows(found)
+    found = dataclasses.replace(checks, held=held)
+    _, term, *others = model_rows(dataclasses.replace(calibration, model_checks=found))
     assert term.assumption == 'cx is 320, velocity x is 0'
     assert term.found == 'the stars agree, within 0.8 sigma of the difference'
     assert not any('478' in row.found for row in (term, *others))
 
 
-def test_a_calibration_without_checks_has_no_rows(calibration: Calibration) -> None:
+def test_a_calibration_without_checks_has_no_rows(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
     assert model_rows(dataclasses.replace(calibration, model_checks=None)) == []

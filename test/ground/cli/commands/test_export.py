@@ -63,3 +63,8 @@ def test_export_warns_of_a_refused_calibration(folder, tmp_path, capsys, accepte
     assert main(f'export {folder} --to csv -o {tmp_path}'.split()) == 0
     expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
     assert capsys.readouterr().err.splitlines() == expected
+
+
+def test_export_needs_a_calibration(tmp_path: Path, capsys) -> None:
+    assert main(f'export {tmp_path} --to csv -o {tmp_path}'.split()) == 2
+    assert 'holds no calibration.json' in capsys.readouterr().err
