@@ -34,11 +34,12 @@ TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 # Files of ten seconds and more, longest first: at the end, one of them would keep one worker while
 # the others wait.
 LONGEST = (
-    *('test_colcon', 'test_bench', 'test_night_sky', 'test_calibrate', 'test_monte_carlo'),
-    *('test_first_setup', 'test_arguments_output', 'test_docs', 'test_diagnose', 'test_c_camera'),
-    *('test_kills', 'test_series_overview', 'test_object_store', 'test_trend', 'test_plan'),
-    *('test_set_up_mistakes', 'test_state', 'test_lens_models', 'test_main', 'test_hostile_state'),
-    *('test_mission_records_guard', 'test_deep_catalog', 'test_unknown_air'),
+    *('test_colcon', 'test_bench', 'test_calibrate', 'test_night_sky', 'test_monte_carlo'),
+    *('test_first_setup', 'test_docs', 'test_diagnose', 'test_kills', 'test_campaign'),
+    *('test_arguments_output', 'test_c_camera', 'test_problem_temperature', 'test_trend'),
+    *('test_problem_mountings', 'test_series_overview', 'test_object_store'),
+    *('test_topics_camera_alone', 'test_plan', 'test_mission_records_guard', 'test_state'),
+    *('test_hostile_state', 'test_simulated_bag_mistakes', 'test_worlds', 'test_set_up_mistakes'),
     *('test_ros_tools', 'test_hostile_messages', 'test_calibrator_camera_driver'),
 )
 
