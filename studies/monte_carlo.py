@@ -133,6 +133,7 @@ def _cell(design: Design, part: StarField) -> Iterator[Row]:
     for tracker, share in itertools.product(design.tracker_arcsec, design.outlier_shares):
         least = trials.bound('hierarchical', blocks, tracker)
         own['hierarchical'] = trials.map_bound_px(camera, least)
+        pointing_arcsec = trials.pointing_bound_arcsec(camera, least)
         ensemble = trials.observe(part, tracker, share)
         for method in design.methods:
             assumed = tracker if design.assumed_arcsec is None else design.assumed_arcsec
@@ -149,7 +150,7 @@ def _cell(design: Design, part: StarField) -> Iterator[Row]:
                 'own_bound_px': own[method],
                 'per_image_bound_px': own['per_image'],
                 'bound_px': own['hierarchical'],
-                'pointing_bound_arcsec': trials.pointing_bound_arcsec(camera, least),
+                'pointing_bound_arcsec': pointing_arcsec,
             }
 
 

@@ -96,12 +96,6 @@ def digests(folder: Path) -> dict[str, str]:
     }
 
 
-def fifo_in_place_of(path: Path) -> None:
-    """Replace a file by a FIFO that nobody writes to."""
-    path.unlink()
-    os.mkfifo(path)
-
-
 _DEEP: object = json.loads('[' * 900 + ']' * 900)
 _ODD: list[object] = [
     None, True, False, 0, -1, 1, 0.5, 1e300, -1e300, 1e-300, 1e20, 2**31, 2**32, 2**63, 10**20,

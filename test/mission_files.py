@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime, timezone
 import functools
 from pathlib import Path
@@ -16,7 +17,10 @@ import numpy as np
 import spiceypy
 import yaml
 
+from starcal_ground.bag_writer import BagWriter
 from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
     velocity_from_message,
@@ -31,6 +35,11 @@ FRAME_ID, CLOCK_ID = -999100, -999
 def images() -> tuple[Image, ...]:
     found = reader.read_images([TINY], '/opnav/image_raw')
     return tuple(image for image in found if isinstance(image, Image))
+
+
+def frames_of(count: int) -> list[np.ndarray]:
+    """Pixels of the first images of the small bag."""
+    return [image.pixels for image in images()[:count]]
 
 
 @functools.cache
@@ -72,14 +81,36 @@ def date(time_ns: int, system: str = 'utc') -> str:
     return str(Time(getattr(time, system), format='isot', precision=9).value)
 
 
-def write_frame(folder: Path) -> None:
-    """The first image of the small bag as ``0.png``, its time, and attitudes about it, as CSV."""
-    folder.mkdir()
-    image = images()[0]
-    cv2.imwrite(str(folder / '0.png'), image.pixels)
-    (folder / 'times.csv').write_text(f'file,time_ns\n0.png,{image.time_ns}\n')
-    rows = [f'{image.time_ns + after_ns},0,0,0,1' for after_ns in (-(10**8), 10**8)]
+def write_frames(folder: Path, count: int = 1) -> None:
+    """The first images of the small bag as PNG, their times, and attitudes about them, as CSV."""
+    write_pngs(folder, frames_of(count))
+    stamps_ns = [image.time_ns for image in images()[:count]]
+    times = [f'{k}.png,{time_ns}' for k, time_ns in enumerate(stamps_ns)]
+    (folder / 'times.csv').write_text('\n'.join(['file,time_ns', *times, '']))
+    around_ns = [time_ns + after_ns for time_ns in stamps_ns for after_ns in (-(10**8), 10**8)]
+    rows = [f'{time_ns},0,0,0,1' for time_ns in around_ns]
     (folder / 'attitude.csv').write_text('\n'.join(['time_ns,qx,qy,qz,qw', *rows, '']))
+
+
+def write_pngs(folder: Path, frames: Sequence[np.ndarray]) -> Path:
+    """A folder of images as ``0.png``, ``1.png``, ..."""
+    folder.mkdir()
+    for k, pixels in enumerate(frames):
+        cv2.imwrite(str(folder / f'{k}.png'), pixels)
+    return folder
+
+
+def write_encoded(
+    writer: BagWriter, topic: str, image: Image, encoding: str, pixels: np.ndarray
+) -> None:
+    """Write an image to a bag with other pixels, in an encoding that may be none that is read."""
+    height, width = image.pixels.shape
+    data = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
+    message = make_message(
+        IMAGE_TYPE, header=make_header(image.time_ns, 'camera', make_message), height=height,
+        width=width, encoding=encoding, is_bigendian=0, step=len(data) // height, data=data,
+    )  # fmt: skip
+    writer.write(topic, IMAGE_TYPE, image.time_ns, message)
 
 
 def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object) -> Path:

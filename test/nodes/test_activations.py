@@ -17,7 +17,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from geometry_msgs.msg import TransformStamped
-import rclpy
+from node_inputs import in_this_process  # type: ignore[import-not-found]
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
@@ -40,19 +40,10 @@ def calibrator(
     ros_domain: None, tiny_bag: Path, tiny_observations: Ensemble
 ) -> Iterator[Calibrator]:
     """An active calibrator in this process that holds the images of the small bag."""
-    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
-    node = Calibrator()
-    try:
-        node.trigger_configure()
-        node.trigger_activate()
+    with in_this_process(Calibrator, tiny_bag) as node:
         for image in tiny_observations.images:
             node._state.add(image)
         yield node
-    finally:
-        node.deactivate()
-        node.cleanup()
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 def test_what_is_latched_is_what_is_active(client: Client, calibrator: Calibrator) -> None:

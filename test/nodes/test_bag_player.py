@@ -18,6 +18,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from mission_files import attitudes, images  # type: ignore[import-not-found]
+from node_inputs import parameters  # type: ignore[import-not-found]
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
@@ -68,8 +69,8 @@ def test_compressed_images_are_paced(
 ) -> None:
     """A queue of twenty overflows where they are not."""
     found: list[Any] = client.collect(StarObservations, 'observations')
-    given = ('-p', 'attitude_timeout_s:=60.0', '-r', 'image:=image/compressed')
-    start_node('star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *given))
+    given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
+    start_node('star_observer', ros=(*given, '-r', 'image:=image/compressed'))
     client.until_listened()
     patient = ('-p', 'wait_for_subscribers_s:=100.0')
     player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0', *patient))

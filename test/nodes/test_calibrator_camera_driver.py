@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 import signal
@@ -21,15 +21,11 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-from diagnostic_msgs.msg import DiagnosticArray
+from node_inputs import parameters  # type: ignore[import-not-found]
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
-
-from starcal.msg import EnsembleStatus, StarObservations
-from starcal_ros.formats.messages.record_messages import observations_to_message
-from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 
@@ -74,33 +70,14 @@ def driver(kept: Path, ends_by: signal.Signals) -> Iterator[None]:
         assert process.wait(60) == (0 if ends_by == signal.SIGTERM else -ends_by)
 
 
-def fill(client: Client, ensemble: Ensemble) -> None:
-    """Publish the observations of an ensemble to a calibrator."""
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    observations = client.publisher(StarObservations, 'observations')
-    for image in ensemble.images:
-        observations.publish(observations_to_message(image, 'camera', make_message))
-    client.until(lambda: status and status[-1].images == len(ensemble.images))
-
-
-def told(diagnostics: list[Any], outcome: str, level: bytes) -> Callable[[], bool]:
-    """Condition on the level and driver outcome in the latest diagnostics."""
+def until_told(client: Client, outcome: str, level: bytes) -> None:
+    """Wait for the level and the outcome of the driver in the diagnostics."""
 
     def is_so() -> bool:
-        newest = [status for message in diagnostics[-1:] for status in message.status]
-        return any(
-            status.level == level
-            and {v.key: v.value for v in status.values}.get('camera_driver') == outcome
-            for status in newest
-        )
+        newest, _, values = client.health('calibrator')
+        return (newest, values.get('camera_driver')) == (level, outcome)
 
-    return is_so
-
-
-def failures(diagnostics: list[Any]) -> int:
-    """Failed calls that the latest diagnostics count."""
-    values = {v.key: v.value for v in diagnostics[-1].status[0].values}
-    return int(values['camera_driver_failures'])
+    client.until(is_so)
 
 
 def test_driver_is_told_and_its_failures_are_seen(
@@ -112,22 +89,18 @@ def test_driver_is_told_and_its_failures_are_seen(
 ) -> None:
     """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
     calibrator = start_node(
-        'calibrator',
-        ros=(
-            *('--params-file', str(tiny_bag / 'params.yaml')),
-            *('-p', f'set_camera_info_service:={SERVICE}'),
-        ),
+        'calibrator', ros=parameters(tiny_bag, f'set_camera_info_service:={SERVICE}')
     )
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    fill(client, tiny_observations)
+    client.fill(tiny_observations.images)
     assert client.call(Trigger, '/calibrator/calibrate').success
-    client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))
+
+    until_told(client, 'service not available; will be sent when it is', b'\x01')
 
     # A driver that takes the call and never answers: nobody spins its node.
     silent = other_client.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
-    client.until(told(diagnostics, 'no answer within 5 s', b'\x01'))
+    until_told(client, 'no answer within 5 s', b'\x01')
     # The first failure was that the service was not there; then it is called again and again.
-    client.until(lambda: failures(diagnostics) >= 4)
+    client.until(lambda: int(client.health('calibrator')[2]['camera_driver_failures']) >= 4)
     other_client.node.destroy_service(silent)
 
     received: list[Any] = []
@@ -140,10 +113,10 @@ def test_driver_is_told_and_its_failures_are_seen(
         return response
 
     client.node.create_service(SetCameraInfo, SERVICE, answer)
-    client.until(told(diagnostics, 'refused: sensor busy', b'\x01'))
+    until_told(client, 'refused: sensor busy', b'\x01')
 
     accepts = True  # it is called again without a request
-    client.until(told(diagnostics, 'accepted', b'\x00'))
+    until_told(client, 'accepted', b'\x00')
     published = client.latched(CameraInfo, 'camera_info')
     client.until(lambda: published)
     assert received[-1] == published[-1]
@@ -176,15 +149,8 @@ def test_a_driver_process_that_restarts(
 
     The next one starts at once.  After SIGKILL, DDS takes the one before it as still there.
     """
-    start_node(
-        'calibrator',
-        ros=(
-            *('--params-file', str(tiny_bag / 'params.yaml')),
-            *('-p', f'set_camera_info_service:={SERVICE}'),
-        ),
-    )
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    fill(client, tiny_observations)
+    start_node('calibrator', ros=parameters(tiny_bag, f'set_camera_info_service:={SERVICE}'))
+    client.fill(tiny_observations.images)
     assert client.call(Trigger, '/calibrator/calibrate').success
     published = client.latched(CameraInfo, 'camera_info')
     client.until(lambda: published)
@@ -192,5 +158,5 @@ def test_a_driver_process_that_restarts(
         kept = tmp_path / name
         with driver(kept, ends_by):
             client.until(kept.exists)
-            client.until(told(diagnostics, 'accepted', b'\x00'))
+            until_told(client, 'accepted', b'\x00')
         assert deserialize_message(kept.read_bytes(), CameraInfo) == published[-1]

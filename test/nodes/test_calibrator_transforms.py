@@ -12,7 +12,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from geometry_msgs.msg import TransformStamped
-import rclpy
+from node_inputs import in_this_process  # type: ignore[import-not-found]
 
 from starcal_ros.ros.calibrator import Calibrator
 
@@ -29,10 +29,7 @@ def test_a_transform_of_another_node_is_named(
     ros_domain: None, tiny_bag: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only to a frame that this node publishes too, and not its own message."""
-    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
-    node = Calibrator()
-    try:
-        node.trigger_configure()
+    with in_this_process(Calibrator, tiny_bag, is_active=False) as node:
         monkeypatch.setattr(node, 'count_publishers', lambda topic: 2)
         own = transform(node._setup.frames.camera_frame, 0.0)
         node._own_transforms.append(own)
@@ -41,7 +38,3 @@ def test_a_transform_of_another_node_is_named(
         foreign = transform(f'/{own.child_frame_id}', 1.0)
         node._on_transforms(SimpleNamespace(transforms=[foreign]))
         assert f'publishes {own.child_frame_id} too' in node._foreign_transforms()
-    finally:
-        node.cleanup()
-        node.destroy_node()
-        rclpy.try_shutdown()

@@ -19,6 +19,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from diagnostic_msgs.msg import DiagnosticArray
+from node_inputs import BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 
 from starcal.msg import EnsembleStatus
 from starcal_ground.bag_writer import BagWriter
@@ -34,10 +35,9 @@ def test_a_bag_plays_again_by_its_clock(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
     """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
-    given = ('-r', '__ns:=/cam', '--params-file', str(tiny_bag / 'params.yaml'))
-    common = (*given, '-p', 'autostart:=true', '-p', 'use_sim_time:=true', '--log-level', 'info')
-    remaps = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
-    start_node('star_observer', ros=(*common, '-r', '__node:=star_observer', *remaps))
+    given = parameters(tiny_bag, 'autostart:=true', 'use_sim_time:=true')
+    common = ('-r', '__ns:=/cam', *given, '--log-level', 'info')
+    start_node('star_observer', ros=(*common, '-r', '__node:=star_observer', *REMAPS))
     start_node('calibrator', ros=(*common, '-r', '__node:=calibrator'))
     client.until(lambda: client.node.count_subscribers('/cam/observations'))
     status = client.latched(EnsembleStatus, '/cam/ensemble_status')
@@ -53,15 +53,12 @@ def test_a_bag_plays_again_by_its_clock(
         return max(values, default=0)
 
     client.until(lambda: restarts() >= 1, 60.0)
-    images = len(list(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    images = len(list(reader.read_images([tiny_bag], IMAGES)))
     client.until(lambda: status and status[-1].images == images)
     stamps = [raw.log_time_ns for raw in reader.read_raw([tiny_bag])]
     last_ns = stamp_ns(health[-1].header.stamp)
     # Within the bag, whatever pass of it: the diagnostics take the time from /clock.
     assert min(stamps) <= last_ns <= max(stamps) + 10**9
-
-
-NODES = ('star_observer', 'calibrator', 'bag_player')
 
 
 @pytest.mark.nodes
@@ -75,11 +72,11 @@ def test_the_policies_name_what_the_nodes_have(
         writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')
         writer.write_temperature('/temperature', 1, 20.0, 'camera')
     start_node('bag_player', ros=('-p', f'bag:={tmp_path / "bag"}', '-p', 'clock:=true', *WAIT))
-    for name in NODES[:2]:
+    for name in BOTH:
         # Nobody may listen to the player, or it plays and ends.
         remaps = ('-r', 'image:=/elsewhere') if name == 'star_observer' else ()
-        start_node(name, ros=('--params-file', str(tiny_bag / 'params.yaml'), *remaps))
-    for name in NODES:
+        start_node(name, ros=(*parameters(tiny_bag), *remaps))
+    for name in (*BOTH, 'bag_player'):
         path = ROOT / 'config' / 'security' / f'{name}.policy.xml'
         profile = ElementTree.parse(path).getroot().find('enclaves/enclave/profiles/profile')
         assert profile is not None and profile.get('node') == name and profile.get('ns') == '/'

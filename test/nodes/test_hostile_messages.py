@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from flight import Flight  # type: ignore[import-not-found]
 from geometry_msgs.msg import QuaternionStamped, TransformStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
 from node_campaign import Campaign  # type: ignore[import-not-found]
+from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -35,7 +35,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
 from std_srvs.srv import Trigger
 
-from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
 from starcal_ros.formats.bag import reader
@@ -63,31 +63,22 @@ MAY_BE_INFINITE = frozenset(
         'p_value',
     ]
 )
-IMAGE_TOPIC = '/opnav/image_raw'
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
 SHUTDOWNS = (5, 6, 7)  # a node rightly executes it
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def parameters(bag: Path, *values: str) -> tuple[str, ...]:
-    """ROS arguments with the parameter file of a bag and further values."""
-    more = [word for value in values for word in ('-p', value)]
-    return ('--params-file', str(bag / 'params.yaml'), *more)
 
 
 class Received:
     """Number of messages that a node has received, from its diagnostics."""
 
     def __init__(self, client: Client, node: str) -> None:
-        self._client, self._name = client, f'starcal: {node}'
-        self._health = client.collect(DiagnosticArray, '/diagnostics')
+        self._client, self._node = client, node
         self._state = client.node.create_client(GetState, f'/{node}/get_state')
         client.until(lambda: self.count() is not None and self._state.service_is_ready())
 
     def count(self) -> int | None:
         """Messages received, up to a second old; None before the first diagnostics."""
-        mine = [m.status[0] for m in self._health if m.status[0].name == self._name]
-        values = {v.key: v.value for status in mine[-1:] for v in status.values}
+        values = self._client.health(self._node)[2]
         return int(values['messages']) if values else None
 
     def send(self, publisher: Any, messages: Iterable[Any], at_once: int = 500) -> None:
@@ -176,11 +167,11 @@ def test_every_image_is_answered(
     template: Callable[[], Any],
 ) -> None:
     given = parameters(tiny_bag, 'attitude_timeout_s:=0.0')
-    node = start_node('star_observer', ros=(*given, '-r', f'image:={IMAGE_TOPIC}'))
+    node = start_node('star_observer', ros=(*given, '-r', f'image:={IMAGES}'))
     answers = client.collect(StarObservations, 'observations')
     infos = client.collect(CameraInfo, 'image_camera_info')
     client.until_listened()
-    images = client.publisher(kind, IMAGE_TOPIC)
+    images = client.publisher(kind, IMAGES)
     for batch in batches(mutated(template(), 20), 20):  # as many as the queue holds
         before = len(answers)
         for message, _ in batch:
@@ -188,32 +179,24 @@ def test_every_image_is_answered(
         client.until(lambda: len(answers) - before >= len(batch))  # noqa: B023
     assert_finite([*answers, *infos])
     # One that is cut off is counted with its reason, and the node goes on.
-    health = client.collect(DiagnosticArray, '/diagnostics')
     counted = sum(answer.refusal == 'bad_layout' for answer in answers) + 1
     images.publish(serialize_message(template())[:40])
-    client.until(lambda: answers[-1].detail.startswith(f'{IMAGE_TOPIC}: 40 bytes are no'))
-    expected = ('refused_bad_layout', str(counted))
-    client.until(
-        lambda: any(
-            expected in {(value.key, value.value) for value in message.status[0].values}
-            for message in health
-        )
-    )
+    client.until(lambda: answers[-1].detail.startswith(f'{IMAGES}: 40 bytes are no'))
+    client.until_value('refused_bad_layout', str(counted))
     assert node.process.poll() is None
 
 
 def test_the_star_observer_measures_images_after_hostile_messages(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    remaps = ('-r', f'image:={IMAGE_TOPIC}', '-r', 'attitude:=/star_tracker/attitude')
-    node = start_node('star_observer', ros=(*parameters(tiny_bag), *remaps))
+    node = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
     answers = client.collect(StarObservations, 'observations')
     received = Received(client, 'star_observer')
     header = small_image().header
     attitude = attitude_to_message(10**18, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf', make_message)
     for kind, topic, template in (
         (QuaternionStamped, '/star_tracker/attitude', attitude),
-        (TwistStamped, 'velocity', TwistStamped(header=header)),
+        (TwistStamped, '/spacecraft/velocity', TwistStamped(header=header)),
         (Temperature, 'temperature', Temperature(header=header)),
     ):
         received.send(client.publisher(kind, topic), mutated(template, 20))
@@ -223,7 +206,7 @@ def test_the_star_observer_measures_images_after_hostile_messages(
     assert_common_requests_are_answered(client, 'star_observer', node)
     latched.publish(sound)
     start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
-    images = len(list(reader.read_images([BAG], IMAGE_TOPIC)))
+    images = len(list(reader.read_images([BAG], IMAGES)))
     # Stamps that went far ahead and come back cost the first images.
     client.until(lambda: sum(not answer.refusal for answer in answers) >= images // 2)
     assert_finite(answers)
@@ -234,9 +217,8 @@ def test_the_calibrator_calibrates_after_hostile_messages(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
     node = start_node('calibrator', ros=parameters(tiny_bag, 'max_images:=30'))
-    status = client.latched(EnsembleStatus, 'ensemble_status')
     published = [
-        status,
+        client.statuses(),
         *(client.latched(Calibration, t) for t in ('calibration', 'candidate_calibration')),
         client.latched(CameraInfo, 'camera_info'),
         client.latched(TransformStamped, 'alignment'),
@@ -251,26 +233,18 @@ def test_the_calibrator_calibrates_after_hostile_messages(
     assert_requests_are_answered(client, Calibrate, '/calibrator/solve', request, node)
     assert_common_requests_are_answered(client, 'calibrator', node)
     client.call(Trigger, '/calibrator/reset')
-    client.until(lambda: status and status[-1].images == 0)
-    fill(client, publisher, status)
+    client.until_images(0)
+    client.fill(observations())
     assert client.call(Trigger, '/calibrator/calibrate').success
     assert_finite(itertools.chain.from_iterable(published))
     assert node.process.poll() is None
-
-
-def fill(client: Client, publisher: Any, status: list[Any]) -> None:
-    """Publish the observations of the tiny bag; wait until the ensemble holds them."""
-    for record in observations():
-        publisher.publish(observations_to_message(record, 'camera', make_message))
-    client.until(lambda: status and status[-1].images == len(observations()))
 
 
 @pytest.fixture
 def filled(client: Client, start_node: StartNode, tiny_bag: Path) -> NodeProcess:
     """A calibrator with the images of the tiny bag."""
     node = start_node('calibrator', ros=parameters(tiny_bag))
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    fill(client, client.publisher(StarObservations, 'observations'), status)
+    client.fill(observations())
     return node
 
 
@@ -306,10 +280,8 @@ time.sleep(60)
 def test_a_second_calibrator_is_warned_of(
     client: Client, start_node: StartNode, tiny_bag: Path, filled: NodeProcess
 ) -> None:
-    health = client.collect(DiagnosticArray, '/diagnostics')
     start_node('calibrator', ros=(*parameters(tiny_bag), '-r', '__node:=double'))
-    text = 'another node publishes'
-    client.until(lambda: any(text in one.status[0].message for one in health))
+    client.until(lambda: 'another node publishes' in client.health('calibrator')[1])
     assert client.call(Trigger, '/calibrator/calibrate').success
 
 

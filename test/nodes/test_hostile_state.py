@@ -18,7 +18,6 @@ from attacks import (  # type: ignore[import-not-found]
     CHANGES,
     digests,
     drawn,
-    fifo_in_place_of,
     in_time,
     observations,
     setup,
@@ -135,11 +134,16 @@ def _sparse(path: Path) -> None:
         file.truncate(1 << 40)
 
 
+def _fifo_in_place_of(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
 _EVENT = 'calibrations/00000003_calibration_00000003.json'
 STRANGE: dict[str, Callable[[Path], object]] = {
     'FIFO as image': lambda f: os.mkfifo(f / 'ensemble/00000003.mcap'),
     'FIFO as calibration': lambda f: os.mkfifo(f / _EVENT),
-    'FIFO as refused': lambda f: fifo_in_place_of(f / 'ensemble/refused.json'),
+    'FIFO as refused': lambda f: _fifo_in_place_of(f / 'ensemble/refused.json'),
     '/dev/zero as image': lambda f: (f / 'ensemble/00000003.mcap').symlink_to('/dev/zero'),
     '/dev/zero as calibration': lambda f: (f / _EVENT).symlink_to('/dev/zero'),
     'link to itself': lambda f: (f / _EVENT).symlink_to(f / _EVENT),

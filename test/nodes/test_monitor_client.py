@@ -33,6 +33,8 @@ from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 
+CLIENT = (sys.executable, '-m', 'starcal_ros.entry_points')
+REMAP = ('--ros-args', '-r')
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -90,15 +92,9 @@ def test_a_signal_ends_it_without_a_traceback(
 ) -> None:
     """At its start, while it draws, and a second time while it ends."""
     name = f'monitor_{number}_{after}'
-    command = [
-        sys.executable,
-        '-m',
-        'starcal_ros.entry_points',
-        'starcal_ground.ros.monitor_client',
-    ]
-    remap = ('--ros-args', '-r', f'__node:={name}')
+    command = [*CLIENT, 'starcal_ground.ros.monitor_client', *REMAP, f'__node:={name}']
     end = subprocess.PIPE
-    with subprocess.Popen([*command, *remap], stdout=end, stderr=end, text=True) as monitor:
+    with subprocess.Popen(command, stdout=end, stderr=end, text=True) as monitor:
         try:
             # A signal during the imports has the default action of the system.
             until_ros(monitor.pid)
@@ -129,19 +125,8 @@ def until_ros(pid: int) -> None:
 @pytest.mark.parametrize('remap', ['__ns:=bad name', '__node:=3', ':='])
 def test_a_bad_remap_is_answered_without_a_traceback(client_name: str, remap: str) -> None:
     """The last line is ours, after those that rcl logs."""
-    command = [
-        sys.executable,
-        '-m',
-        'starcal_ros.entry_points',
-        f'starcal_ground.ros.{client_name}',
-    ]
-    done = subprocess.run(
-        [*command, '--ros-args', '-r', remap],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60.0,
-    )
+    command = [*CLIENT, f'starcal_ground.ros.{client_name}', *REMAP, remap]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60.0)
     assert done.returncode == 2 and 'Traceback' not in done.stderr, done.stderr
     last = done.stderr.splitlines()[-1]
     assert last.startswith(f'{client_name.removesuffix("_client")}') and remap in last

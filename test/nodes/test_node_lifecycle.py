@@ -22,6 +22,7 @@ pytest.importorskip('starcal.msg')
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import rclpy
 
 from starcal_ros.ros.calibrator import Calibrator
@@ -99,8 +100,8 @@ def test_every_transition_in_every_state(
     client: Client, start_node: StartNode, tiny_bag: Path, state: str, shut_down: bool
 ) -> None:
     """Each node survives all transitions, and a signal ends it with status 0 in every state."""
-    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
-    nodes = [start_node(name, ros=ros, forked=False) for name in ('star_observer', 'calibrator')]
+    ros = parameters(tiny_bag, 'autostart:=false')
+    nodes = [start_node(name, ros=ros, forked=False) for name in BOTH]
     # Each state meets both signals; the two nodes end by the same code.
     signals = [signal.SIGINT, signal.SIGTERM]
     for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
@@ -116,6 +117,13 @@ def test_every_transition_in_every_state(
             try_everything(manager, reached)
         assert node.stop(number) == 0, node.said()
         assert 'Traceback' not in node.said()
+
+
+def run(code: str, *arguments: str) -> tuple[int, str, str]:
+    """Exit status and output of a process that runs some lines."""
+    command = [sys.executable, '-c', code, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    return done.returncode, done.stdout, done.stderr
 
 
 SIGNALLED = """
@@ -140,9 +148,7 @@ sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
 )
 def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said: str) -> None:
     """Errors after a signal give status 0; other errors give one line and status 2."""
-    command = [sys.executable, '-c', SIGNALLED, argument]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (status, '', said)
+    assert run(SIGNALLED, argument) == (status, '', said)
 
 
 SIGNALLED_AGAIN = """
@@ -171,9 +177,7 @@ sys.exit(until_told_to_end('maker', [], work, end))
 
 
 def test_signals_do_not_cut_the_end_short() -> None:
-    command = [sys.executable, '-c', SIGNALLED_AGAIN]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, 'ended\n', '')
+    assert run(SIGNALLED_AGAIN) == (0, 'ended\n', '')
 
 
 SIGNALLED_AT_AN_ENTRY = """
@@ -205,9 +209,7 @@ sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
 @pytest.mark.parametrize(('argument', 'said'), [('', 'released\n'), ('early', '')])
 def test_a_signal_leaves_no_lock_taken(argument: str, said: str) -> None:
     """A KeyboardInterrupt at the entry of a lock would, and the threads that need it never end."""
-    command = [sys.executable, '-c', SIGNALLED_AT_AN_ENTRY, argument]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, said, '')
+    assert run(SIGNALLED_AT_AN_ENTRY, argument) == (0, said, '')
 
 
 NEVER_LET_GO = """
@@ -226,8 +228,7 @@ node.end_quietly(Held())
 
 
 def test_a_node_that_the_middleware_never_lets_go_ends() -> None:
-    done = subprocess.run([sys.executable, '-c', NEVER_LET_GO], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (-signal.SIGALRM, '')
+    assert run(NEVER_LET_GO) == (-signal.SIGALRM, '', '')
 
 
 EXECUTOR_OF_A_NODE = """
@@ -260,10 +261,9 @@ node.main(sys.argv[1:])
 def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_bag: Path) -> None:
     """The thread triggers a condition of each executor, and may find it half destroyed."""
     parameters = ['-p', f'bag:={tiny_bag}'] if name == 'bag_player' else ['-p', 'autostart:=false']
-    command = [sys.executable, '-c', EXECUTOR_OF_A_NODE, name, '--ros-args', *parameters]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    lines = [line for line in done.stdout.splitlines() if line]
-    assert (done.returncode, done.stderr) == (0, '')
+    status, out, error = run(EXECUTOR_OF_A_NODE, name, '--ros-args', *parameters)
+    lines = [line for line in out.splitlines() if line]
+    assert (status, error) == (0, '')
     assert lines.index('executor destroyed') > lines.index('signals answered no more')
 
 
@@ -281,9 +281,7 @@ except Exception:
 
 
 def test_a_signal_while_the_executor_is_constructed_prints_no_traceback() -> None:
-    command = [sys.executable, '-c', EXECUTOR_AFTER_THE_SHUTDOWN]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, 'refused\n', '')
+    assert run(EXECUTOR_AFTER_THE_SHUTDOWN) == (0, 'refused\n', '')
 
 
 ARENAS_OF_A_NODE = """
@@ -313,10 +311,8 @@ entry_points.calibrator()
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), 'malloc_info'), reason='glibc alone has it')
 def test_threads_share_one_arena_of_memory() -> None:
     """Otherwise the memory of a node grows with the threads on which it has solved."""
-    command = [sys.executable, '-c', ARENAS_OF_A_NODE]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.count('<heap nr=') == 1
+    status, out, error = run(ARENAS_OF_A_NODE)
+    assert (status, error) == (0, '') and out.count('<heap nr=') == 1
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -325,8 +321,7 @@ def test_nodes_end_after_several_signals(
 ) -> None:
     """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
     rng = random.Random(seed)
-    ros = ('--params-file', str(tiny_bag / 'params.yaml'))
-    nodes = [start_node(name, ros=ros, forked=False) for name in ('star_observer', 'calibrator')]
+    nodes = [start_node(name, ros=parameters(tiny_bag), forked=False) for name in BOTH]
     managers = [Manager(client, node.name) for node in nodes]
     client.until(lambda: all(manager.state() == 'active' for manager in managers))
     for _ in range(rng.choice([2, 3])):
@@ -356,9 +351,7 @@ for _ in range(10_000):
 
 def test_ros_may_be_shut_down_by_a_signal_at_the_same_time() -> None:
     """`rclpy.try_shutdown` alone fails once in some hundred times: the signal was faster."""
-    command = [sys.executable, '-c', SHUT_DOWN_TWICE]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stderr) == (0, '')
+    assert run(SHUT_DOWN_TWICE) == (0, '', '')
 
 
 CALLBACK_AT_THE_END = """
@@ -393,16 +386,14 @@ sys.exit(run(Slow, 'calibrator', sys.argv[1:]))
 
 def test_a_callback_that_runs_at_the_end_has_a_node(tiny_bag: Path) -> None:
     """In a destroyed one, rclpy crashes where the state is asked for."""
-    ros = ['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')]
-    command = [sys.executable, '-c', CALLBACK_AT_THE_END, *ros]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith('a node ')
+    status, out, error = run(CALLBACK_AT_THE_END, '--ros-args', *parameters(tiny_bag))
+    assert status == 0, error
+    assert out.startswith('a node ')
 
 
 def test_a_destroyed_node_is_no_longer_in_the_graph(client: Client, tiny_bag: Path) -> None:
     """A process may hold several nodes, one after the other, with the same name."""
-    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
+    rclpy.init(args=['--ros-args', *parameters(tiny_bag)])
     try:
         node = Calibrator()
         client.until(lambda: 'calibrator' in client.node.get_node_names())

@@ -6,7 +6,6 @@ from __future__ import annotations
 import array
 from collections.abc import Callable
 import dataclasses
-import functools
 import json
 from pathlib import Path
 import signal
@@ -28,17 +27,17 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, TransformStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, Temperature
 from std_srvs.srv import Trigger
 
-from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ground.bag_writer import (
     attitude_to_message,
@@ -72,18 +71,6 @@ from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 
-BOTH = ('star_observer', 'calibrator')
-REMAPS = (
-    *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
-    *('-r', 'velocity:=/spacecraft/velocity'),
-)
-
-
-def parameters(folder: Path, *more: str) -> tuple[str, ...]:
-    """ROS arguments for the parameter file of a bag and further ones."""
-    given = [part for one in more for part in ('-p', one)]
-    return ('--params-file', str(folder / 'params.yaml'), *given)
-
 
 def blank(stamp_ns: int, **change: Any) -> Any:
     """Return an image message of a dark sky with some fields changed."""
@@ -105,24 +92,28 @@ def play(start_node: StartNode, folder: Path, *more: str) -> None:
     assert player.wait(120.0) == 0, player.said()
 
 
-def send_observations(client: Client, products: Path) -> None:
-    """Publish the observations of products; a player would take as long to start as a node."""
-    publisher = client.publisher(StarObservations, 'observations')
-    for raw in reader.read_raw([products / 'observations.mcap']):
-        publisher.publish(raw.data)
-
-
 def test_nodes_and_tool_give_the_same_calibration(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
 ) -> None:
+    """The observations have rates and the sigma of the velocity, the picture the image's size."""
     for name in BOTH:
         start_node(name, ros=(*parameters(tiny_bag), *REMAPS))
+    pictures = client.collect(Image, 'annotated_image', 5)
+    answers: list[Any] = client.collect(StarObservations, 'observations')
     # The player waits for the observer, but the calibrator must not miss the first image.
     client.until_listened()
     play(start_node, tiny_bag)
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    images = json.loads((tiny_bag / 'truth.json').read_text())['images']
-    client.until(lambda: status and status[-1].images == images)
+    client.until_images(json.loads((tiny_bag / 'truth.json').read_text())['images'])
+    client.until(lambda: pictures and len(answers) == 10)
+    assert {answer.velocity_sigma_m_s for answer in answers} == {10.0}
+    rates_rad_s = np.array([answer.star_tracker_rate_rad_s for answer in answers])
+    # The camera is still.
+    assert rates_rad_s.shape == (10, 3) and np.abs(rates_rad_s).max() < 1e-12
+    picture = pictures[0]
+    assert picture.encoding == 'bgr8'
+    assert (picture.height, picture.width) == (answers[0].height, answers[0].width)
+    assert len(picture.data) == picture.height * picture.width * 3
+    assert np.ptp(np.frombuffer(picture.data, np.uint8)) > 100
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert answer.success, answer.message
     found = client.latched(Calibration, 'calibration')
@@ -158,10 +149,9 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
         start_node(name, ros=(*parameters(bag), *REMAPS))
     client.until_listened()
     play(start_node, bag)
-    status = client.latched(EnsembleStatus, 'ensemble_status')
     found = client.latched(Calibration, 'calibration')
     for images in (8, 10):
-        client.until(lambda images=images: status and status[-1].images == images)
+        client.until_images(images)
         answer = client.call(Trigger, '/calibrator/calibrate')
         assert answer.success, answer.message
         client.until(lambda images=images: found and found[-1].images_used == images)
@@ -173,32 +163,19 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
     np.testing.assert_allclose(live.sigma, offline.sigma, rtol=1e-4)
 
 
-@pytest.fixture
-def calibrated(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
-) -> list[Any]:
-    """Calibrations published by a calibrator that has collected the tiny bag: one so far."""
+def test_each_service_of_a_calibrator(
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+    tmp_path: Path,
+) -> None:
+    """Dry runs, bad requests, a table, roll-back, reset: one calibration is ever published."""
     start_node('calibrator', ros=parameters(tiny_bag))
-    send_observations(client, tiny_products)
-    images = json.loads((tiny_bag / 'truth.json').read_text())['images']
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and status[-1].images == images)
+    client.fill(tiny_observations.images)
     assert client.call(Trigger, '/calibrator/calibrate').success
     published: list[Any] = client.latched(Calibration, 'calibration')
     client.until(lambda: published)
-    return published
-
-
-def test_rollback(client: Client, calibrated: list[Any]) -> None:
-    """Rollback activates the previous calibration, and fails without one."""
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    back = client.call(Trigger, '/calibrator/rollback')
-    assert back.success and 'activated again' in back.message
-    none = client.call(Trigger, '/calibrator/rollback')
-    assert not none.success and 'no calibration before' in none.message
-
-
-def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: list[Any]) -> None:
     # All but k3, which is zero in truth: the gate would name any other that is held.
     names = ['fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2']
     trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=names)
@@ -212,22 +189,18 @@ def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: l
     for estimate in (['fx'] * 100_000, ['fx', 'fx'], ['x' * 10**6]):
         bad = client.call(Calibrate, '/calibrator/solve', estimate=estimate)
         assert not bad.success and len(bad.message) < 1000
-    assert len(calibrated) == 1
 
-
-def test_the_table_of_lines_of_sight_is_that_of_the_tool(
-    client: Client, calibrated: list[Any], tmp_path: Path
-) -> None:
     answer = client.call(LineOfSightTable, '/calibrator/lookup', points=7)
     assert answer.success and '49 lines of sight' in answer.message
-    write_calibration(calibration_from_message(calibrated[0]), tmp_path / 'calibration.json')
+    active = calibration_from_message(published[0])
+    write_calibration(active, tmp_path / 'calibration.json')
     table = tmp_path / 'table.csv'
     assert main(['lookup', str(tmp_path), '-o', str(table), '--points', '7']) == 0
     columns = np.genfromtxt(table, delimiter=',', names=True)
     assert len(columns) == 49
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(answer, name), columns[name])
-    budget = calibration_from_message(calibrated[0]).sigma_budget
+    budget = active.sigma_budget
     assert [part.cause for part in answer.sigma_budget] == [part.cause for part in budget]
     assert answer.sigma_budget[0].map_arcsec == budget[0].map_arcsec > 0.0
     default = client.call(LineOfSightTable, '/calibrator/lookup')
@@ -236,35 +209,32 @@ def test_the_table_of_lines_of_sight_is_that_of_the_tool(
         refused = client.call(LineOfSightTable, '/calibrator/lookup', points=points)
         assert not refused.success and f'points: {points}' in refused.message
 
-
-def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> None:
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status)
-    images = status[-1].images
     reset = client.call(Trigger, '/calibrator/reset')
-    assert reset.success and str(images) in reset.message
-    client.until(lambda: status[-1].images == 0)
-    empty = client.call(Trigger, '/calibrator/calibrate')
-    assert not empty.success
-    assert len(calibrated) == 1
+    assert reset.success and str(len(tiny_observations.images)) in reset.message
+    client.until_images(0)
+    assert not client.call(Trigger, '/calibrator/calibrate').success
+    assert len(published) == 1
+    client.fill(tiny_observations.images)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    back = client.call(Trigger, '/calibrator/rollback')
+    assert back.success and 'activated again' in back.message
+    none = client.call(Trigger, '/calibrator/rollback')
+    assert not none.success and 'no calibration before' in none.message
 
 
 def test_gate_refusal_and_force(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
 ) -> None:
     """A refused candidate is only in the response, unless it is forced."""
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_change_px:=1e-6'))
-    send_observations(client, tiny_products)
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and status[-1].images >= 10)
+    client.fill(tiny_observations.images)
     found = client.latched(Calibration, 'calibration')
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert not answer.success and answer.message.startswith('refused by the gate')
     solved = client.call(Calibrate, '/calibrator/solve')
     assert not solved.success and solved.calibration.stars_used > 0
     assert solved.calibration.reasons and not solved.calibration.accepted
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    client.until(lambda: any('refused by the gate' in m.status[0].message for m in diagnostics))
+    client.until(lambda: 'refused by the gate' in client.health('calibrator')[1])
     assert not found
     candidate = client.latched(Calibration, 'candidate_calibration')
     client.until(lambda: candidate)
@@ -274,9 +244,7 @@ def test_gate_refusal_and_force(
     client.until(lambda: found)
     assert found[0].reasons[-1] == 'activated by request despite the gate'
     assert found[0].forced and found[0].number == 1
-    client.until(
-        lambda: any('active despite the gate' in m.status[0].message for m in diagnostics)
-    )
+    client.until(lambda: 'active despite the gate' in client.health('calibrator')[1])
     assert calibrator.process.poll() is None
 
 
@@ -307,11 +275,9 @@ def test_every_image_gets_one_answer(
     assert all(a.detail for a in answers)
     images.publish(blank(60_000_000_000))
     client.until(lambda: len(answers) == len(sent) + 1)
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    client.until(lambda: diagnostics)
-    values = {v.key: v.value for v in diagnostics[0].status[0].values}
-    assert (values['images'], values['refused_bad_layout']) == ('6', '2')
-    assert diagnostics[0].status[0].level == b'\x01'
+    client.until_value('images', '6')
+    level, _, values = client.health()
+    assert (level, values['refused_bad_layout']) == (b'\x01', '2')
 
 
 def test_attitudes_of_an_imu_are_taken_by_their_type(
@@ -323,7 +289,7 @@ def test_attitudes_of_an_imu_are_taken_by_their_type(
     images = client.publisher(Image, 'image', 50)
     attitudes = client.publisher(Imu, 'attitude', 200)
     client.until_listened()
-    for raw in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+    for raw in reader.read_raw([tiny_bag], [ATTITUDES]):
         decoded = reader.decode(raw)
         sample = Imu()
         sample.header.stamp.sec = decoded.header.stamp.sec
@@ -338,38 +304,16 @@ def test_attitudes_of_an_imu_are_taken_by_their_type(
     assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
 
 
-def test_image_waits_for_its_attitude(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    """An image that arrives before its attitude waits for it."""
-    start_node('star_observer', ros=(*parameters(tiny_bag, 'attitude_timeout_s:=60.0'), *REMAPS))
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, '/opnav/image_raw', 10)
-    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
-    first = next(reader.read_raw([tiny_bag], ['/opnav/image_raw']))
-    samples = list(reader.read_raw([tiny_bag], ['/star_tracker/attitude']))
-    client.until_listened()
-    images.publish(first.data)
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    client.until(functools.partial(is_waiting, diagnostics, 1))
-    assert not answers
-    for sample in samples:
-        attitudes.publish(sample.data)
-    client.until(lambda: answers)
-    assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
-
-
-def test_observations_carry_the_temperature(
+def test_an_image_waits_for_its_attitude_and_has_the_temperature(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
     given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
     start_node('star_observer', ros=(*given, *REMAPS, '-r', 'temperature:=/box'))
     answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, '/opnav/image_raw', 10)
-    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    images = client.publisher(Image, IMAGES, 10)
+    attitudes = client.publisher(QuaternionStamped, ATTITUDES)
     temperatures = client.publisher(Temperature, '/box')
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
-    first = next(reader.read_raw([tiny_bag], ['/opnav/image_raw']))
+    first = next(reader.read_raw([tiny_bag], [IMAGES]))
     for offset_ns, degc in ((-2 * 10**9, 3.5), (-(10**9), -7.25), (10**9, 40.0)):
         message = temperature_to_message(
             first.log_time_ns + offset_ns, degc, 'camera', make_message
@@ -378,25 +322,13 @@ def test_observations_carry_the_temperature(
     assert temperatures.wait_for_all_acked()
     client.until_listened()
     images.publish(first.data)
-    client.until(functools.partial(is_waiting, diagnostics, 1))
-    for sample in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+    client.until_value('images_waiting', '1')
+    assert not answers
+    for sample in reader.read_raw([tiny_bag], [ATTITUDES]):
         attitudes.publish(sample.data)
     client.until(lambda: answers)
-    assert answers[0].refusal == '' and answers[0].temperature_degc == -7.25
-
-
-def test_observations_carry_rate_and_velocity_sigma(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    """Of a camera that is still, with the velocity in its bag."""
-    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    client.until_listened()
-    start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
-    client.until(lambda: len(answers) == 10)
-    assert {answer.velocity_sigma_m_s for answer in answers} == {10.0}
-    rates_rad_s = np.array([answer.star_tracker_rate_rad_s for answer in answers])
-    assert rates_rad_s.shape == (10, 3) and np.abs(rates_rad_s).max() < 1e-12
+    assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
+    assert answers[0].temperature_degc == -7.25
 
 
 def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
@@ -407,16 +339,16 @@ def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path
     start_node(
         'star_observer',
         ros=(
-            *(*parameters(tiny_bag, patient), '-r', 'image:=/opnav/image_raw/compressed'),
-            *('-r', 'attitude:=/star_tracker/attitude'),
-            *('-r', 'observations:=of_png', '-r', '__node:=png_observer'),
+            *(*parameters(tiny_bag, patient), '-r', f'image:={IMAGES}/compressed'),
+            *('-r', f'attitude:={ATTITUDES}', '-r', 'observations:=of_png'),
+            *('-r', '__node:=png_observer'),
         ),
     )
     raw: list[Any] = client.collect(StarObservations, 'observations')
     png: list[Any] = client.collect(StarObservations, 'of_png')
-    images = client.publisher(Image, '/opnav/image_raw', 10)
-    compressed = client.publisher(CompressedImage, '/opnav/image_raw/compressed', 10)
-    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    images = client.publisher(Image, IMAGES, 10)
+    compressed = client.publisher(CompressedImage, f'{IMAGES}/compressed', 10)
+    attitudes = client.publisher(QuaternionStamped, ATTITUDES)
     client.until(lambda: attitudes.get_subscription_count() == 2)
     client.until_listened()
     client.until_listened('png_observer')
@@ -427,7 +359,7 @@ def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path
     message.data = array.array('B', cv2.imencode('.png', first.pixels)[1].tobytes())
     compressed.publish(message)
     images.publish(image_to_message(first, 'camera', make_message))
-    for sample in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+    for sample in reader.read_raw([tiny_bag], [ATTITUDES]):
         attitudes.publish(sample.data)
     client.until(lambda: raw and png)
     assert raw[0].refusal == '' and raw[0].header == png[0].header
@@ -441,7 +373,6 @@ def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Pa
     """With more images than the queue holds, each is answered, the surplus with overrun."""
     start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=60.0'))
     answers: list[Any] = client.collect(StarObservations, 'observations')
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     images = client.publisher(Image, 'image', 50)
     attitudes = client.publisher(QuaternionStamped, 'attitude')
     client.until_listened()
@@ -449,31 +380,10 @@ def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Pa
         for k in range(first, end + 1):
             images.publish(blank(k))
         # DDS itself keeps no more than twenty: these are taken before the next are sent.
-        client.until(functools.partial(is_waiting, diagnostics, end))
+        client.until_value('images_waiting', str(end))
     attitudes.publish(attitude(100_000_000_000))
     client.until(lambda: len(answers) == 40)
     assert [a.refusal for a in answers] == ['wrong_size'] * 20 + ['overrun'] * 20
-
-
-def is_waiting(diagnostics: list[Any], images: int) -> bool:
-    """Return True if the latest diagnostics report this number of queued images."""
-    values = {v.key: v.value for m in diagnostics[-1:] for v in m.status[0].values}
-    return values.get('images_waiting') == str(images)
-
-
-def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """The annotated image has the size and stamp of the image."""
-    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    pictures = client.collect(Image, 'annotated_image', 5)
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    client.until_listened()
-    play(start_node, tiny_bag)
-    client.until(lambda: len(pictures) >= 1 and len(answers) >= 10)
-    picture = pictures[0]
-    assert picture.encoding == 'bgr8'
-    assert (picture.height, picture.width) == (answers[0].height, answers[0].width)
-    assert len(picture.data) == picture.height * picture.width * 3
-    assert np.ptp(np.frombuffer(picture.data, np.uint8)) > 100
 
 
 def test_camera_info_per_image(
@@ -531,13 +441,11 @@ def test_camera_info_per_image(
 
 
 def test_calibrator_collects_while_it_solves(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
 ) -> None:
     """Observations that arrive during a calibration are all counted."""
     start_node('calibrator', ros=parameters(tiny_bag))
-    send_observations(client, tiny_products)
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and status[-1].images >= 10)
+    client.fill(tiny_observations.images)
     observations = client.publisher(StarObservations, 'observations')
     solve = client.node.create_client(Calibrate, '/calibrator/solve')
     client.until(solve.service_is_ready)
@@ -547,8 +455,7 @@ def test_calibrator_collects_while_it_solves(
         observations.publish(observations_to_message(refused, '', make_message))
     client.until(lambda: all(future.done() for future in futures), 120.0)
     assert all(future.result().success for future in futures)
-    client.until(lambda: 'no_stars' in {entry.reason for entry in status[-1].refused})
-    client.until(lambda: sum(e.count for e in status[-1].refused) == 300)
+    client.until_refused(('no_stars', 300))
 
 
 def test_state_outlasts_a_kill(
@@ -559,8 +466,7 @@ def test_state_outlasts_a_kill(
     state = f'state_dir:={tmp_path / "state"}'
     killed = start_node('calibrator', ros=parameters(tiny_bag, state))
     play(start_node, tiny_products / 'observations.mcap')
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and status[-1].images_saved == tool.images_used)
+    client.until_images(tool.images_used, 'images_saved')
     assert client.call(Trigger, '/calibrator/calibrate').success
     second = start_node('calibrator', ros=parameters(tiny_bag, state))
     assert second.wait() == 2
@@ -577,50 +483,36 @@ def test_state_outlasts_a_kill(
     answer = calibration_from_message(again.calibration)
     for one in (active, answer):
         np.testing.assert_array_equal(one.covariance, tool.covariance)
-    ensemble_by_tool = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate']
-    ensemble_by_tool += [str(tmp_path / 'state' / 'ensemble'), '-o', str(tmp_path / 'again')]
-    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml')]
-    subprocess.run(ensemble_by_tool, check=True, capture_output=True)
+    ensemble_by_tool = ['calibrate', str(tmp_path / 'state' / 'ensemble')]
+    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(tmp_path / 'again')]
+    assert main(ensemble_by_tool) == 0
     repeated = read_calibration(tmp_path / 'again' / CALIBRATION_FILE)
     np.testing.assert_array_equal(repeated.covariance, tool.covariance)
 
 
-def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Inconsistent observations are logged and counted as refused; the next ones are used."""
+def test_without_images_nothing_is_active_and_a_bad_message_ends_nothing(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """The prior is no calibration. Inconsistent observations are logged and counted."""
     calibrator = start_node('calibrator', ros=parameters(tiny_bag))
-    observations = client.publisher(StarObservations, 'observations')
-    observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
-    refused = refused_image(5, 8, 8, 'no_stars', '')
-    observations.publish(observations_to_message(refused, '', make_message))
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    both = ['bad_observations', 'no_stars']
-    client.until(lambda: status and [e.reason for e in status[-1].refused] == both)
-    assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
-    assert 'Traceback' not in calibrator.said()
-
-
-def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A calibration of an empty ensemble is refused; the prior is no calibration."""
-    start_node('calibrator', ros=parameters(tiny_bag))
     latched = [
         client.latched(CameraInfo, 'camera_info'),
         client.latched(TransformStamped, 'alignment'),
         client.latched(Calibration, 'calibration'),
     ]
-    status = client.latched(EnsembleStatus, 'ensemble_status')
     answer = client.call(Trigger, '/calibrator/calibrate')
-    assert not answer.success
-    assert str(status_of(client, status).min_images) in answer.message
-    assert '\n' not in answer.message
+    assert not answer.success and '\n' not in answer.message
+    assert str(client.until_images(0).min_images) in answer.message
     rollback = client.call(Trigger, '/calibrator/rollback')
     assert not rollback.success and rollback.message == 'no calibration is active'
     assert latched == [[], [], []]
-
-
-def status_of(client: Client, status: list[Any]) -> Any:
-    """Latest ensemble status."""
-    client.until(lambda: status)
-    return status[-1]
+    observations = client.publisher(StarObservations, 'observations')
+    observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
+    refused = refused_image(5, 8, 8, 'no_stars', '')
+    observations.publish(observations_to_message(refused, '', make_message))
+    client.until_refused(('bad_observations', 1), ('no_stars', 1))
+    assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
+    assert 'Traceback' not in calibrator.said()
 
 
 INTERRUPTED = """
@@ -644,15 +536,6 @@ def test_a_signal_while_python_imports(name: str) -> None:
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signals(client: Client, start_node: StartNode, tiny_bag: Path, number: int) -> None:
-    nodes = [start_node(name, ros=parameters(tiny_bag)) for name in BOTH]
-    client.until(lambda: set(BOTH) <= set(client.node.get_node_names()))
-    for node in nodes:
-        assert node.stop(number) == 0
-        assert 'Traceback' not in node.said()
-
-
 def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tuple[str, ...]]:
     """ROS arguments for a changed copy of the parameter file of the bag."""
 
@@ -673,6 +556,10 @@ def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tupl
         (lambda f, _: parameters(f, 'prior_alignment:=[1.0, 2.0]'), 'prior_alignment'),
         (lambda f, _: parameters(f, 'estimate:=[fx, fz]'), 'estimate'),
         (lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
+        (
+            lambda f, _: parameters(f, 'magnitude_limt:=6.0'),
+            'magnitude_limt: no such parameter (did you mean magnitude_limit?)',
+        ),
         (lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
         (lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
         (tiny_parameters(lambda text: text.replace(':', ':::')), 'params.yaml'),
@@ -729,38 +616,17 @@ def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DO
     return '' if answer.results[0].successful else str(answer.results[0].reason)
 
 
-def state_of(client: Client, name: str = 'star_observer') -> str:
-    """Lifecycle state of a node."""
-    answer = client.call(GetState, f'/{name}/get_state')
+def state_of(client: Client) -> str:
+    """Lifecycle state of the star observer."""
+    answer = client.call(GetState, '/star_observer/get_state')
     return str(answer.current_state.label)
 
 
-def change_state(client: Client, transition: int, name: str = 'star_observer') -> bool:
+def change_state(client: Client, transition: int) -> bool:
     """Request a transition; return True if the node made it."""
     request = Transition(id=transition)
-    return bool(client.call(ChangeState, f'/{name}/change_state', transition=request).success)
-
-
-@pytest.mark.parametrize('name', BOTH)
-def test_lifecycle_by_hand(
-    client: Client, start_node: StartNode, tiny_bag: Path, name: str
-) -> None:
-    """Without autostart the node stays unconfigured; an invalid transition is answered."""
-    node = start_node(name, ros=parameters(tiny_bag, 'autostart:=false'))
-    assert state_of(client, name) == 'unconfigured'
-    assert not change_state(client, Transition.TRANSITION_ACTIVATE, name)
-    assert state_of(client, name) == 'unconfigured'
-    for _ in range(2):
-        for transition, state in (
-            (Transition.TRANSITION_CONFIGURE, 'inactive'),
-            (Transition.TRANSITION_ACTIVATE, 'active'),
-            (Transition.TRANSITION_DEACTIVATE, 'inactive'),
-            (Transition.TRANSITION_CLEANUP, 'unconfigured'),
-        ):
-            assert change_state(client, transition, name)
-            assert state_of(client, name) == state
-    assert node.stop() == 0
-    assert 'Traceback' not in node.said()
+    answer = client.call(ChangeState, '/star_observer/change_state', transition=request)
+    return bool(answer.success)
 
 
 def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-import rclpy
+from node_inputs import in_this_process  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import typestore
@@ -31,17 +31,8 @@ pytestmark = pytest.mark.nodes
 @pytest.fixture
 def observer(ros_domain: None, tiny_bag: Path) -> Iterator[StarObserver]:
     """An active star observer in this process."""
-    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
-    node = StarObserver()
-    try:
-        node.trigger_configure()
-        node.trigger_activate()
+    with in_this_process(StarObserver, tiny_bag) as node:
         yield node
-    finally:
-        node.deactivate()
-        node.cleanup()
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 def test_the_worker_alone_changes_prediction_and_counts(

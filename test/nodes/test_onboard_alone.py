@@ -24,10 +24,11 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from ament_index_python.packages import get_packages_with_prefixes
+from node_inputs import BOTH, parameters, REMAPS  # type: ignore[import-not-found]
 from packaging.requirements import Requirement
 from std_srvs.srv import Trigger
 
-from starcal.msg import Calibration, EnsembleStatus
+from starcal.msg import Calibration
 from starcal_ros.formats.messages.record_messages import calibration_from_message
 
 pytestmark = [pytest.mark.nodes, pytest.mark.usefixtures('onboard')]
@@ -110,26 +111,20 @@ def test_nodes_and_interface_calibrate_a_bag(
     client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:
     """The same calibration from the messages of a player and from the bag; with a state folder."""
-    values = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', f'state_dir:={tmp_path}/kept')
-    remaps = [
-        *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
-        *('-r', 'velocity:=/spacecraft/velocity'),
-    ]
-    for name in ('star_observer', 'calibrator'):
-        start_node(name, ros=(*values, *remaps))
+    for name in BOTH:
+        start_node(name, ros=(*parameters(tiny_bag, f'state_dir:={tmp_path}/kept'), *REMAPS))
     client.until_listened()
     player = start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
     assert player.wait(120.0) == 0, player.said()
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and status[-1].images_saved == 10)
+    client.until_images(10, 'images_saved')
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert answer.success, answer.message
     published = client.latched(Calibration, 'calibration')
     client.until(lambda: published)
     done = run('-c', CALIBRATED, tiny_bag, tiny_bag / 'params.yaml')
     assert (done.returncode, done.stderr) == (0, '')
-    is_accepted, images, parameters = json.loads(done.stdout)
+    is_accepted, images, by_interface = json.loads(done.stdout)
     assert is_accepted and published[0].accepted
     assert images == published[0].images_used == 10
     camera = calibration_from_message(published[0]).geometry.camera
-    assert parameters == camera.parameters.tolist()
+    assert by_interface == camera.parameters.tolist()

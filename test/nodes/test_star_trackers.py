@@ -16,13 +16,12 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import QuaternionStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal.msg import Calibration, StarObservations
 from starcal_ground.bag_writer import attitude_to_message, BagWriter, image_to_message
 from starcal_ros.constants import NANOSECONDS_PER_SECOND as SECOND_NS
 from starcal_ros.formats.messages.record_messages import calibration_from_message
@@ -47,6 +46,17 @@ def parameter_file(bag: Path, path: Path, wrong_by_deg: float = 0.0) -> Path:
     return path
 
 
+def attitude_messages(mounted: Rotation, from_ns: int, to_ns: int) -> list[Any]:
+    """Attitudes of the small bag in a span of time, by a star tracker mounted like this."""
+    return [
+        attitude_to_message(
+            time_ns, (Rotation.from_quat(xyzw) * mounted).as_quat(), 'icrf', make_message
+        )
+        for time_ns, xyzw in attitudes()
+        if from_ns < time_ns < to_ns
+    ]
+
+
 def test_one_takes_over_from_another(
     client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:
@@ -66,8 +76,7 @@ def test_one_takes_over_from_another(
     client.until_listened()
     player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0'))
     assert player.wait(120.0) == 0, player.said()
-    status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and status[-1].images == len(images()))
+    client.until_images(len(images()))
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert answer.success, answer.message
     found = client.latched(Calibration, 'calibration')
@@ -85,7 +94,6 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
     patient = ('--params-file', str(params), '-p', 'attitude_timeout_s:=60.0')
     start_node('star_observer', ros=patient)
     found = client.collect(StarObservations, 'observations')
-    health = client.collect(DiagnosticArray, '/diagnostics')
     first = client.publisher(QuaternionStamped, '/attitude')
     other = client.publisher(QuaternionStamped, '/other/attitude')
     shown = client.publisher(Image, '/image', 10)
@@ -98,30 +106,23 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
         sent += len(messages)
 
     def send_attitudes(publisher: Any, image: ImageRecord) -> None:
-        """Send those about an image."""
+        """Send those about an image; wait until they have come."""
         mounted = Rotation.identity() if publisher is first else FIRST_FROM_OTHER
-        for time_ns, xyzw in attitudes():
-            if abs(time_ns - image.time_ns) < 2 * SECOND_NS:
-                quaternion = (Rotation.from_quat(xyzw) * mounted).as_quat()
-                send(publisher, attitude_to_message(time_ns, quaternion, 'icrf', make_message))
-
-    def values() -> dict[str, str]:
-        return {one.key: one.value for one in health[-1].status[0].values} if health else {}
+        about = (image.time_ns - 2 * SECOND_NS, image.time_ns + 2 * SECOND_NS)
+        send(publisher, *attitude_messages(mounted, *about))
+        client.until_value('messages', str(sent))
 
     for k, image in enumerate(images()[:4]):
         if k >= 2:  # the delay of the first is known
             send(shown, image_to_message(image, 'camera', make_message))
+        # One after the other: samples of two topics may come in another order.
         send_attitudes(other, image)
-        client.until(lambda: values().get('messages') == str(sent))
         send_attitudes(first, image)
-        # Before the next: samples of two topics may come in another order than they are sent.
-        client.until(lambda: values().get('messages') == str(sent))
         client.until(lambda k=k: len(found) == max(0, k - 1))
     assert [(one.refusal, one.star_tracker) for one in found] == 2 * [('', '')]
     assert found[0].detail == '' and found[1].detail.startswith('other not used: no_match: ')
-    client.until(lambda: values().get('attitudes_not_used') == 'other: 1')
-    status = health[-1].status[0]
-    assert status.level == DiagnosticStatus.WARN and status.message == found[1].detail
+    client.until_value('attitudes_not_used', 'other: 1')
+    assert client.health()[:2] == (b'\x01', found[1].detail)
 
 
 @pytest.mark.parametrize('wrong_by_deg', [5.0, 40.0])
@@ -137,19 +138,16 @@ def test_the_first_images_wait_for_a_late_one_beside_a_wrong_one(
     wrong = client.publisher(QuaternionStamped, '/other/attitude')
     shown = client.publisher(Image, '/image', 10)
 
-    def send_attitudes(publisher: Any, mounted: Rotation, until_ns: int) -> None:
-        for time_ns, xyzw in attitudes():
-            if time_ns <= until_ns:
-                quaternion = (Rotation.from_quat(xyzw) * mounted).as_quat()
-                publisher.publish(attitude_to_message(time_ns, quaternion, 'icrf', make_message))
-
     first = images()[:3]
+    until_ns = first[-1].time_ns + 2 * SECOND_NS
     for image in first:
         shown.publish(image_to_message(image, 'camera', make_message))
-    send_attitudes(wrong, FIRST_FROM_OTHER, first[-1].time_ns + 2 * SECOND_NS)
+    for message in attitude_messages(FIRST_FROM_OTHER, 0, until_ns):
+        wrong.publish(message)
     client.until(lambda: len(observed) == len(first))
     assert {one.refusal for one in observed} == {'no_match'}
-    send_attitudes(late, Rotation.identity(), first[-1].time_ns + 2 * SECOND_NS)
+    for message in attitude_messages(Rotation.identity(), 0, until_ns):
+        late.publish(message)
     client.until(lambda: len(observed) == 2 * len(first))
     again = observed[len(first) :]
     assert [(one.refusal, one.star_tracker) for one in again] == len(first) * [('', '')]

@@ -169,11 +169,12 @@ def test_the_answer_has_the_requirements(
 
 
 @pytest.mark.slow
-def test_what_is_forced_says_so(
+def test_what_is_forced_says_so_and_stays_for_its_own_reasons_only(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     gate = dataclasses.replace(setup.gate, max_change_px=1e-6)
-    state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
+    given = dataclasses.replace(setup, gate=gate)
+    state = filled(given, shown, tmp_path)
     refused = state.solve()
     assert not refused.success and refused.calibration is not None
     assert (refused.calibration.number, refused.calibration.forced) == (0, False)
@@ -181,10 +182,16 @@ def test_what_is_forced_says_so(
     assert state.solve(dry_run=True, force=True).success and state.active is None
     assert state.solve(force=True).success
     state.close()
-    state = started(setup, tmp_path)
-    active = state.active
-    assert active is not None and active.forced and not active.accepted
-    assert active.reasons[-1] == 'activated by request despite the gate'
+    for again in (given, setup):
+        state = started(again, tmp_path)
+        active = state.active
+        assert active is not None and active.forced and not active.accepted
+        assert active.reasons[-1] == 'activated by request despite the gate'
+        state.close()
+    tighter = dataclasses.replace(gate, requirements=('map=1e-6px',))
+    state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
+    assert state.active is None and 'requirements' in state.withheld[0]
+    assert 'max_change_px' not in state.withheld[0]
     state.close()
 
 
@@ -313,18 +320,6 @@ def test_two_on_one_folder(setup: Setup, tmp_path: Path) -> None:
     started(setup, tmp_path).close()
 
 
-def test_damage_is_named(
-    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
-    filled(setup, shown, tmp_path).close()
-    victim = tmp_path / 'ensemble' / '00000002.mcap'
-    victim.write_bytes(victim.read_bytes()[:-100])
-    state = started(setup, tmp_path)
-    assert len(state.damage) == 1 and '00000002.mcap.damaged' in state.damage[0]
-    assert len(state.ensemble.images) == len(shown) - 1
-    state.close()
-
-
 def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
     state = started(setup)
     assert state.rollback() == Answer(False, 'no calibration is active')
@@ -399,23 +394,6 @@ def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(
     state = started(setup, tmp_path)
     assert state.active is None
     assert 'its file states that the gate refused it; forged' in state.withheld[0]
-    state.close()
-
-
-def test_what_was_forced_stays_for_its_own_reasons_only(
-    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
-    gate = dataclasses.replace(setup.gate, max_change_px=1e-6)
-    state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
-    assert state.solve(force=True).success
-    state.close()
-    state = started(dataclasses.replace(setup, gate=gate), tmp_path)
-    assert state.active is not None and state.active.forced
-    state.close()
-    tighter = dataclasses.replace(gate, requirements=('map=1e-6px',))
-    state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
-    assert state.active is None and 'requirements' in state.withheld[0]
-    assert 'max_change_px' not in state.withheld[0]
     state.close()
 
 

@@ -36,13 +36,6 @@ def test_a_calibration_does_not_wait_for_what_it_seldom_needs() -> None:
     assert not loaded & seldom
 
 
-def test_help_and_completion_load_no_numbers() -> None:
-    """Half a second of imports would be felt at each press of the tab key."""
-    show = 'import sys, starcal_ground.cli.main; print(*sys.modules)'
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
-    assert not set(done.stdout.split()) & {'numpy', 'scipy', 'mcap', 'rosbags'}
-
-
 def run_at_import(statements: list[ast.stmt]) -> Iterator[ast.Import | ast.ImportFrom]:
     """Import statements of a module that its import runs: none of functions or for types alone."""
     for one in statements:

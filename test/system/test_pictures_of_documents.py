@@ -11,13 +11,12 @@ import shutil
 import sys
 
 import cv2
+from mission_files import frames_of, write_pngs  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
 from docs import make_gallery, make_images, make_nodes, make_phase, make_real_sky, make_trend
 from starcal_ground.simulation import scenario
-from starcal_ros.formats.bag.reader import read_images
-from starcal_ros.records import Image
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
@@ -72,11 +71,7 @@ def small_phase(patch: pytest.MonkeyPatch, folder: Path) -> None:
 
 
 def small_real_sky(patch: pytest.MonkeyPatch, folder: Path) -> None:
-    photographs = folder / 'photographs'
-    photographs.mkdir()
-    for k, image in enumerate(read_images([ROOT / 'bags' / 'tiny'], '/opnav/image_raw')):
-        assert isinstance(image, Image)
-        cv2.imwrite(str(photographs / f'{k}.png'), image.pixels)
+    photographs = write_pngs(folder / 'photographs', frames_of(10))
     patch.setattr(sys, 'argv', ['make_real_sky', str(photographs), str(folder)])
     make_real_sky.main()
 

@@ -19,7 +19,7 @@ import subprocess
 import sys
 
 from attacks import BAG, digests, in_time, many, write_product_folder  # type: ignore[import-not-found]
-from mission_files import write_frame, write_lsk, write_sclk  # type: ignore[import-not-found]
+from mission_files import write_frames, write_lsk, write_sclk  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
@@ -213,7 +213,7 @@ OF_OTHERS: dict[str, Callable[[Path], object]] = {
 @pytest.fixture(scope='module')
 def inputs(campaign: Path) -> Path:
     """The campaign with a frame, its time and attitudes, a table of Gaia, and kernels."""
-    write_frame(campaign / 'frames')
+    write_frames(campaign / 'frames')
     stars = load_catalog(None, 3.0)
     stars = stars.select(stars.id > 0)
     places = np.degrees([stars.ra_rad, stars.dec_rad])

@@ -16,7 +16,6 @@ import dataclasses
 from dataclasses import dataclass
 import functools
 import io
-import itertools
 import json
 import os
 from pathlib import Path
@@ -29,6 +28,7 @@ import traceback
 
 from attacks import BAG, digests, many  # type: ignore[import-not-found]
 import cv2
+from mission_files import write_frames  # type: ignore[import-not-found]
 import pytest
 
 from bench import graph
@@ -39,7 +39,6 @@ from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import read_calibration, write_atomically
-from starcal_ros.records import Image
 
 SLOWEST_S = 300.0
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
@@ -90,26 +89,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # With three images a run has fewer thumbnails than with ten, and the same other files.
     few = dataclasses.replace(scenario('tiny'), image_count=3)
     simulated_bag.write_bag(few, folder / 'in/bag')
-    _make_frames(folder / 'in/frames')
+    write_frames(folder / 'in/frames', 2)
     files = ['--params', str(folder / 'in/bag/params.yaml'), '-o', str(folder / 'in/a')]
     with contextlib.redirect_stdout(io.StringIO()):  # in this process: it loads the modules
         assert main.main(['calibrate', str(folder / 'in/bag'), *files]) == 0
     shutil.copytree(folder / 'in/a', folder / 'in/b')
     return folder
-
-
-def _make_frames(folder: Path) -> None:
-    """Write two images as PNG, their times, and attitudes about them."""
-    folder.mkdir()
-    images = itertools.islice(reader.read_images([BAG], '/opnav/image_raw', 0.0), 2)
-    times, attitudes = ['file,time_ns'], ['time_ns,qx,qy,qz,qw']
-    for k, image in enumerate(images):
-        assert isinstance(image, Image)  # of a sound bag
-        cv2.imwrite(str(folder / f'{k}.png'), image.pixels)
-        times.append(f'{k}.png,{image.time_ns}')
-        attitudes += [f'{image.time_ns + after_ns},0,0,0,1' for after_ns in (-(10**8), 10**8)]
-    (folder / 'times.csv').write_text('\n'.join(times) + '\n')
-    (folder / 'attitude.csv').write_text('\n'.join(attitudes) + '\n')
 
 
 def _arguments(command: Command, folder: Path) -> list[str]:

@@ -77,7 +77,9 @@ def test_help_is_there_at_once() -> None:
     )  # fmt: skip
     for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
         assert command in done.stdout
-    for heavy in ('numpy', 'scipy', 'cv2', 'contourpy', 'rclpy', 'rich', 'argcomplete'):
+    # Half a second of imports would be felt at each press of the tab key.
+    numbers = ('numpy', 'scipy', 'cv2', 'contourpy', 'mcap', 'rosbags')
+    for heavy in (*numbers, 'rclpy', 'rich', 'argcomplete'):
         assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
 
 
@@ -95,12 +97,10 @@ def test_a_command_line_imports_its_command_alone() -> None:
         (['fly'], ["'fly'"]),
         (['calibrat'], ['did you mean calibrate?']),
         (['calibrate', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
-        (['--json', 'compare', 'a', 'b'], ['--json (write it after the command)']),
         (['inspect', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
         (['inspect', 'none.mcap'], ['none.mcap', 'no such bag']),
         (['inspect', ''], ['empty path']),
         (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
-        (['calibrate', str(TINY), '--params', str(TINY / 'camera.yaml'), '-o', 'x'], ['a camera']),
         (
             ['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'],
             ['larger than'],
@@ -116,8 +116,6 @@ def test_a_command_line_imports_its_command_alone() -> None:
         (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
         (['import', '--channel', 'grene'], ['did you mean green?']),
         (['calibrate'], ['BAG']),
-        (['calibrate', 'a.mcap'], ['--output DIR: not given', 'e.g. -o out']),
-        (['calibrate', 'a.mcap', '-o', 'x', '--json', '--quiet'], ['not allowed with']),
         (['simulate', '-o', 'x'], ['--scenario']),
         (['simulate', '-o', 'x', '--scenario', 'huge'], ["'huge'", 'tiny', 'small', 'paper']),
         (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', '-1'], ['--seed', '-1']),
@@ -470,17 +468,13 @@ def test_the_first_steps_run_in_an_empty_folder(
 def test_what_needs_ros_names_it(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
 ) -> None:
-    find_spec = importlib.util.find_spec
-
-    def without(name: str) -> object:
-        if name == 'starcal.msg' and missing == 'starcal':
-            raise ModuleNotFoundError(name='starcal')
-        return None if name == missing else find_spec(name)
-
-    monkeypatch.setattr(importlib.util, 'find_spec', without)
+    for name in [name for name in sys.modules if name.partition('.')[0] == missing]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)  # cannot be imported
     monkeypatch.setitem(sys.modules, 'starcal_ground.report', None)  # ROS is named first
     result = run(*line.format(t=tmp_path, b=TINY).split())
-    assert_refused(result, missing, 'is not installed', 'starcal calibrate')
+    assert_refused(result, missing, 'is not installed', 'source a ROS 2 workspace')
+    assert 'starcal calibrate' in result[2]
     assert not (tmp_path / 'out').exists()
 
 
@@ -535,25 +529,6 @@ def test_no_report_is_written_where_none_is_wanted(
     assert not (tmp_path / 'report.html').exists()
 
 
-def test_no_older_report_stands_beside_products_that_cannot_be_drawn(
-    run: Run,
-    tmp_path: Path,
-    tiny_bag: Path,
-    tiny_products: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def cannot(*_: object) -> None:
-        raise ValueError('no such colour')
-
-    monkeypatch.setattr('starcal_ground.report.page.charts_of', cannot)
-    write_atomically(tmp_path / 'report.html', 'of earlier products')
-    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
-    status, _, err = run('calibrate', bag, '--params', params, '-o', tmp_path)
-    assert status == 0 and 'the products cannot be drawn: ValueError: no such colour' in err
-    assert (tmp_path / 'calibration.json').is_file()
-    assert not (tmp_path / 'report.html').exists()
-
-
 def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
@@ -562,25 +537,6 @@ def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
     # The entry point imports that module of ros/; it was once renamed without its command.
     assert importlib.util.find_spec('starcal_ground.ros.monitor_client')
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
-@pytest.mark.parametrize('command', [('play', str(TINY)), ('monitor', '--once', '1')])
-def test_without_ros_one_line_names_the_remedy(
-    tmp_path: Path, command: tuple[str, ...], missing: str
-) -> None:
-    """ROS 2 itself or the messages of starcal cannot be imported, as where nothing is sourced."""
-    (tmp_path / 'sitecustomize.py').write_text(f'import sys; sys.modules[{missing!r}] = None\n')
-    done = subprocess.run(
-        [sys.executable, '-m', 'starcal_ground.cli.main', *command],
-        env={**os.environ, 'PYTHONPATH': str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2 and done.stderr.count('\n') == 1, done.stderr
-    assert missing in done.stderr and 'source a ROS 2 workspace' in done.stderr
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import resource
 import shutil
 
 from attacks import BAG, in_time, write_product_folder  # type: ignore[import-not-found]
-from mission_files import write_frame, write_lsk, write_sclk  # type: ignore[import-not-found]
+from mission_files import write_frames, write_lsk, write_sclk  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ground.cli import main
@@ -90,7 +90,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('campaign')
     shutil.copytree(BAG, folder / 'bag')
     write_product_folder(folder / 'out')
-    write_frame(folder / 'frames')
+    write_frames(folder / 'frames')
     write_lsk(folder / 'naif.tls')
     write_sclk(folder / 'clock.tsc')
     return folder

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import json
 from pathlib import Path
 import re
 import shutil
 
-import cv2
-from mission_files import images, TINY  # type: ignore[import-not-found]
+from mission_files import frames_of, images, TINY, write_encoded, write_pngs  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,18 +16,16 @@ from scipy.spatial.transform import Rotation
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
-from starcal_ros.records import Image
 
 TRUTH = json.loads((TINY / 'truth.json').read_text())
 IMAGES = '/opnav/image_raw'
 ATTITUDES = '/star_tracker/attitude'
 ALIGNMENT_DEG = 0.1  # noise of the star tracker in the bag: 0.011; a prior must be within 1.5
 COLUMNS = 80
+LENS = ('--focal-length-mm', '18', '--pixel-size-um', '10')  # of this camera, within 1 %
 
 
 def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
@@ -42,13 +38,6 @@ def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
         for image in images():
             writer.write_image(IMAGES, image, 'camera')
     return path
-
-
-def write_pngs(folder: Path, written: Sequence[Image]) -> Path:
-    folder.mkdir()
-    for k, image in enumerate(written):
-        cv2.imwrite(str(folder / f'{k}.png'), image.pixels)
-    return folder
 
 
 @pytest.mark.slow
@@ -104,12 +93,13 @@ def test_attitudes_that_do_not_fit_are_diagnosed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = with_attitudes(tmp_path / 'b.mcap', shift_s=5)
-    assert main(['calibrate', str(bag), '-o', str(tmp_path / 'out'), '--quiet']) == 2
+    command = ['calibrate', str(bag), *LENS, '-o', str(tmp_path / 'out'), '--quiet']
+    assert main(command) == 2
     error = capsys.readouterr().err
     assert error.count('\n') == 1
     assert 'prior_alignment: not given, and not found: The stamps of the images' in error
     assert 'Set stamp_offset_s: ' in error and '(details: starcal diagnose); look at ' in error
-    assert main(['diagnose', str(bag)]) == 3
+    assert main(['diagnose', str(bag), *LENS]) == 3
     assert 'in the parameter file:\n  stamp_offset_s: ' in capsys.readouterr().out
 
 
@@ -122,7 +112,7 @@ def test_streaks_that_are_measured_are_identified_too(
     line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '5']
     assert main(line) == 0
     capsys.readouterr()
-    assert main(['calibrate', str(bag), '-o', str(out), '--no-report']) == 0
+    assert main(['calibrate', str(bag), *LENS, '-o', str(out), '--no-report']) == 0
     assert '5 of 5 images identified by their stars' in capsys.readouterr().err
     calibration = read_calibration(out / 'calibration.json')
     truth = json.loads((bag / 'truth.json').read_text())['k_true'][0]
@@ -134,7 +124,7 @@ def test_streaks_that_are_measured_are_identified_too(
 def test_photographs_of_which_nothing_is_stated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    night, out = write_pngs(tmp_path / 'night', images()[:3]), tmp_path / 'out'
+    night, out = write_pngs(tmp_path / 'night', frames_of(3)), tmp_path / 'out'
     command = ['calibrate', str(night), '-o', str(out), '--no-report']
     assert main([*command, '--focal-length-mm', '50', '--pixel-size-um', '10']) in (0, 3)
     text, notes = capsys.readouterr()
@@ -142,12 +132,12 @@ def test_photographs_of_which_nothing_is_stated(
     assert 'observer: assumed by the stars' in text and 'star_tracker' not in text
     assert '# observer: by the stars' in (out / 'params.yaml').read_text()
     for name in ('inspect', 'diagnose'):
-        assert main([name, str(night)]) == 0
+        assert main([name, str(night), *LENS]) == 0
     text = capsys.readouterr().out
     assert 'can be calibrated: the camera alone' in text and 'fit the images' in text
     with (out / 'params.yaml').open('a') as file:
         file.write('    shutter: global\n')
-    assert main(command) == 2
+    assert main([*command, *LENS]) == 2
     assert 'params.yaml: was not written by starcal, or was changed' in capsys.readouterr().err
 
 
@@ -173,23 +163,9 @@ def test_a_requirement_is_answered_for_people_and_programs(
     assert reason.endswith(f'over the limit of 0.055 px (requirements); {check["note"]}')
 
 
-def of_colour(path: Path) -> None:
-    """Write a bag of colour images."""
-    with BagWriter(path) as writer:
-        for image in images()[:3]:
-            grey = (image.pixels >> 4).astype(np.uint8)
-            message = make_message(
-                IMAGE_TYPE, header=make_header(image.time_ns, 'camera', make_message),
-                height=512, width=640, encoding='rgb8', is_bigendian=0, step=1920,
-                data=np.repeat(grey.reshape(-1), 3),
-            )  # fmt: skip
-            writer.write(IMAGES, IMAGE_TYPE, image.time_ns, message)
-            writer.write_attitude(ATTITUDES, image.time_ns, np.array([0, 0, 0, 1.0]), 'icrf')
-
-
 STATED = f'--params {TINY}/params.yaml -o out'
 WRONG = [
-    ('calibrate {bag}', ['-o/--output DIR: not given', '-o out']),
+    ('calibrate {bag}', ['-o/--output DIR: not given', 'e.g. -o out']),
     ('calibrate params.yaml -o out',
      ['parameters: give a bag or images, and --params params.yaml']),
     ('calibrate camera.yaml -o out',
@@ -236,13 +212,17 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('inputs')
     for name in ('params.yaml', 'camera.yaml'):
         shutil.copy(TINY / name, folder)
-    write_pngs(folder / 'night', images()[:3])
+    write_pngs(folder / 'night', frames_of(3))
     (folder / 'nothing').mkdir()
     (folder / 'nothing' / 'notes.txt').write_text('notes')
     with BagWriter(folder / 'night.mcap') as writer:
         for image in images()[:3]:
             writer.write_image(IMAGES, image, 'camera')
-    of_colour(folder / 'colour.mcap')
+    with BagWriter(folder / 'colour.mcap') as writer:
+        for image in images()[:3]:
+            colour = np.repeat((image.pixels >> 4).astype(np.uint8).reshape(-1), 3)
+            write_encoded(writer, IMAGES, image, 'rgb8', colour)
+            writer.write_attitude(ATTITUDES, image.time_ns, np.array([0, 0, 0, 1.0]), 'icrf')
     with BagWriter(folder / 'observations.mcap') as writer:
         from starcal_ros.records import refused_image
 

@@ -6,12 +6,11 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable
 import json
-import os
 from pathlib import Path
 import shutil
 from typing import Any
 
-from attacks import CHANGES, drawn, fifo_in_place_of, in_time, with_changes, write_product_folder  # type: ignore[import-not-found]
+from attacks import CHANGES, drawn, in_time, with_changes, write_product_folder  # type: ignore[import-not-found]
 from hypothesis import given
 import pytest
 
@@ -71,12 +70,7 @@ def _folder_of_secret(here: Path, secret: Path) -> None:
 
 PICTURES: dict[str, Callable[[Path, Path], object]] = {
     'link': lambda here, secret: _in_pictures(here, 'image_5.jpg').symlink_to(secret),
-    'link to /dev/zero': lambda here, _: _in_pictures(here, 'image_5.jpg').symlink_to('/dev/zero'),
-    'FIFO': lambda here, _: os.mkfifo(_in_pictures(here, 'image_5.jpg')),
-    'folder': lambda here, _: _in_pictures(here, 'image_5.jpg').mkdir(),
     'link to a folder': _folder_of_secret,
-    'FIFO as calibration': lambda here, _: fifo_in_place_of(here / CALIBRATION_FILE),
-    'FIFO as observations': lambda here, _: fifo_in_place_of(here / 'observations.mcap'),
 }
 
 

@@ -17,6 +17,7 @@ from starcal_ground.cli import main
 from starcal_ground.outputs import OBSERVATIONS_FILE
 from starcal_ground.products import NOT_CALIBRATED_FILE, OBSERVATIONS_TOPIC, write_observations
 from starcal_ros.formats.bag.reader import read_observations
+from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import refused_image
 
 
@@ -30,7 +31,8 @@ def test_a_failure_replaces_an_older_calibration(
     params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
     assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
     complaint = capsys.readouterr().err
-    assert 'Set attitude_direction: st_to_inertial.' in complaint
+    words = 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)'
+    assert words in complaint and complaint.count('\n') == 1
     assert complaint.endswith(f'; look at {out}/report.html\n')
     record = json.loads((out / NOT_CALIBRATED_FILE).read_text())
     assert (record['calibrated'], record['cause']) == (False, 'attitude_direction')
@@ -87,6 +89,8 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
     few_images: Path, tmp_path: Path, capsys, monkeypatch, place: str, missing: str
 ) -> None:
     out = tmp_path / 'out'
+    out.mkdir()
+    write_atomically(out / 'report.html', 'of earlier products')
     monkeypatch.setattr(place, broken)
     params = str(few_images / 'params.yaml')
     assert main.main(['calibrate', str(few_images), '--params', params, '-o', str(out)]) == 0
@@ -94,6 +98,7 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
     assert 'accepted by the gate' in said.out
     assert f'warning: no {missing}, ' in said.err and 'TypeError: another version' in said.err
     assert said.err.count('\n') == 1
+    assert ('the products cannot be drawn' in said.err) == (missing == 'report')
     assert (out / 'report.html').exists() == (missing != 'report')
     assert json.loads((out / 'calibration.json').read_text())['accepted']
 

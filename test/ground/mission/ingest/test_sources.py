@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ccsds_ndm.mapping import NDMFileFormats
-from ccsds_ndm.ndm_io import NdmIo
 from mission_files import (  # type: ignore[import-not-found]
     attitudes,
     date,
@@ -63,8 +61,10 @@ def test_direction_and_order_of_an_aem_are_obeyed(tmp_path, frames, direction, o
 
 
 def test_an_aem_in_xml_is_that_in_kvn(tmp_path: Path) -> None:
-    kvn = write_aem(tmp_path / 'a.aem')
-    xml = tmp_path / 'a.xml'
+    from ccsds_ndm.mapping import NDMFileFormats  # its import takes a second
+    from ccsds_ndm.ndm_io import NdmIo
+
+    kvn, xml = write_aem(tmp_path / 'a.aem'), tmp_path / 'a.xml'
     xml.write_text(NdmIo().to_string(NdmIo().from_path(kvn), NDMFileFormats.XML))
     a, b = (sources.attitudes([path], '', AT_NS) for path in (kvn, xml))
     assert (a.time_ns == b.time_ns).all()

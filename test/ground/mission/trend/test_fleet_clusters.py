@@ -14,7 +14,6 @@ import subprocess
 import sys
 from typing import Any
 
-from distributed import Client
 import pytest
 import yaml
 
@@ -56,6 +55,8 @@ def container(
 
 
 def test_the_containers_of_kubernetes_find_each_other() -> None:
+    from distributed import Client  # its import takes a second
+
     cluster = yaml.safe_load(example('yaml', 'DaskCluster'))
     with socket.create_server(('127.0.0.1', 0)) as free:
         port = free.getsockname()[1]

@@ -1,0 +1,43 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Arguments of nodes for the small bag, and nodes in the process of a test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+from pathlib import Path
+from typing import Any
+
+BOTH = ('star_observer', 'calibrator')
+IMAGES, ATTITUDES = '/opnav/image_raw', '/star_tracker/attitude'
+# The topics of the small bag.
+REMAPS = (
+    *('-r', f'image:={IMAGES}', '-r', f'attitude:={ATTITUDES}'),
+    *('-r', 'velocity:=/spacecraft/velocity'),
+)
+
+
+def parameters(folder: Path, *values: str) -> tuple[str, ...]:
+    """ROS arguments for the parameter file of a bag and further values."""
+    more = [word for value in values for word in ('-p', value)]
+    return ('--params-file', str(folder / 'params.yaml'), *more)
+
+
+@contextlib.contextmanager
+def in_this_process(kind: Any, folder: Path, is_active: bool = True) -> Iterator[Any]:
+    """A configured node with the parameter file of a bag, in this process."""
+    import rclpy
+
+    rclpy.init(args=['--ros-args', *parameters(folder)])
+    node = kind()
+    try:
+        node.trigger_configure()
+        if is_active:
+            node.trigger_activate()
+        yield node
+    finally:
+        if is_active:
+            node.deactivate()
+        node.cleanup()
+        node.destroy_node()
+        rclpy.try_shutdown()
