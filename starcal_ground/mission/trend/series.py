@@ -357,22 +357,8 @@ def _change(rows: Sequence[Row], row: int, against: int) -> Change:
     return Change(row, against, total_px, float(left_px.max()))
 
 
-def versions(rows: Sequence[Row]) -> list[Change]:
-    """Change by this version against the recorded calibration of the same images."""
-    recorded = {_images(row): k for k, row in enumerate(rows) if row.kind != COMPUTED}
-    return [
-        _change(rows, k, recorded[_images(row)])
-        for k, row in enumerate(rows)
-        if row.kind == COMPUTED and _images(row) in recorded
-    ]
-
-
 def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """
-    Calibrations by spacecraft, camera, frame name, size and lens model; the largest group first.
-
-    Of the same images the newest version counts, so that a series has each once.
-    """
+    """Calibrations by spacecraft, camera, frame, size and lens model; the largest group first."""
     by_name: dict[str, list[Row]] = {}
     for row in rows:
         if row.error:
@@ -384,23 +370,16 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return dict(sorted(by_name.items(), key=lambda item: (-len(item[1]), item[0])))
 
 
-def newest_of_each(rows: Sequence[Row]) -> list[Row]:
+def distinct(rows: Sequence[Row]) -> list[Row]:
     """
-    Rows of different calibrations, each once.
+    Rows of different calibrations, the first of each.
 
-    Without the recorded ones whose images this version has calibrated again, and without copies: a
-    state folder has a calibration once more for each activation.
+    A state folder has a calibration once more for each activation, and a folder may be copied.
     """
-    again = {_images(row) for row in rows if row.kind == COMPUTED}
-    newest: dict[object, Row] = {}
+    first: dict[object, Row] = {}
     for row in rows:
-        if row.kind == COMPUTED or _images(row) not in again:
-            newest.setdefault((_images(row), row.kind, tuple(row.values)), row)
-    return list(newest.values())
-
-
-def _images(row: Row) -> tuple[int, int]:
-    return row.first_ns, row.last_ns
+        first.setdefault((row.first_ns, row.last_ns, row.values), row)
+    return list(first.values())
 
 
 _OPEN = 'too few to tell'

@@ -106,7 +106,7 @@ def _order(one: _Judged) -> tuple[bool, int, str]:
 
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
 def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
-    rows = trends.newest_of_each(group)
+    rows = trends.distinct(group)
     active = trends.activations(group)
     shown = trends.series_of(rows, max_p_value)
     new = trends.changes(group, active[-1:])
@@ -120,7 +120,7 @@ def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
 def _camera(judged: _Judged) -> dict[str, object]:
     """The part of the page on one camera."""
     group, shown = judged.group, judged.shown
-    rows = trends.newest_of_each(group)
+    rows = trends.distinct(group)
     active = trends.activations(group)
     new = trends.changes(group, active)
     charts = [_change_chart(group, new)] if new else []
@@ -134,15 +134,6 @@ def _camera(judged: _Judged) -> dict[str, object]:
         'findings': [_finding(one, term, rows) for one, term in trends.findings(shown)],
         'charts': charts,
         'active': [_active(one, group, new) for one in active],
-        'versions': [
-            (
-                utc_text(group[v.against].time_ns)[:10],
-                group[v.against].software,
-                group[v.row].software,
-                f'{v.line_of_sight_px:.3f}',
-            )
-            for v in trends.versions(group)
-        ],
         'assumed': any(one.assumed for one in active),
     }
 
