@@ -450,7 +450,6 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
         'coverage': detector_figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
         'field': detector_figures.mean_residuals(residuals, camera),
-        'spectrum': figures.spectrum(residuals, camera),
         'histogram': figures.histogram(residuals),
         'magnitude': figures.residuals_against_magnitude(residuals),
         'colour': figures.residuals_against_colour(residuals),

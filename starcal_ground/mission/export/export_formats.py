@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-import functools
 import io
 from pathlib import Path
 from typing import Any
@@ -14,20 +13,18 @@ import numpy as np
 
 from starcal_ground.mission.export import camera_models, spice
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.exported import Content, Loss, temperature_losses
+from starcal_ground.mission.export.exported import Content, Loss
 from starcal_ground.outputs import check_outputs
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import line_of_sight_table, LineOfSightTable
-from starcal_ros.camera import pixel_grid
+from starcal_ros.assessment.lookup import LineOfSightTable
 from starcal_ros.errors import needing, OptionError, ProductError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import Calibration, StarObservations
 
-FORMATS = ('spice', 'ck', 'isd', 'opencv', 'kalibr', 'ros', 'giant', 'mrcal', 'csv', 'c')
+FORMATS = ('spice', 'ck', 'isd', 'opencv', 'ros', 'giant', 'mrcal', 'c')
 _OF_ALIGNMENT = ('ros', 'spice', 'ck')
 _OF_SPICE = ('spice', 'ck', 'isd')
-CSV_POINTS = 65  # pixels a side
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,6 @@ def export(
     kind: str,
     folder: Path,
     names: spice.SpiceNames | None,
-    topic: str = '',
     table: bool = False,
     observations: Iterable[StarObservations] = (),
     kernels: Sequence[Path] = (),
@@ -63,8 +59,6 @@ def export(
     ----------
     names : SpiceNames or None
         Needed for ``spice``, ``ck`` and ``isd``.
-    topic : str
-        Image topic, for kalibr.
     table : bool
         For ``c``: the binary table alone.
     observations, kernels
@@ -92,11 +86,9 @@ def export(
         'ck': lambda: spice.ck_of_images(calibration, observations, naif, kernels),
         'isd': lambda: camera_models.isd_files(calibration, naif),
         'opencv': lambda: camera_models.opencv_yaml(calibration),
-        'kalibr': lambda: camera_models.kalibr_yaml(calibration, topic),
         'ros': lambda: camera_models.ros_yaml(calibration),
         'giant': lambda: camera_models.giant_json(calibration),
         'mrcal': lambda: camera_models.mrcal_cameramodel(calibration),
-        'csv': lambda: _csv(calibration),
         'c': lambda: Content(
             {TABLE_FILE: c_table(calibration)} if table else c_files(calibration)
         ),
@@ -109,14 +101,6 @@ def export(
         else:
             write_atomically(folder / name, content)
     return Exported(tuple(folder / name for name in made.files), made.worst_px, made.losses)
-
-
-def _csv(calibration: Calibration) -> Content:
-    camera = calibration.geometry.camera
-    pixels = pixel_grid(camera, CSV_POINTS, CSV_POINTS)
-    sights = line_of_sight_table(camera, calibration.map_covariance, pixels)
-    files = {'lines_of_sight.csv': functools.partial(write_lookup_table, sights)}
-    return Content(files, losses=temperature_losses(calibration))
 
 
 def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
