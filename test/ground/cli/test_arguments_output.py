@@ -162,7 +162,6 @@ WRITING: dict[str, str] = {
     'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
     'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
     'lookup HERE/out -o HERE/o/a.npz --points 2': 'a.npz',
-    'lookup HERE/out -o HERE/o/a.fits --points 2': 'a.fits',
     'simulate --scenario tiny -o HERE/o': (
         'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
     ),
