@@ -183,7 +183,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
         sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
     )
     names = SpiceNames(-999, camera_frame='CAMERA', star_tracker_frame='TRACKER')
-    for path in export(made, kind, tmp_path, names, topic=HOSTILE).files:
+    for path in export(made, kind, tmp_path, names).files:
         text = path.read_text('ascii')
         assert all(line.isprintable() for line in text.split('\n')), path
         READERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
@@ -199,7 +199,7 @@ def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:
         export(calibration(), 'opencvv', tmp_path, None)
     with pytest.raises(OptionError, match=r'--spacecraft-id'):
         export(calibration(), 'spice', tmp_path, None)
-    assert len(FORMATS) == 10
+    assert len(FORMATS) == 8
 
 
 def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
