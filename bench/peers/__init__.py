@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.competitors import solve_ceres, solve_scipy
 from bench.peers import giant, solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
@@ -45,8 +44,7 @@ TOOLS = {
     'GIANT, estimator': Tool(giant.estimator, giant.INSTALLED, _GIANT),
     'mrcal': Tool(solvers.mrcal, solvers.MRCAL.exists(), _STARS),
     'OpenCV': Tool(solvers.opencv, True, _STARS),
-    'SciPy': Tool(partial(solvers.least_squares, solve=solve_scipy), True, _SOLVER),
-    'Ceres': Tool(partial(solvers.least_squares, solve=solve_ceres), solvers.CERES, _SOLVER),
+    'SciPy': Tool(solvers.least_squares, True, _SOLVER),
 }
 
 

@@ -70,7 +70,7 @@ def test_peers_bench(tmp_path: Path) -> None:
         # A lens that its model does not describe is not in the sigma of a solver.
         assert (scipy['error/sigma'] > 4.0) == ('ripple' in kind)
         assert rows[kind, 'OpenCV']['sigma "'] is None
-        for name in ('tetra3rs', 'GIANT', 'GIANT, estimator', 'mrcal', 'Ceres'):
+        for name in ('tetra3rs', 'GIANT', 'GIANT, estimator', 'mrcal'):
             skipped = f'{name} is not installed: skipped' in said
             images_only = name in ('tetra3rs', 'GIANT') and kind.startswith('stars')
             assert ((kind, name) in rows) == (not skipped and not images_only)
