@@ -33,7 +33,6 @@ from starcal_ground.simulation.scenario import attitude_samples, Scenario, scena
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.star_equations import squared_sigmas, star_table
@@ -205,8 +204,6 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
             'used_px': rms(estimate.residual_px[estimate.kept]),
             'others_px': judge(camera, images, limit).rms_px(rest(chosen)),
             'map_error_px': map_error_px(camera, truth.camera),
-            'scatter_arcsec': estimate.alignment_scatter_arcsec,
-            'sigma_fx_px': float(np.sqrt(estimate.covariance[0, 0])),
         }
 
     used = spread(min(CALIBRATED_WITH, count - 1), count)  # the others judge the result
@@ -266,7 +263,6 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
         ],
         'table1': found.table1.summary,
         'trials': found.table1.design.trials,
-        'arcsec_per_px': 1.0 / found.camera.parameters[0] / ARCSECOND_RAD,
     }
 
 
