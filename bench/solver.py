@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 import multiprocessing
 from pathlib import Path
 import time
+import timeit
 from typing import Any
 
 import numpy as np
@@ -47,16 +49,6 @@ def cost_of(case: competitors.Case, answer: competitors.Answer, steps: int = 0) 
         step = np.linalg.solve(blocks[:, ROTATION, ROTATION], gradient)[..., 0]
         rotations = Rotation.from_rotvec(-step) * rotations
     return normal_blocks(*held, rotations.as_matrix())[0]
-
-
-def least_s(repeats: int, call: Callable[..., object], *args: object) -> float:
-    """Least wall time of some calls."""
-    took_s = []
-    for _ in range(repeats):
-        start_s = time.perf_counter()
-        call(*args)
-        took_s.append(time.perf_counter() - start_s)
-    return min(took_s)
 
 
 @dataclass
@@ -104,7 +96,8 @@ def solve_all(case: competitors.Case, names: list[str], repeats: int) -> dict[st
         for name, result in results.items():
             if name != 'opencv':  # which takes so long that once, apart, is enough
                 calls = 3 if name == 'starcal' else 1  # its time is the shortest
-                result.best_s = min(result.best_s, least_s(calls, SOLVERS[name][1], case))
+                took_s = timeit.repeat(partial(SOLVERS[name][1], case), number=1, repeat=calls)
+                result.best_s = min(result.best_s, *took_s)
     return results
 
 
