@@ -246,8 +246,5 @@ def _summary(rows: Sequence[Row]) -> Iterator[Row]:
 def table(result: StudyResult) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the summary: what the study is about."""
     names = [*_KEY, *_ERRORS, *_SHOWN[result.design.study]]
-    return names, [[_words(row[name]) for name in names] for row in result.summary]
-
-
-def _words(value: int | float | str) -> str:
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
+    cells = ([row[name] for name in names] for row in result.summary)
+    return names, [[f'{c:.4g}' if isinstance(c, float) else str(c) for c in row] for row in cells]
