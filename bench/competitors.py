@@ -108,7 +108,7 @@ def make_case(ensemble: Ensemble, prior: CameraGeometry, free: NDArray[np.int64]
         # The others have no star tracker: ten degrees leave the images free of it.
         star_tracker_sigma_rad=np.full((m, 3), 36000.0 * ARCSECOND_RAD),
     )
-    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    alignment = prior.star_tracker_from_camera.inv()
     start = State(prior.camera.parameters.copy(), alignment, alignment * star_tracker_from_icrf)
     return Case(ensemble, prior, star_table(ensemble.images), problem, start)
 

@@ -65,7 +65,7 @@ def export(
     if table and kind != 'c':
         raise OptionError(f'--table: only --to c has a table, not {kind}')
     if kind in _OF_ALIGNMENT and not calibration.has_alignment:
-        others = ', '.join(one for one in FORMATS if one not in _OF_ALIGNMENT)
+        others = ', '.join(other for other in FORMATS if other not in _OF_ALIGNMENT)
         raise OptionError(
             f'--to {kind}: the calibration is of the camera alone, without the alignment that'
             f' {kind} needs; choose one of {others}'

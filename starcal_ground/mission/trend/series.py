@@ -146,9 +146,9 @@ def _p_values(
     sums = sums[: len(names) + len(places)]
     sums[: len(names), 0] = np.sum((C * w) ** 2, axis=0)
     squares, along_b, along_Q = sums[:, 0], sums[:, 1], sums[:, 2:]
-    left = squares - np.sum(along_Q**2, axis=1)
+    remaining = squares - np.sum(along_Q**2, axis=1)
     # A column that the chosen ones span lowers nothing.
-    gain = np.where(left > 1e-12 * squares, along_b**2 / np.maximum(left, 1e-300), 0.0)
+    gain = np.where(remaining > 1e-12 * squares, along_b**2 / np.maximum(remaining, 1e-300), 0.0)
     freedom = n - len(chosen) - 2
     F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
     p_values = fdtrc(1, freedom, np.maximum(F, 0.0))
@@ -258,36 +258,38 @@ def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Ser
         values = np.array([row.values[k] for row in rows])
         sigmas = np.array([row.sigmas[k] for row in rows])
         unit = 'px' if name in INTRINSIC_NAMES else ''
-        series += _one(rows, name, unit, values, sigmas, max_p_value)
+        series += _known(rows, name, unit, values, sigmas, max_p_value)
     boresight = _boresight_arcsec([row.geometry for row in rows])
     of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
     for k, axis in enumerate('xy'):
         name = f'boresight about {axis}'
-        series += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
+        series += _known(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
     alignment = np.array(
         [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
     )
     sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
     for k, axis in enumerate('xyz'):
         name = f'alignment_{axis}'
-        series += _one(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
+        series += _known(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
     return series
 
 
 def findings(shown: Sequence[Series]) -> list[tuple[Series, Term]]:
     """Terms of series, a drift of several that trade with each other where it is clearest."""
-    terms = [(one, term) for one in shown for term in one.trend.terms]
+    terms = [(series, term) for series in shown for term in series.trend.terms]
     clearest: dict[object, tuple[float, str]] = {}
-    for one, term in terms:
+    for series, term in terms:
         if term.kind == 'drift':
-            group = _TRADING.get(one.name, one.name)
-            best = (abs(term.size) / term.sigma, one.name)
+            group = _TRADING.get(series.name, series.name)
+            best = (abs(term.size) / term.sigma, series.name)
             clearest[group] = max(best, clearest.get(group, best))
     names = {name for _, name in clearest.values()}
-    return [(one, term) for one, term in terms if term.kind != 'drift' or one.name in names]
+    return [
+        (series, term) for series, term in terms if term.kind != 'drift' or series.name in names
+    ]
 
 
-def _one(
+def _known(
     rows: Sequence[Row],
     name: str,
     unit: str,
@@ -310,10 +312,8 @@ def _boresight_arcsec(geometries: Sequence[CameraGeometry]) -> Floats:
     camera = geometries[0].camera
     middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
     in_tracker = [
-        Rotation.from_quat(one.star_tracker_from_camera_xyzw).apply(
-            line_of_sight(one.camera, middle)
-        )
-        for one in geometries
+        geometry.star_tracker_from_camera.apply(line_of_sight(geometry.camera, middle))
+        for geometry in geometries
     ]
     tracker_from_first = Rotation.from_quat(geometries[0].star_tracker_from_camera_xyzw)
     of_first = tracker_from_first.inv().apply(in_tracker)
@@ -340,7 +340,7 @@ def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
     """Change by each calibration against the one active at its last image."""
     made = []
     for k, row in enumerate(rows):
-        then = [one for one in active if one.since_ns <= row.last_ns and one.row != k]
+        then = [period for period in active if period.since_ns <= row.last_ns and period.row != k]
         if then:
             made.append(_change(rows, k, then[-1].row))
     return made
