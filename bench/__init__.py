@@ -1,7 +1,7 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Benches of time, memory, accuracy and identification, some against other packages."""
 
-NAMES = ('solver', 'measure', 'calibrate', 'observer', 'gate')
+NAMES = ('solver', 'calibrate', 'observer')
 """The benches, each a module with ``run(quick)`` that yields its tables."""
 
 LONG = (

@@ -171,7 +171,7 @@ def with_detector(scenario: Scenario, detector: dict[str, Any]) -> Scenario:
 
 def turned(geometry: CameraGeometry, rotation: Rotation) -> CameraGeometry:
     """Geometry with the camera rotated about its own axes."""
-    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * rotation
+    alignment = geometry.star_tracker_from_camera * rotation
     return CameraGeometry(geometry.camera, alignment.as_quat())
 
 
@@ -238,7 +238,7 @@ def anywhere(scenario: Scenario, drawn: Scene, rng: np.random.Generator, count: 
 def beyond(scenario: Scenario, drawn: Scene, rng: np.random.Generator, count: int) -> Floats:
     """Attitudes (count, 4) 2 to 8 degrees off: most stars are shared, but displaced."""
     # About axes across the line of sight: the camera's x and y, seen from the star tracker.
-    st_from_camera = Rotation.from_quat(scenario.truth.star_tracker_from_camera_xyzw)
+    st_from_camera = scenario.truth.star_tracker_from_camera
     about = rng.uniform(0, 2 * np.pi, count)
     axis = st_from_camera.apply(np.stack([np.cos(about), np.sin(about), 0 * about], axis=-1))
     angle_rad = np.radians(rng.uniform(2.0, 8.0, count))

@@ -1,17 +1,15 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-One least-squares problem of stars for several solvers: starcal, Ceres, SciPy, OpenCV.
+One least-squares problem of stars for several solvers: starcal, SciPy, OpenCV.
 
 Method 1 (`per_image`): eight camera parameters (fixed principal point) and the rotation of
-every image.  The others get the analytic derivatives of `camera.project_jacobians`: SciPy for all
-stars at once, Ceres, which calls Python for every image, image by image.
+every image.  SciPy gets the analytic derivatives of `camera.project_jacobians`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -110,7 +108,7 @@ def make_case(ensemble: Ensemble, prior: CameraGeometry, free: NDArray[np.int64]
         # The others have no star tracker: ten degrees leave the images free of it.
         star_tracker_sigma_rad=np.full((m, 3), 36000.0 * ARCSECOND_RAD),
     )
-    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    alignment = prior.star_tracker_from_camera.inv()
     start = State(prior.camera.parameters.copy(), alignment, alignment * star_tracker_from_icrf)
     return Case(ensemble, prior, star_table(ensemble.images), problem, start)
 
@@ -192,60 +190,6 @@ def solve_scipy(case: Case) -> Answer:
     rotation, _ = _rotation_jacobian(found.x[f:].reshape(m, 3))
     rotations = rotation @ case.start.camera_from_icrf.as_matrix()
     return Answer(case.with_free(found.x[:f]), rotations, found.njev)
-
-
-def solve_ceres(case: Case) -> Answer:
-    """Ceres with one analytic residual block per image, eliminating the rotations."""
-    import pyceres
-
-    table, prior = case.table, case.prior.camera
-    free = case.problem.free
-    rotations = case.start.camera_from_icrf.as_matrix()
-
-    class Stars(pyceres.CostFunction):  # type: ignore[misc]
-        """Residual block of the stars of one image."""
-
-        def __init__(self, stars: slice, rotation: Floats) -> None:
-            super().__init__()
-            self.base = table.direction_icrf[stars] @ rotation.T
-            self.measured_px = table.measured_px[stars]
-            self.sigma_px = case.sigma_px[stars]
-            self.set_num_residuals(self.measured_px.size)
-            self.set_parameter_block_sizes([len(free), 3])
-
-        def Evaluate(self, blocks: Any, residuals: Floats, jacobians: Any) -> bool:
-            """Write residuals in sigma, and derivatives if requested."""
-            parameters = case.with_free(blocks[0])
-            (rotation,), (L,) = _rotation_jacobian(blocks[1][None])
-            directions = self.base @ rotation.T
-            if jacobians is None:
-                predicted_px = project_parameters('plumb_bob', parameters, directions)
-            else:
-                camera = dataclasses.replace(prior, parameters=parameters)
-                predicted_px, J_parameters, J_rotation = project_jacobians(camera, directions)
-                for k, J in enumerate((J_parameters[..., free], J_rotation @ L)):
-                    if jacobians[k] is not None:
-                        jacobians[k][:] = (J / self.sigma_px[..., None]).ravel()
-            residuals[:] = ((predicted_px - self.measured_px) / self.sigma_px).ravel()
-            return True
-
-    problem = pyceres.Problem()
-    shared = case.start.parameters[free].copy()
-    angles = np.zeros((table.image_count, 3))
-    costs = list(map(Stars, case.rows_of_images, rotations))
-    for cost, angle in zip(costs, angles, strict=True):
-        problem.add_residual_block(cost, None, [shared, angle])
-    options = pyceres.SolverOptions()
-    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
-    options.function_tolerance = options.parameter_tolerance = TOLERANCE
-    options.gradient_tolerance = TOLERANCE
-    options.logging_type = pyceres.LoggingType.SILENT
-    options.num_threads = 1  # the callbacks are Python: more threads would wait for each other
-    summary = pyceres.SolverSummary()
-    pyceres.solve(options, problem, summary)
-    rotation, _ = _rotation_jacobian(angles)
-    iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
-    return Answer(case.with_free(shared), rotation @ rotations, iterations)
 
 
 def solve_opencv(case: Case) -> Answer:

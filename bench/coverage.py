@@ -119,7 +119,7 @@ def score(world: World, seed: int) -> tuple[Score, float]:
 def _bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     """Cramer-Rao bound of the rms 1-sigma of the shape: the lens model, free image rotations."""
     camera = made.scenario.truth.camera
-    to_camera = Rotation.from_quat(made.scenario.truth.star_tracker_from_camera_xyzw).inv()
+    to_camera = made.scenario.truth.star_tracker_from_camera.inv()
     p = len(camera.parameters)
     information = np.zeros((p, p))
     prior_px = options.principal_point_prior * max(camera.width, camera.height)

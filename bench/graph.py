@@ -116,17 +116,6 @@ class Client:
             self.spin(0.02)
         return True
 
-    def call(self, kind: Any, name: str, timeout_s: float = START_S, **fields: Any) -> Any:
-        """Answer of a service."""
-        client = self.node.create_client(kind, name)
-        try:
-            self.until(client.service_is_ready, name, timeout_s)
-            future = client.call_async(kind.Request(**fields))
-            self.until(future.done, name, timeout_s)
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
-
     def collect(self, kind: Any, topic: str, take: Callable[[Any], None], latched: bool) -> Any:
         """Subscribe to a topic."""
         qos = _qos(1 if latched else 5000, latched)

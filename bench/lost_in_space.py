@@ -126,15 +126,10 @@ def random_points(count: int) -> Table:
 
 def _searched(points: Floats, width_deg: float, ranges: Ranges) -> tuple[bool, float]:
     """True if points (n, 2) are taken for stars, and processor time, s."""
-    catalog, prior = _catalog(), camera(width_deg)
+    catalog, prior = load_catalog(), camera(width_deg)
     search = functools.partial(find_in_any, [points], prior, catalog, ranges=ranges)
     (sky, _), took_s = timed(search)
     return isinstance(sky, SkyMatch), took_s
-
-
-@functools.lru_cache(maxsize=1)
-def _catalog() -> StarCatalog:
-    return load_catalog()
 
 
 def camera(width_deg: float) -> CameraModel:

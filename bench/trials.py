@@ -65,9 +65,7 @@ def score(
     pixels = pixel_grid(truth.camera, GRID, GRID)
     table = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
     estimated = table.direction_camera
-    to_tracker, to_true = (
-        Rotation.from_quat(g.star_tracker_from_camera_xyzw) for g in (found.geometry, truth)
-    )
+    to_tracker, to_true = (g.star_tracker_from_camera for g in (found.geometry, truth))
     off = [to_tracker.apply(estimated) - to_true.apply(true) for true in true_directions]
     off_arcsec = np.array([shape_errors_arcsec(true, estimated) for true in true_directions])
     shape_arcsec = rms(off_arcsec)

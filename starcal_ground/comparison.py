@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import math
 
@@ -178,6 +179,20 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
         total=chi_squared(difference[:compared], covariance),
         notes=_notes(a, b, difference, sigma),
+    )
+
+
+def truth_like(calibration: Calibration, geometry: CameraGeometry) -> Calibration:
+    """The truth behind a calibration as one without sigma, to compare it with."""
+    none = np.zeros((len(geometry.camera.parameters) + 3,) * 2)
+    return dataclasses.replace(
+        calibration,
+        geometry=geometry,
+        covariance=none,
+        field=None,
+        accepted=True,
+        reasons=(),
+        provenance={},
     )
 
 

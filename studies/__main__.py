@@ -8,15 +8,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
 import functools
 import json
 from pathlib import Path
 import sys
 import time
+from typing import TypeVar
 
 from starcal_ground.cli import terminal
+from starcal_ground.cli.arguments import number
 from starcal_ground.outputs import make_folder
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.constants import software_version
@@ -28,6 +30,7 @@ from studies.monte_carlo import Design, Row
 from studies.workers import processors, run_each
 
 NAMES = (*monte_carlo.STUDIES, 'paper')
+Value = TypeVar('Value')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,21 +61,23 @@ def parser() -> argparse.ArgumentParser:
     what = 'folder for STUDY.json, or for paper.md with its figures'
     made.add_argument('-o', '--output', type=Path, metavar='DIR', required=True, help=what)
     what = 'number of trials (default: depends on the study)'
-    made.add_argument('--trials', type=int, metavar='N', help=what)
+    made.add_argument('--trials', type=number(int, 1, 10**6), metavar='N', help=what)
     what = 'seed of all trials (default: 1)'
-    made.add_argument('--seed', type=int, default=1, metavar='S', help=what)
+    made.add_argument('--seed', type=number(int, 0), default=1, metavar='S', help=what)
+    arcsec = number(float, 0, 3600)
     for name, kind, metavar, what in (
-        ('images', int, 'M', 'numbers of images in a calibration; paper: frames of the night'),
-        ('stars', int, 'N', 'numbers of stars in an image'),
-        ('tracker', float, 'ARCSEC', 'true star tracker sigmas about each axis, arcsec'),
+        ('images', number(int, 2, 1000), 'M', 'numbers of images; paper: frames of the night'),
+        ('stars', number(int, 3, 1000), 'N', 'numbers of stars in an image'),
+        ('tracker', arcsec, 'ARCSEC', 'true star tracker sigmas about each axis, arcsec'),
     ):
         made.add_argument(f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
     what = f'methods to compare: {", ".join(METHODS)}'
     made.add_argument('--methods', nargs='+', choices=METHODS, metavar='METHOD', help=what)
     what = 'star tracker sigma that the calibration assumes, arcsec (default: the true one)'
-    made.add_argument('--tracker-assumed', type=float, metavar='ARCSEC', help=what)
+    made.add_argument('--tracker-assumed', type=arcsec, metavar='ARCSEC', help=what)
     what = 'worker processes; 0 runs in-process (default: one per CPU)'
-    made.add_argument('--workers', type=int, default=processors(), metavar='N', help=what)
+    count = number(int, 0, 1024)
+    made.add_argument('--workers', type=count, default=processors(), metavar='N', help=what)
     return made
 
 
@@ -83,10 +88,10 @@ def _monte_carlo(args: argparse.Namespace) -> None:
         default,
         trials=default.trials if args.trials is None else args.trials,
         seed=args.seed,
-        images=tuple(args.images or default.images),
-        stars=tuple(args.stars or default.stars),
-        tracker_arcsec=tuple(args.tracker or default.tracker_arcsec),
-        methods=tuple(args.methods or default.methods),
+        images=_each(args.images or default.images),
+        stars=_each(args.stars or default.stars),
+        tracker_arcsec=_each(args.tracker or default.tracker_arcsec),
+        methods=_each(args.methods or default.methods),
         assumed_arcsec=args.tracker_assumed,
     )
     start_s = time.monotonic()
@@ -103,7 +108,6 @@ def _monte_carlo(args: argparse.Namespace) -> None:
 
 def _rows(design: Design, args: argparse.Namespace) -> list[Row]:
     """Rows of all trials of a design."""
-    _check(design, args)
     make_folder(args.output)
     trial = functools.partial(monte_carlo.run_trial, design)
     with terminal.progress_bar(design.trials, 'trials') as advance:
@@ -111,17 +115,15 @@ def _rows(design: Design, args: argparse.Namespace) -> list[Row]:
     return [row for of_trial in rows for row in of_trial]
 
 
-def _check(design: Design, args: argparse.Namespace) -> None:
-    monte_carlo.check(design)
-    if not 0 <= args.workers <= 1024:
-        raise OptionError(f'--workers: {args.workers} is not within 0 to 1024')
+def _each(values: Iterable[Value]) -> tuple[Value, ...]:
+    """Different values in their order."""
+    return tuple(dict.fromkeys(values))
 
 
 def _paper(args: argparse.Namespace) -> None:
     """Reproduce the paper."""
     trials = paper.TABLE_1.trials if args.trials is None else args.trials
     table1 = dataclasses.replace(paper.TABLE_1, seed=args.seed, trials=trials)
-    _check(table1, args)
     night = scenario(paper.NIGHT, args.seed).image_count
     if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
         raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')

@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from starcal_ground.comparison import parameter_difference
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.records import ALIGNMENT_NAMES
 from studies import trials
@@ -82,33 +82,6 @@ _SHOWN: Mapping[str, tuple[str, ...]] = {
     ),
 }
 """Columns of the printed table beside `_KEY` and `_ERRORS`."""
-
-_LIMITS = {
-    'trials': (1, 10**6),
-    'seed': (0, math.inf),
-    'images': (2, 1000),
-    'stars': (3, 1000),
-    'tracker_arcsec': (0, 3600),
-    'assumed_arcsec': (0, 3600),
-}
-_OPTIONS = {'tracker_arcsec': 'tracker', 'assumed_arcsec': 'tracker-assumed'}  # or by field
-
-
-def check(design: Design) -> None:
-    """Raise OptionError for values out of range and duplicates."""
-    for name, (low, high) in _LIMITS.items():
-        values = getattr(design, name)
-        for value in values if isinstance(values, tuple) else (values,):
-            if value is not None and not low <= value <= high:  # nor is NaN
-                raise OptionError(
-                    f'--{_OPTIONS.get(name, name)}: {value:g} is not within {low:g} to {high:g}'
-                )
-    for name in ('images', 'stars', 'tracker_arcsec', 'methods'):
-        values = getattr(design, name)
-        if len(set(values)) < len(values):
-            raise OptionError(
-                f'--{_OPTIONS.get(name, name)}: duplicate values: {" ".join(map(str, values))}'
-            )
 
 
 def run_trial(design: Design, trial: int) -> tuple[Row, ...]:
@@ -274,8 +247,5 @@ def _summary(rows: Sequence[Row]) -> Iterator[Row]:
 def table(result: StudyResult) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the summary: what the study is about."""
     names = [*_KEY, *_ERRORS, *_SHOWN[result.design.study]]
-    return names, [[_words(row[name]) for name in names] for row in result.summary]
-
-
-def _words(value: int | float | str) -> str:
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
+    cells = ([row[name] for name in names] for row in result.summary)
+    return names, [[f'{c:.4g}' if isinstance(c, float) else str(c) for c in row] for row in cells]

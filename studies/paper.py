@@ -32,15 +32,7 @@ from starcal_ground.simulation.rendering import fixed_pattern, render
 from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.camera import (
-    CameraModel,
-    distortion_px,
-    line_of_sight,
-    PARAMETER_NAMES,
-    pixel_grid,
-    project,
-)
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.star_equations import squared_sigmas, star_table
@@ -212,8 +204,6 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
             'used_px': rms(estimate.residual_px[estimate.kept]),
             'others_px': judge(camera, images, limit).rms_px(rest(chosen)),
             'map_error_px': map_error_px(camera, truth.camera),
-            'scatter_arcsec': estimate.alignment_scatter_arcsec,
-            'sigma_fx_px': float(np.sqrt(estimate.covariance[0, 0])),
         }
 
     used = spread(min(CALIBRATED_WITH, count - 1), count)  # the others judge the result
@@ -273,7 +263,6 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
         ],
         'table1': found.table1.summary,
         'trials': found.table1.design.trials,
-        'arcsec_per_px': 1.0 / found.camera.parameters[0] / ARCSECOND_RAD,
     }
 
 
@@ -298,7 +287,6 @@ def svgs(found: PaperStudy) -> Mapping[str, str]:
         'figure_5': sheet([[star_cloud(found.judged.measured_px, found.camera)]], stars),
         'figure_6': sheet([distortion], 'distortion: vectors, enlarged, and magnitude'),
         'figure_7': sheet([[_images(found), _histogram(found)], [_plane(found), _counts(found)]]),
-        'figure_8': _terms(found),
     }
     return {name: figure.document() for name, figure in drawn.items()}
 
@@ -357,45 +345,3 @@ def _counts(found: PaperStudy) -> Drawing:
     )
     return plot(curves, 'images used', 'rms (px)', log='xy',
                 under=lambda panel: panel.upright(CALIBRATED_WITH, width=5.0))  # fmt: skip
-
-
-def _terms(found: PaperStudy) -> Drawing:
-    """Terms removed after each step, and the residuals and the change of the map."""
-    gone = [removal.removed for removal in found.removals[1:]]
-    order = [*gone, *(name for name in PARAMETER_NAMES if name not in gone)]
-    height, steps = 60.0 + 26.0 * len(found.removals), len(found.removals)
-    x = svg.Scale(-0.5, len(order) - 0.5, 62, svg.WIDTH - 12)
-    panel = Panel(x, svg.Scale(-0.5, steps - 0.5, 28, height - 24))
-    for step in range(steps):
-        for term in range(step):
-            panel.box((term - 0.47, term + 0.47), (step - 0.45, step + 0.45), SERIES[1], 0.9)
-    x_ticks = [(float(k), name) for k, name in enumerate(order)]
-    y_ticks = [(float(k), str(k)) for k in range(steps)]
-    panel.axes('', 'terms removed', x_ticks, y_ticks, is_framed=True)
-    panel.outside.append(svg.words(62, 16, 'coloured: removed from the calibration', 'start'))
-    return sheet([[panel.drawing(height), _removals(found.removals)]])
-
-
-def _removals(removals: Sequence[TermRemoval]) -> Drawing:
-    """Residuals, and change of the map, after each removal; shaded: terms not significant."""
-    steps = np.arange(len(removals), dtype=float)
-    std_u, std_v = np.array([removal.residual_std_px for removal in removals]).T
-    change_px = np.array([removal.map_change_px for removal in removals])
-    curves = [
-        Curve(steps, np.where(values > 0, values, np.nan), colour, label, mark)
-        for values, label, colour, mark in (
-            (std_u, 'residual, std of u', SERIES[0], 'circle'),
-            (std_v, 'residual, std of v', SERIES[1], 'square'),
-            (np.r_[np.nan, change_px[1:]], 'change of the map, rms', SERIES[2], 'triangle'),
-        )
-    ]
-    insignificant = max((k for k, removal in enumerate(removals) if removal.negligible), default=0)
-
-    def shade(panel: Panel) -> None:
-        if insignificant:
-            panel.band(-0.5, insignificant + 0.5, is_vertical=True)
-
-    names = ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
-    ends, ticks = (-0.5, len(names) - 0.5), list(zip(steps.tolist(), names, strict=True))
-    return plot(curves, 'removed, one by one', 'px', x=ends, log='y', x_ticks=ticks,
-                is_left=True, under=shade)  # fmt: skip

@@ -58,7 +58,6 @@ _SAMPLES = 89
 _GAP_S = 2.0  # the default of the package
 _BLENDS, _OPTICS = 90, 91
 _BLEND_FREEDOM = 3.0  # degrees of freedom: medians of displacements are half of their rms
-_HALF_WIDTH_PX = 648.0
 _HALF_HEIGHT = 1024 / 1296  # half widths
 _CORNER = math.hypot(1.0, _HALF_HEIGHT)
 
@@ -77,30 +76,6 @@ def ripple(size_px: float, rad_per_half_width: float, rng: Generator, x: Floats)
     """Lens with a product of waves along both axes, each component with its own phases."""
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 2))
     return np.asarray(size_px * np.sin(rad_per_half_width * x[:, None, :] + phase).prod(axis=2))
-
-
-def rings(size_px: float, rad_per_half_width: float, rng: Generator, x: Floats) -> Floats:
-    """Detector with rings about a point, as of the growth of its crystal."""
-    centre, phase = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.0, 2.0 * np.pi)
-    radius = np.linalg.norm(x - centre, axis=1, keepdims=True)
-    wave = np.sin(rad_per_half_width * radius + phase)
-    return np.asarray(size_px * wave * (x - centre) / np.maximum(radius, 1e-9))
-
-
-def rows(size_px: float, period_px: float, rng: Generator, x: Floats) -> Floats:
-    """Detector whose rows are displaced along the columns by a wave."""
-    phase = rng.uniform(0.0, 2.0 * np.pi)
-    wave = 2.0 * np.pi * _HALF_WIDTH_PX / period_px
-    return np.asarray(np.array([0.0, size_px]) * np.sin(wave * x[:, [1]] + phase))
-
-
-def stitch(size_px: float, period_px: float, rng: Generator, x: Floats) -> Floats:
-    """Detector of blocks: steps of either sign along each axis at the borders."""
-    offset_px = size_px * np.cumsum(rng.choice([-1.0, 1.0], (16, 2)), axis=0)
-    offset_px -= offset_px[:5].mean(axis=0)
-    block = np.floor((x + np.array([1.0, _HALF_HEIGHT])) * _HALF_WIDTH_PX / period_px)
-    block = np.clip(block, 0, 15).astype(int)
-    return np.stack([offset_px[block[:, 0], 0], offset_px[block[:, 1], 1]], axis=-1)
 
 
 def kink(size_px: float, rng: Generator, x: Floats) -> Floats:
@@ -521,7 +496,6 @@ _BRIGHT24 = World(24, magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 t
 WORLDS = {
     'plain': World(),
     'n3': World(images=3),
-    'n100': World(images=100),
     'bright24': _BRIGHT24,
     'small24': World(24, 'small'),
     'vel_leo_ram': World(pointing='ram', velocity_m_s=7600.0),
@@ -536,13 +510,8 @@ WORLDS = {
     'wave11_050': World(lens=partial(ripple, 0.05, 11.0)),
     'rip7_010': World(lens=partial(ripple, 0.01, 7.0)),
     'rip7_050': World(lens=partial(ripple, 0.05, 7.0)),
-    'rings': World(lens=partial(rings, 0.05, 20.0)),
-    'rows34': World(lens=partial(rows, 0.05, 34.0)),
-    'stitch': World(lens=partial(stitch, 0.05, 256.0)),
-    'hf24': World(lens=partial(ripple, 0.05, 24.0)),
     'kink': World(lens=partial(kink, 0.4)),
     'corner_bump': World(lens=partial(corner_bump, 0.2)),
-    'tilt': World(lens=partial(tilt, 0.7)),
     'radial8_10': World(lens=partial(radial8, 1.0)),
     'radial8_30': World(lens=partial(radial8, 3.0)),
     'out5': World(outlier_fraction=0.05),

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.competitors import solve_ceres, solve_scipy
 from bench.peers import giant, solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
@@ -25,28 +24,23 @@ from studies.trials import rms
 
 
 class Tool(NamedTuple):
-    """A way of calibration and its limits."""
+    """A way of calibration; what each cannot do is in docs/peers.md."""
 
     calibrate: Callable[[Campaign], list[Result]]
-    installed: bool
-    limits: str
+    installed: bool = True
     from_images: bool = False
 
 
 _OURS = 'starcal, estimator'
-_STARS = 'no sigma, no alignment, no points at infinity'
-_GIANT = 'sigma scaled by hand, none of the alignment'
-_SOLVER = 'a solver: camera and derivatives of starcal, sigma by hand'
 TOOLS = {
-    'starcal, bag to camera': Tool(starcal.whole, True, 'no alignment without attitudes', True),
-    'GIANT': Tool(giant.whole, giant.INSTALLED, _GIANT, True),
-    'tetra3rs': Tool(tetra3rs.whole, tetra3rs.INSTALLED, 'no sigma, no alignment', True),
-    _OURS: Tool(starcal.estimator, True, 'no alignment without attitudes'),
-    'GIANT, estimator': Tool(giant.estimator, giant.INSTALLED, _GIANT),
-    'mrcal': Tool(solvers.mrcal, solvers.MRCAL.exists(), _STARS),
-    'OpenCV': Tool(solvers.opencv, True, _STARS),
-    'SciPy': Tool(partial(solvers.least_squares, solve=solve_scipy), True, _SOLVER),
-    'Ceres': Tool(partial(solvers.least_squares, solve=solve_ceres), solvers.CERES, _SOLVER),
+    'starcal, bag to camera': Tool(starcal.whole, from_images=True),
+    'GIANT': Tool(giant.whole, giant.INSTALLED, from_images=True),
+    'tetra3rs': Tool(tetra3rs.whole, tetra3rs.INSTALLED, from_images=True),
+    _OURS: Tool(starcal.estimator),
+    'GIANT, estimator': Tool(giant.estimator, giant.INSTALLED),
+    'mrcal': Tool(solvers.mrcal, solvers.MRCAL.exists()),
+    'OpenCV': Tool(solvers.opencv),
+    'SciPy': Tool(solvers.least_squares),
 }
 
 
@@ -84,7 +78,7 @@ def _best(campaign: Campaign, runs: tuple[list[Result], ...]) -> tuple[float, Re
 
 def _table(rows: dict[tuple[str, str], list[tuple[float, Result]]], title: str) -> Table:
     measured = ('campaign', 'tool', 'error "', 'by ours', 'sigma "', 'error/sigma', 'worst')
-    columns = (*measured, 'frames', 'stars', 'cpu s', 'best variants', 'limits')
+    columns = (*measured, 'frames', 'stars', 'cpu s', 'best variants')
     table = Table(f'Error of the lines of sight, rms of {title}', columns)
     table.notes.append(
         "by ours: over the error of starcal's estimator.  cpu s: least of several runs."
@@ -97,8 +91,7 @@ def _table(rows: dict[tuple[str, str], list[tuple[float, Result]]], title: str) 
         over_ours = rms(error) / rms([one for one, _ in rows[kind, _OURS]])
         used = np.mean([(one.frames, one.stars, one.processor_s) for _, one in row], axis=0)
         variants = '; '.join(sorted({one.variant for _, one in row}))
-        cells = (*stated, *used.tolist(), variants, TOOLS[name].limits)
-        table.add(kind, name, rms(error), over_ours, *cells)
+        table.add(kind, name, rms(error), over_ours, *stated, *used.tolist(), variants)
     return table
 
 

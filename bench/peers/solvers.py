@@ -1,17 +1,15 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-SciPy, Ceres, OpenCV and mrcal on identified stars; the first three as in `bench.competitors`.
+SciPy, OpenCV and mrcal on identified stars; the first two as in `bench.competitors`.
 
-SciPy and Ceres get starcal's camera with its derivatives.  Their sigma is computed here, from the
-Jacobian at the minimum and scaled by the residuals.
+SciPy gets starcal's camera with its derivatives.  Its sigma is computed here, from the Jacobian at
+the minimum and scaled by the residuals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import functools
-import importlib.util
 from pathlib import Path
 import subprocess
 import tempfile
@@ -20,7 +18,6 @@ import cv2
 import numpy as np
 
 from bench import competitors, mrcal_process
-from bench.competitors import Answer, Case
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
 from starcal_ros.assessment.lookup import line_of_sight_table
@@ -28,7 +25,6 @@ from starcal_ros.camera import line_of_sight
 from starcal_ros.records import MapCovariance
 from studies.trials import rms
 
-CERES = importlib.util.find_spec('pyceres') is not None
 MRCAL = Path('/usr/lib/python3/dist-packages/mrcal')  # of Debian's python3-mrcal
 _FREE = {'cx, cy free': np.arange(10), 'cx, cy held': competitors.FREE}
 _THIN_PRISM = cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL
@@ -36,12 +32,12 @@ _INVERSION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 _OPENCV_MODELS = (0, _THIN_PRISM, _THIN_PRISM | cv2.CALIB_TILTED_MODEL)
 
 
-def least_squares(campaign: Campaign, solve: Callable[[Case], Answer]) -> list[Result]:
-    """SciPy or Ceres, with the principal point estimated, and held at its prior."""
+def least_squares(campaign: Campaign) -> list[Result]:
+    """SciPy, with the principal point estimated, and held at its prior."""
     results = []
     for variant, free in _FREE.items():
         case = competitors.make_case(campaign.case.ensemble, campaign.case.prior, free)
-        answer, took_s = timed(functools.partial(solve, case))
+        answer, took_s = timed(functools.partial(competitors.solve_scipy, case))
         camera = dataclasses.replace(case.prior.camera, parameters=answer.parameters)
         matrix = np.zeros((13, 13))  # ten parameters and an alignment, which does not matter
         matrix[np.ix_(free, free)] = competitors.covariance_of(case, answer)

@@ -408,10 +408,7 @@ def _expected(
 ) -> StarObservations:
     """Return what an image is expected to show: stars as bright as those observed so far."""
     geometry, last = estimate.geometry, ensemble.images[-1]
-    star_tracker = (
-        pointing.icrf_from_camera
-        * Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).inv()
-    )
+    star_tracker = pointing.icrf_from_camera * geometry.star_tracker_from_camera.inv()
     camera = geometry.camera
     stars = within_image(
         predict(

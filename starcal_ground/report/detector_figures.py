@@ -397,7 +397,7 @@ def pointings(
     sides = [(edge, -end), (end, edge), (edge[::-1], end), (-end, edge[::-1])]
     border = np.concatenate([np.stack(side, axis=-1) for side in sides])
     in_camera = line_of_sight(camera, (border + 0.5) * [camera.width, camera.height] - 0.5)
-    in_tracker = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(in_camera)
+    in_tracker = geometry.star_tracker_from_camera.apply(in_camera)
     every = -(-len(placed) // _FOOTPRINTS) or 1
     for one in placed[::every]:
         seen = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker)

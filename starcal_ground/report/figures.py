@@ -12,7 +12,6 @@ import numpy as np
 from starcal_ground.report import svg
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
-from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import whitening
 from starcal_ros.pipeline.annotation import predicted_px
@@ -20,7 +19,6 @@ from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations
 from starcal_ros.text import significant
 
 _LEAST_IN_BIN = 10
-_WAVES = 16  # highest spatial frequency of the spectrum, waves over the longer side
 
 
 def residuals_of_images(residuals: Residuals) -> svg.Chart:
@@ -96,47 +94,6 @@ def before_and_after(
         'Distance of the stars from their prediction: by the attitude that the star tracker '
         'reported and the prior, and after the calibration.',
     )  # fmt: skip
-
-
-def spectrum(residuals: Residuals, camera: CameraModel) -> svg.Chart:
-    """Amplitude of waves in the residuals over the detector, with that of independent noise."""
-    waves, amplitude_px, noise_px = wave_amplitudes(residuals, camera)
-    curves = [
-        svg.Curve(waves, amplitude_px, svg.SERIES[0], 'measured', 'circle'),
-        svg.Curve(waves[[0, -1]], [noise_px, noise_px], svg.INK, 'independent noise', dash='5 3'),
-    ]
-    return svg.Chart(
-        'Spectrum of the residuals',
-        svg.plot(curves, 'waves over the longer side of the detector', 'amplitude, rms (px)',
-                 y=(0.0, None)),
-        'Waves that are left in the residuals over the detector. Amplitudes over the line of '
-        'independent noise indicate a pattern that neither lens model nor field describes.',
-    )  # fmt: skip
-
-
-def wave_amplitudes(residuals: Residuals, camera: CameraModel) -> tuple[Floats, Floats, float]:
-    """
-    Spectrum of the residuals: waves over the longer side, RMS amplitude (px), and that of noise.
-
-    The mean over directions and both axes of ``|2/n sum r exp(-i k x)|^2``, x in cells of 1/64 of
-    the longer side; for independent residuals of variance s^2 its expectation is 4 s^2 / n.
-    """
-    side, cells = float(max(camera.width, camera.height)), 64
-    used = residuals.used
-    place = np.floor((residuals.measured_px[used] + 0.5) / side * cells).astype(int)
-    u, v = np.clip(place, 0, cells - 1).T
-    count = max(int(used.sum()), 1)
-    power = np.zeros((cells, cells))
-    for component in residuals.residual_px[used].T:
-        summed = np.bincount(v * cells + u, component, cells * cells).reshape(cells, cells)
-        power += np.abs(np.fft.fft2(summed)) ** 2 / 2
-    frequency = np.fft.fftfreq(cells, 1 / cells)
-    length = np.hypot(frequency[:, None], frequency)
-    ring = np.rint(length).astype(int).ravel()
-    mean = np.bincount(ring, power.ravel()) / np.bincount(ring)
-    waves = np.arange(1, _WAVES + 1)
-    noise_px = 2.0 * float(np.sqrt((residuals.residual_px[used] ** 2).mean() / count))
-    return waves.astype(float), 2.0 / count * np.sqrt(mean[waves]), noise_px
 
 
 def residuals_against_magnitude(residuals: Residuals) -> svg.Chart | None:

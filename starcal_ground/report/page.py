@@ -9,7 +9,7 @@ The page needs no network: styles, script and pictures are embedded.
 from __future__ import annotations
 
 import base64
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 import functools
@@ -26,7 +26,7 @@ import numpy as np
 from starcal_ground import outputs, products
 from starcal_ground.report import detector_figures, figures, thumbnails, verdict
 from starcal_ground.report.svg import Chart, light
-from starcal_ground.report.thumbnails import star_of, Thumbnail
+from starcal_ground.report.thumbnails import Thumbnail
 from starcal_ground.report.verdict import Row
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
@@ -155,7 +155,7 @@ def refused_images(
     thumbnails: Sequence[Thumbnail],
 ) -> list[Mapping[str, object]]:
     """For each reason its count, the refused images, and pictures of some of them."""
-    pictures = {t.time_ns: t for t in thumbnails if not t.reason}
+    pictures = {t.time_ns: t for t in thumbnails if not t.is_expected}
     groups: list[Mapping[str, object]] = []
     for reason, count in Counter(counts).most_common():
         images = [o for o in observations if o.refusal == reason]
@@ -196,30 +196,10 @@ def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str,
     ]
 
 
-def refused_stars(
-    observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
-) -> list[Mapping[str, object]]:
-    """
-    For each reason, most frequent first: meaning, count, and pictures of some refused stars.
-
-    Each picture has the stamp and the catalog number of its star.
-    """
-    by_time = {o.time_ns: o for o in observations}
-    pictures = defaultdict(list)
-    for one in (thumbnail for thumbnail in thumbnails if thumbnail.reason):
-        number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
-        label = '' if number is None else str(number)
-        pictures[one.reason].append((picture(one), utc_text(one.time_ns), label))
-    return [
-        {
-            'reason': reason,
-            'meaning': STAR_REFUSALS.get(reason, ''),
-            'count': count,
-            'pictures': pictures[reason],
-        }
-        for reason, count in _counts(observations).most_common()
-        if count
-    ]
+def refused_stars(observations: Sequence[StarObservations]) -> list[tuple[str, str, int]]:
+    """Reason, most frequent first, meaning, and count."""
+    counts = _counts(observations).most_common()
+    return [(reason, STAR_REFUSALS.get(reason, ''), count) for reason, count in counts if count]
 
 
 def used_images(
@@ -230,7 +210,7 @@ def used_images(
     return [
         (picture(t), utc_text(t.time_ns), stars[t.time_ns])
         for t in thumbnails
-        if not t.reason and t.time_ns in stars
+        if not t.is_expected and t.time_ns in stars
     ]
 
 
@@ -338,11 +318,11 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'correlation': calibration.correlation,
         'slider': slider(calibration, residuals),
         'refused_images': refused_images(refused, observations, pictures),
-        'refused_stars': refused_stars(observations, pictures),
+        'refused_stars': refused_stars(observations),
         'model_rows': verdict.model_rows(calibration),
         'star_marks': star_marks(observations),
         'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
-        'has_images': any(not one.reason for one in pictures),
+        'has_images': any(not one.is_expected for one in pictures),
         'used_images': used_images(observations, pictures),
         'options': _options(calibration),
     }
@@ -377,7 +357,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     pictures = [
         (picture(one), utc_text(one.time_ns))
         for one in thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
-        if one.reason == thumbnails.EXPECTED
+        if one.is_expected
     ]
     refused = [
         (count, reason, IMAGE_REFUSALS.get(reason, ''))
@@ -455,7 +435,6 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
         'coverage': detector_figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
         'field': detector_figures.mean_residuals(residuals, camera),
-        'spectrum': figures.spectrum(residuals, camera),
         'histogram': figures.histogram(residuals),
         'magnitude': figures.residuals_against_magnitude(residuals),
         'colour': figures.residuals_against_colour(residuals),

@@ -34,7 +34,6 @@ _PER_UNIT = 2  # pixels of a bitmap
 _MARKS = {
     'circle': 'M{r},0A{r},{r} 0 1 1 -{r},0A{r},{r} 0 1 1 {r},0Z',
     'square': 'M-{r},-{r}H{r}V{r}H-{r}Z',
-    'triangle': 'M0,-{r}L{r},{r}H-{r}Z',
     'cross': 'M-{r},-{r}L{r},{r}M-{r},{r}L{r},-{r}',
 }
 _PALETTE = re.compile(r':root \{(.*?)\}', re.DOTALL)
@@ -249,21 +248,17 @@ class Panel:
         steps = [f'{pen}{u:.1f},{v:.1f}' for pen, (u, v) in zip(pens[known], places[known])]  # noqa: B905
         self.inside.append(_stroke(''.join(steps), colour, width, dash))
 
-    def band(self, low: float, high: float, is_vertical: bool = False) -> None:
-        """A pale band between two values."""
-        a, b = sorted((self.x if is_vertical else self.y)(np.array([low, high])).tolist())
-        box = (a, self._top, b, self._bottom) if is_vertical else (self._left, a, self._right, b)
-        self.inside.append(_rectangle(box, GRID, 0.6))
+    def band(self, low: float, high: float) -> None:
+        """A pale band between two values of y."""
+        top, bottom = sorted(self.y(np.array([low, high])).tolist())
+        self.inside.append(
+            f'<rect x="{self._left:.1f}" y="{top:.1f}" width="{self._right - self._left:.1f}"'
+            f' height="{bottom - top:.1f}" fill="{GRID}" fill-opacity="0.6"/>'
+        )
 
     def upright(self, x: float, colour: str = GRID, width: float = 1.5, dash: str = '') -> None:
         """A line at a value of x, from bottom to top."""
         self.curve(Curve([x, x], [self.y.low, self.y.high], colour, width=width, dash=dash))
-
-    def box(self, x: tuple[float, float], y: tuple[float, float], colour: str,
-            opacity: float) -> None:  # fmt: skip
-        """A rectangle between values."""
-        corners = np.sort([self.x(x), self.y(y)]).T.ravel()
-        self.inside.append(_rectangle(corners.tolist(), colour, opacity))
 
     def cloud(self, points: Floats, radius: float, opacity: float) -> None:
         """Many points (n, 2) as a bitmap; where they overlap they add up."""
@@ -368,14 +363,6 @@ def _line(
     x1: float, y1: float, x2: float, y2: float, colour: str, width: float, dash: str = ''
 ) -> str:
     return _stroke(f'M{x1:.1f},{y1:.1f}L{x2:.1f},{y2:.1f}', colour, width, dash)
-
-
-def _rectangle(box: Sequence[float], colour: str, opacity: float) -> str:
-    left, top, right, bottom = box
-    return (
-        f'<rect x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}"'
-        f' height="{bottom - top:.1f}" fill="{colour}" fill-opacity="{opacity:g}"/>'
-    )
 
 
 def _mark(x: float, y: float, colour: str, shape: str, size: float, title: str) -> str:

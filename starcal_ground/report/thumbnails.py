@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Thumbnails of a few images and refused stars, stored beside the products for the report."""
+"""Thumbnails of a few images, stored beside the products for the report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import re
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from starcal_ground.outputs import make_folder
 from starcal_ros.arrays import Pixels
@@ -27,17 +26,11 @@ from starcal_ros.untrusted import read_bytes
 THUMBNAILS_FOLDER = 'thumbnails'
 _USED = 6  # used images, evenly spread; between this and twice as many are kept
 _REFUSED_OF_A_REASON = 2
-_STARS_OF_A_REASON = 6
 _WIDTH_PX = 480
-_STAR_HALF_PX = 12
-_NAME = re.compile(
-    r'image_(?P<image_ns>-?\d{1,20})\.jpg'
-    r'|star_(?P<star_ns>-?\d{1,20})_(?P<reason>[a-z_]{1,40})_(?P<n>\d{1,9})\.png'
-)
+_NAME = re.compile(r'image_(?P<image_ns>-?\d{1,20})\.jpg|expected_(?P<ns>-?\d{1,20})\.png')
 _MAGIC = {'.jpg': b'\xff\xd8\xff', '.png': b'\x89PNG\r\n\x1a\n'}
 _MOST_BYTES = 1 << 20  # of a picture: one of 480 x 480 pixels has a quarter
 _MOST_FILES = 1000  # in a folder: a calibration writes under 200
-EXPECTED = 'no_match_expected'  # in the names of these pictures
 _EXPECTED_PICTURES = 3
 _EXPECTED_STARS = 40  # brightest stars and sources
 _EXPECTED_WIDTH_PX = 900
@@ -46,19 +39,16 @@ _EXPECTED_BGR, _SEEN_BGR = (80, 200, 255), (120, 255, 120)
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A small picture; ``reason`` is empty for a whole image."""
+    """A small picture of an image, or a larger one with the stars expected in it."""
 
     time_ns: int
-    reason: str
-    number: int
     encoded: bytes
+    is_expected: bool = False
 
     @property
     def name(self) -> str:
         """File name, which `read_thumbnails` parses."""
-        if self.reason:
-            return f'star_{self.time_ns}_{self.reason}_{self.number}.png'
-        return f'image_{self.time_ns}.jpg'
+        return f'expected_{self.time_ns}.png' if self.is_expected else f'image_{self.time_ns}.jpg'
 
 
 @dataclass(frozen=True)
@@ -73,7 +63,7 @@ class _Reduced:
         """Thumbnail with the stars marked."""
         picture = annotate_reduced(self.pixels, self.observations, self.geometry)
         _, encoded = cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
-        return Thumbnail(self.observations.time_ns, '', 0, encoded.tobytes())
+        return Thumbnail(self.observations.time_ns, encoded.tobytes())
 
 
 @dataclass
@@ -81,7 +71,7 @@ class Album:
     """
     Selects thumbnails from a stream of images.
 
-    Keeps some used images, evenly spread, and the first images and stars of each refusal reason.
+    Keeps some used images, evenly spread, and the first images of each refusal reason.
     ``expected`` images, if known, are spread from the start; more or fewer may come.  With a
     setup, ``unmatched`` are the first images that match no star, with the stars expected there.
     """
@@ -91,7 +81,6 @@ class Album:
     unmatched: list[Thumbnail] = field(default_factory=list)
     used: list[_Reduced] = field(default_factory=list)
     refused: dict[str, list[_Reduced]] = field(default_factory=dict)
-    stars: dict[str, list[Thumbnail]] = field(default_factory=dict)
     _stride: int = 1
     _seen: int = 0
 
@@ -111,31 +100,15 @@ class Album:
                 if len(self.used) == 2 * _USED:
                     self.used, self._stride = self.used[::2], 2 * self._stride
             self._seen += 1
-        for reason, places in observations.refused_places().items():
-            of_reason = self.stars.setdefault(reason, [])
-            # At most one star per image, for variety.
-            if len(of_reason) < _STARS_OF_A_REASON and len(places):
-                number = len(of_reason)
-                encoded = _cut_out(image.pixels, places[number % len(places)])
-                of_reason.append(Thumbnail(image.time_ns, reason, number, encoded))
-        number = len(self.unmatched)
-        if self.setup and observations.refusal == 'no_match' and number < _EXPECTED_PICTURES:
+        is_unmatched = observations.refusal == 'no_match'
+        if self.setup and is_unmatched and len(self.unmatched) < _EXPECTED_PICTURES:
             encoded = _expected_picture(image, observations, geometry, self.setup)
-            self.unmatched.append(Thumbnail(image.time_ns, EXPECTED, number, encoded))
+            self.unmatched.append(Thumbnail(image.time_ns, encoded, is_expected=True))
 
     def thumbnails(self) -> tuple[Thumbnail, ...]:
         """All selected thumbnails."""
         whole = [*self.used, *(one for group in self.refused.values() for one in group)]
-        stars = [one for group in self.stars.values() for one in group]
-        return (*(one.drawn() for one in whole), *stars)
-
-
-def star_of(thumbnail: Thumbnail, observations: StarObservations) -> int | None:
-    """Catalog number of the refused star of a thumbnail; None if the image has none such."""
-    codes = {name: code for code, name in enumerate(observations.refused_stars)}
-    of_reason = observations.refused_reason == codes.get(thumbnail.reason, -1)
-    numbers = observations.refused_catalog_id[of_reason]
-    return int(numbers[thumbnail.number % len(numbers)]) if len(numbers) else None
+        return tuple(one.drawn() for one in whole)
 
 
 def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
@@ -180,15 +153,15 @@ def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
         except (OSError, ValueError):
             continue
         if encoded.startswith(_MAGIC[path.suffix]):
-            time_ns = int(name['image_ns'] or name['star_ns'])
-            pictures.append(Thumbnail(time_ns, name['reason'] or '', int(name['n'] or 0), encoded))
+            time_ns = int(name['image_ns'] or name['ns'])
+            pictures.append(Thumbnail(time_ns, encoded, name['image_ns'] is None))
     return ordered(pictures)
 
 
 def ordered(thumbnails: Iterable[Thumbnail]) -> tuple[Thumbnail, ...]:
-    """Thumbnails by time, reason and number; of those with one file name the last."""
+    """Thumbnails by time; of those with one file name the last."""
     named = {thumbnail.name: thumbnail for thumbnail in thumbnails}
-    return tuple(sorted(named.values(), key=lambda t: (t.time_ns, t.reason, t.number)))
+    return tuple(sorted(named.values(), key=lambda t: (t.time_ns, t.is_expected)))
 
 
 def _reduced(pixels: Pixels) -> Pixels:
@@ -206,21 +179,6 @@ def _reduced(pixels: Pixels) -> Pixels:
 def _resized(pixels: Pixels, width: int, height: int) -> Pixels:
     # OpenCV's type stubs lack integer images.
     return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
-
-
-def _cut_out(pixels: Pixels, place_px: NDArray[np.float32]) -> bytes:
-    """PNG of the pixels about a place; black where that leaves the image."""
-    u, v = np.rint(np.nan_to_num(np.clip(place_px, -1e4, 1e5), nan=-1e4)).astype(int)
-    size = 2 * _STAR_HALF_PX + 1
-    picture = np.zeros((size, size), np.uint8)
-    first = np.array([v - _STAR_HALF_PX, u - _STAR_HALF_PX])
-    low, high = np.maximum(first, 0), np.minimum(first + size, pixels.shape)
-    if (low < high).all():
-        part = pixels[low[0] : high[0], low[1] : high[1]]
-        inside = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
-        picture[inside] = stretch(part)
-    _, encoded = cv2.imencode('.png', picture)
-    return encoded.tobytes()
 
 
 def _expected_picture(

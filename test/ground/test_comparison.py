@@ -6,8 +6,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+import shutil
 from xml.etree import ElementTree
 
+from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
 from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
@@ -247,3 +249,20 @@ def test_the_tool_compares(
     assert made['difference'][0] == pytest.approx(0.5)
     # The outermost column lies 319.5 px from cx: half a pixel of focal length moves it by this.
     assert made['lines_of_sight']['worst_px'] == pytest.approx(0.5 * 319.5 / 1801, rel=0.1)
+
+
+def test_the_truth_of_a_simulated_bag_has_no_sigma(
+    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_calibration(tiny, tmp_path / 'calibration.json')
+    truth = tmp_path / 'truth.json'
+    shutil.copy(TINY / 'truth.json', truth)
+    command = ['compare', str(tmp_path), str(truth)]
+    assert main.main([*command, '--json']) == 0
+    made, true = json.loads(capsys.readouterr().out), json.loads(truth.read_text())
+    assert made['sigma'] == pytest.approx(tiny.sigma.tolist())
+    assert made['b'] == [*true['k_true'], *true['d_true']] and made['p_value'] > 1e-3
+    truth.write_text(json.dumps({**true, 'A_true': 1}))
+    assert main.main(command) == 2
+    error = capsys.readouterr().err
+    assert 'not the truth of a simulated bag' in error and error.count('\n') == 1

@@ -313,7 +313,6 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--trials', 'many'], "--trials: invalid int value: 'many'"),
         (['table1', '--seed', '-1'], '--seed: -1'),
         (['table1', '--images', '1'], '--images: 1 is not within 2 to'),
-        (['table1', '--images', '5', '5'], '--images: duplicate values: 5 5'),
         (['table1', '--stars', '2'], '--stars: 2'),
         (['table1', '--tracker', '-3'], '-3 is not within 0 to 3600'),
         (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
@@ -332,9 +331,3 @@ def test_a_bad_argument_is_named(
     out, err = capsys.readouterr()
     assert status == 2 and out == '' and words in err.splitlines()[-1]
     assert not (tmp_path / 'out').exists()
-
-
-def test_check_takes_every_study_as_it_stands() -> None:
-    for name, (_, design) in monte_carlo.STUDIES.items():
-        assert design.study == name
-        monte_carlo.check(design)

@@ -52,12 +52,10 @@ def test_calibrate_bench(tmp_path: Path) -> None:
 
 
 def test_fleet_bench(tmp_path: Path) -> None:
-    """Client and worker are killed, and each bag is in the table once, without a failure."""
-    (table, _), _ = found_by('fleet', tmp_path)
-    rows = {row['quantity']: row['value'] for row in table['rows']}
-    assert rows['workers killed with SIGKILL'] == 1
-    assert [rows[f'bags {what}'] for what in ('lost', 'counted twice', 'failed')] == [0, 0, 0]
-    assert rows['calibrations lost or left over'] == 0
+    """The command passes over all simulated calibrations, which its table has."""
+    (table,), _ = found_by('fleet', tmp_path)
+    assert [row['rows'] for row in table['rows']] == [100, 1000]
+    assert all(row['peak MB'] > 0 for row in table['rows'])
 
 
 def test_peers_bench(tmp_path: Path) -> None:
@@ -72,7 +70,7 @@ def test_peers_bench(tmp_path: Path) -> None:
         # A lens that its model does not describe is not in the sigma of a solver.
         assert (scipy['error/sigma'] > 4.0) == ('ripple' in kind)
         assert rows[kind, 'OpenCV']['sigma "'] is None
-        for name in ('tetra3rs', 'GIANT', 'GIANT, estimator', 'mrcal', 'Ceres'):
+        for name in ('tetra3rs', 'GIANT', 'GIANT, estimator', 'mrcal'):
             skipped = f'{name} is not installed: skipped' in said
             images_only = name in ('tetra3rs', 'GIANT') and kind.startswith('stars')
             assert ((kind, name) in rows) == (not skipped and not images_only)

@@ -21,8 +21,10 @@ from PIL import Image
 import pytest
 
 from starcal_ground.cli import main
-from starcal_ground.cli.commands import compare, demo
+from starcal_ground.cli.commands import demo
 from starcal_ground.cli.main import parser
+from starcal_ground.comparison import compare, truth_like
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import names_of, read_parameter_file
 from starcal_ros.pipeline.setup import (
@@ -348,19 +350,20 @@ def test_the_demo_lines_of_the_tutorial_are_those_of_the_demo(tiny_products: Pat
     """Estimates within a tenth of their sigma, sigmas within 2 %."""
     bag = demo.tiny_bag(tiny_products)
     calibration = read_calibration(tiny_products / 'calibration.json')
-    table = compare.with_truth(calibration, bag.truth, bag.prior)
-    made = {line.rpartition('  ')[0][:11].strip(): numbers(line) for line in table.lines[1:]}
+    made = compare(calibration, truth_like(calibration, bag.truth))
+    places = {name.replace('_', ' '): k for k, name in enumerate(calibration.parameter_names)}
     shown = re.findall(
         r'^    (fx|k1|p1|alignment x) (.*)$', (ROOT / 'docs/tutorial.md').read_text(), re.MULTILINE
     )
     assert len(shown) == 4
     for name, text in shown:
-        prior, estimate, sigma, true, error = numbers(text)
-        expected = made[name]
-        assert (prior, true) == (expected[0], expected[3]), name
-        assert abs(estimate - expected[1]) < 0.1 * sigma, name
-        assert sigma == pytest.approx(expected[2], rel=0.02), name
-        assert error == pytest.approx(expected[4], abs=0.1), name
+        *values, off, sigma, sigmas = numbers(text)
+        k, unit = places[name], 1.0 if values else ARCSECOND_RAD
+        for value, geometry in zip(values, (calibration.geometry, bag.truth), strict=False):
+            assert abs(value - geometry.camera.parameters[k]) < 0.1 * sigma, name
+        assert abs(off - made.difference[k] / unit) < 0.1 * sigma, name
+        assert sigma == pytest.approx(made.sigma[k] / unit, rel=0.02), name
+        assert sigmas == pytest.approx(made.sigmas[k], abs=0.1), name
 
 
 def test_the_picture_of_the_report_is_of_todays_calibration(tiny_products: Path) -> None:

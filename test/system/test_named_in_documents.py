@@ -50,7 +50,8 @@ ELSEWHERE = {
     ),
     *('Calibration.id_stars', 'estimate_geometric_calibration', 'estimate_attitude'),
     *('estimate_static_alignment', 'estimate_temperature_dependent_alignment'),
-    *('kalibr_calibrate_imu_camera', 'target.yaml', '--scale-low', '--scale-high'),
+    *('kalibr_calibrate_imu_camera', 'camchain.yaml', 'timeshift_cam_imu', 'target.yaml'),
+    *('--scale-low', '--scale-high'),
 }
 # Hypothetical files of a user, and modules that were rejected.
 NOT_OURS = {'rotation.py', 'env.sh', 'STUDY.json', '00000012.mcap'}

@@ -32,7 +32,7 @@ BY_COMMAND = {
     'make_phase': {'pixel_phase'},
     'make_trend': {'trend'},
     # `python -m studies paper`: test/studies/test_paper.py draws them from a few images.
-    'paper': {f'paper_figure_{k}' for k in (5, 6, 7, 8)},
+    'paper': {f'paper_figure_{k}' for k in (5, 6, 7)},
 }
 
 

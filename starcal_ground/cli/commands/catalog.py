@@ -19,7 +19,7 @@ from starcal_ground.cli import arguments, terminal
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    what = 'table of Gaia, Tycho-2 or 2MASS, VOTable, FITS, CSV or Parquet; or an index file'
+    what = 'table of Gaia, Tycho-2 or 2MASS, VOTable, FITS or CSV; or an index file'
     add('table', type=arguments.path, metavar='TABLE', help=what)
     what = 'catalog file to write (.npz), for the option catalog'
     arguments.add_output(command, 'FILE', what, required=True)

@@ -2,9 +2,9 @@
 """
 Compare two calibrations in pixels and sigmas.
 
-A and B are calibration.json files or folders with one. Lines of sight are compared in the star
-tracker frame, before and after removing their common rotation. Differences are B minus A; their
-sigmas assume that A and B are independent.
+A and B are calibration.json files or folders with one; B may be the truth of a simulated bag.
+Lines of sight are compared in the star tracker frame, before and after removing their common
+rotation. Differences are B minus A; their sigmas assume that A and B are independent.
 
   # two runs
   starcal compare out again
@@ -20,19 +20,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_table, print_text, table_lines
+from starcal_ground.cli.terminal import print_table, print_text
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.errors import ProductError
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 if TYPE_CHECKING:
     from starcal_ground.comparison import Comparison, DifferenceMap
-    from starcal_ros.records import Calibration, CameraGeometry
+    from starcal_ros.records import Calibration
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -48,17 +47,8 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     files = [calibration_file(path) for path in (args.a, args.b)]
-    truth = _truth_of(files[1])
-    if truth is not None:
-        if args.output:
-            raise OptionError('--output: a plot needs two calibrations')
-        table = _compared_with(read_calibration(files[0]), truth, files[1])
-        if args.json:
-            arguments.print_json(table)
-        else:
-            print_text('\n'.join(table.lines))
-        return arguments.EXIT_ACCEPTED
-    result = comparison.compare(*map(read_calibration, files))
+    a = read_calibration(files[0])
+    result = comparison.compare(a, _truth_of(files[1], a) or read_calibration(files[1]))
     if args.output:
         from starcal_ground.report.detector_figures import write_comparison
 
@@ -67,13 +57,13 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         arguments.print_json(comparison.content(result))
     else:
-        _print(result)
+        print_comparison(result)
         if args.output:
             print_text(f'figure written to {args.output}')
     return arguments.EXIT_ACCEPTED
 
 
-def _print(comparison: Comparison) -> None:
+def print_comparison(comparison: Comparison) -> None:
     """Print the differences of parameters, alignment and lines of sight."""
     a, b = (c.geometry.camera for c in (comparison.a, comparison.b))
     of_a = dict(zip(a.parameter_names, a.parameters, strict=True))
@@ -127,16 +117,14 @@ def _sigmas(difference: float, sigma: float) -> str:
     return f'{difference / sigma:+.1f}' if sigma > 0 else ''
 
 
-@dataclass(frozen=True)
-class TruthTable:
-    """Estimate and truth: lines of a table, and the largest error in sigmas."""
+def _truth_of(path: Path, like: Calibration) -> Calibration | None:
+    """
+    The truth of a simulated bag, as ``starcal simulate`` writes it; None for another file.
 
-    lines: tuple[str, ...]
-    worst_sigmas: float
-
-
-def _truth_of(path: Path) -> object:
-    """Content of the truth of a simulated bag, as ``starcal simulate`` writes it; else None."""
+    Raises ProductError when it is damaged.
+    """
+    from starcal_ground.comparison import truth_like
+    from starcal_ground.simulation.simulated_bag import true_geometry
     from starcal_ros.formats.products.product_files import read_text
     from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 
@@ -144,65 +132,9 @@ def _truth_of(path: Path) -> object:
         content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
     except (ProductError, ValueError):
         return None
-    return content if isinstance(content, dict) and 'k_true' in content else None
-
-
-def _compared_with(calibration: Calibration, content: object, path: Path) -> TruthTable:
-    """
-    The table of a calibration beside the truth.
-
-    Raises ProductError when the truth is of another lens model or damaged.
-    """
-    from starcal_ground.products import prior_of
-    from starcal_ground.simulation.simulated_bag import true_geometry
-
+    if not (isinstance(content, dict) and 'k_true' in content):
+        return None
     try:
-        truth = true_geometry(content)  # type: ignore[arg-type]
+        return truth_like(like, true_geometry(content))
     except (ValueError, KeyError, TypeError) as error:
         raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
-    model = calibration.geometry.camera.model
-    if truth.camera.model != model:
-        raise ProductError(f'{path}: of lens model {truth.camera.model}, calibrated was {model}')
-    return with_truth(calibration, truth, prior_of(calibration) or calibration.geometry)
-
-
-def with_truth(
-    calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry
-) -> TruthTable:
-    """Table of the estimated parameters and the alignment with prior and truth."""
-    import numpy as np
-
-    from starcal_ground.comparison import alignment_difference_rad
-
-    all_names = calibration.geometry.camera.parameter_names
-    names = [name for name in all_names if name in calibration.estimated]
-    columns = [all_names.index(name) for name in names]
-    before, estimate, true = (
-        geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
-    )
-    sigma = calibration.sigma
-    off = (estimate - true) / sigma[columns]
-    rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
-    table = [
-        (
-            name,
-            significant(b, 6),
-            to_sigma(e, s),
-            significant(s, 2),
-            significant(t, 6),
-            f'{o:+.1f} sigma',
-        )
-        for name, b, e, s, t, o in rows
-    ]
-    # Alignment angles are relative to the truth.
-    prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
-    error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
-    sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
-    angles_off = (error_arcsec / sigma_arcsec)[: 3 * calibration.has_alignment]
-    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=False)
-    table += [
-        (f'alignment {axis}', f'{b:+.2f}″', f'{e:+.2f}″', f'{s:.2f}″', '0″', f'{o:+.1f} sigma')
-        for axis, b, e, s, o in angles
-    ]
-    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
-    return TruthTable(tuple(table_lines(header, table)), float(np.abs([*off, *angles_off]).max()))

@@ -40,8 +40,10 @@ def run(args: argparse.Namespace) -> int:
 
     node_processes.check_ros()  # before modules whose packages a vehicle lacks
 
+    import numpy as np
+
     from starcal_ground import comparison
-    from starcal_ground.cli.commands.compare import with_truth
+    from starcal_ground.cli.commands.compare import print_comparison
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
     from starcal_ground.outputs import check_outputs, make_folder
     from starcal_ground.products import write_products
@@ -62,12 +64,14 @@ def run(args: argparse.Namespace) -> int:
     terminal.print_text(verdict)
     if calibration is None:
         return arguments.EXIT_REFUSED
-    beside_truth = with_truth(calibration, bag.truth, bag.prior)
-    terminal.print_text('\n'.join(beside_truth.lines))
-    good = beside_truth.worst_sigmas <= _MOST_SIGMAS
+    truth = comparison.truth_like(calibration, bag.truth)
+    of_truth = comparison.compare(calibration, truth)
+    print_comparison(of_truth)
+    worst_sigmas = float(np.nanmax(np.abs(of_truth.sigmas)))
+    good = worst_sigmas <= _MOST_SIGMAS
     terminal.print_verdict(
         good,
-        f'largest error {beside_truth.worst_sigmas:.1f} sigma, '
+        f'largest error {worst_sigmas:.1f} sigma, '
         f'{"within" if good else "over"} the limit of {_MOST_SIGMAS:g} sigma',
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
@@ -90,23 +94,19 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class DemoBag:
-    """A bag folder with its parameters, the prior geometry and the true geometry."""
+    """A bag folder with its parameters and the true geometry."""
 
     bag: Path
     parameters: dict[str, object]
-    prior: CameraGeometry
     truth: CameraGeometry
     image_count: int
 
 
 def tiny_bag(spare: Path) -> DemoBag:
     """The small bag of the source tree or the installed package, or one rendered under `spare`."""
-    import numpy as np
     import yaml
 
     from starcal_ground.simulation import scenario, simulated_bag
-    from starcal_ros.formats.products.camera_yaml import read_camera_info
-    from starcal_ros.records import CameraGeometry
 
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     places = [Path(__file__).parents[3], *(Path(p, 'share/starcal') for p in prefixes if p)]
@@ -118,7 +118,4 @@ def tiny_bag(spare: Path) -> DemoBag:
     parameters = yaml.safe_load((folder / 'params.yaml').read_text())['/**']['ros__parameters']
     # The nodes may run in another folder: they need the absolute URL.
     parameters['camera_info_url'] = f'file://{(folder / "camera.yaml").resolve()}'
-    prior = CameraGeometry(
-        read_camera_info(folder / 'camera.yaml'), np.array(parameters['prior_alignment'])
-    )
-    return DemoBag(folder, parameters, prior, simulated_bag.true_geometry(truth), truth['images'])
+    return DemoBag(folder, parameters, simulated_bag.true_geometry(truth), truth['images'])

@@ -3,9 +3,9 @@
 Write a calibration in the format of another tool.
 
 Writes SPICE kernels (FK and IK, or CK with the attitude of each image), an ALE fragment and ISIS
-keywords, YAML of OpenCV, kalibr or ROS, arguments of GIANT, a model of mrcal, a table of lines of
-sight, or C99 source; prints the parts that the format cannot represent and the error in pixels
-that this causes. SPICE kernels, tables and C represent the whole camera.
+keywords, YAML of OpenCV or ROS, arguments of GIANT, a model of mrcal, or C99 source; prints the
+parts that the format cannot represent and the error in pixels that this causes. SPICE kernels and
+C represent the whole camera, as do the tables of starcal lookup.
 
   # frame and instrument kernel, including the star tracker frame
   starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-id -999100
@@ -40,7 +40,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     what = 'calibration.json or its folder'
     add('calibration', type=Path, metavar='DIR', help=what)
-    what = 'format: spice, ck, isd, opencv, kalibr, ros, giant, mrcal, csv or c'
+    what = 'format: spice, ck, isd, opencv, ros, giant, mrcal or c'
     add('--to', required=True, metavar='FORMAT', help=what)
     what = 'folder for the files, created if absent'
     add('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
@@ -61,7 +61,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
     what = 'LSK and SCLK of the spacecraft, for ck'
     spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
-    add('--image-topic', default='', metavar='T', help='image topic, for kalibr')
     what = 'only the binary table, for compiled C code'
     add('--table', action='store_true', help=what)
 
@@ -83,8 +82,7 @@ def run(args: argparse.Namespace) -> int:
     if args.to == 'ck':
         observations = read_observations([_observations_of(args.calibration)], OBSERVATIONS_TOPIC)
     done = export(
-        *(calibration, args.to, args.output, names, args.image_topic, args.table),
-        *(observations, args.kernels),
+        *(calibration, args.to, args.output, names, args.table, observations, args.kernels)
     )
     terminal.print_text(f'written: {", ".join(map(str, done.files))}')
     if not calibration.accepted:
@@ -92,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
             f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}'
         )
     if not math.isfinite(done.worst_px):
-        terminal.print_text('the format cannot see the whole detector: use spice, opencv or csv')
+        terminal.print_text('the format cannot see the whole detector: use spice or opencv')
     else:
         terminal.print_text(
             f'largest error of a pixel against the calibration: {significant(done.worst_px, 3)} px'

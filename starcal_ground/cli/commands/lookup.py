@@ -12,12 +12,20 @@ sight include the residual field if there is one.
   starcal lookup out -o lines_of_sight.npz --step 16
 """
 
+from __future__ import annotations
+
 import argparse
+import io
 import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.text import significant
+
+if TYPE_CHECKING:
+    from starcal_ros.assessment.lookup import LineOfSightTable
 
 _MOST_POINTS = 2000  # pixels a side of a table of lines of sight: 1.8 GB of memory
 
@@ -25,7 +33,7 @@ _MOST_POINTS = 2000  # pixels a side of a table of lines of sight: 1.8 GB of mem
 def add_arguments(command: argparse.ArgumentParser) -> None:
     what = 'calibration.json or its folder'
     command.add_argument('calibration', type=arguments.path, metavar='DIR', help=what)
-    arguments.add_output(command, 'FILE', 'table to write: .csv, .npz or .fits', required=True)
+    arguments.add_output(command, 'FILE', 'table to write: .csv or .npz', required=True)
     grid = command.add_mutually_exclusive_group()
     points = arguments.number(int, 2, _MOST_POINTS)
     what = 'N x N pixels from corner to corner of the detector, u fastest (default: 25)'
@@ -35,7 +43,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.mission.export.export_formats import write_lookup_table
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
@@ -57,3 +64,28 @@ def run(args: argparse.Namespace) -> int:
     write_lookup_table(table, args.output)
     terminal.print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return arguments.EXIT_ACCEPTED
+
+
+def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
+    """
+    Write a table in the format of the file extension, .csv or .npz.
+
+    Raises ProductError for another extension, or a file that cannot be written.
+    """
+    import numpy as np
+
+    from starcal_ros.formats.products.product_files import write_atomically
+
+    columns: dict[str, Any] = table.columns()  # the stub of savez_compressed wants no others
+    if path.suffix == '.csv':
+        rows = (
+            ','.join(repr(float(value)) for value in row)
+            for row in zip(*columns.values(), strict=True)
+        )
+        write_atomically(path, '\n'.join([','.join(columns), *rows]) + '\n')
+    elif path.suffix == '.npz':
+        memory = io.BytesIO()
+        np.savez_compressed(memory, **columns)
+        write_atomically(path, memory.getvalue())
+    else:
+        raise ProductError(f'{path}: ends neither in .csv nor in .npz')

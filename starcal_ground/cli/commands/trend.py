@@ -3,9 +3,8 @@
 Follow calibrations over years.
 
 Adds every calibration.json and state folder under ROOT to a table in DIR, one SQLite file. With
---params it calibrates bags too. Observations of older versions are calibrated again. Writes
-trend.html: each parameter, boresight and alignment over time, steps and drifts with p-values, and
-the change that a recalibration would have made.
+--params it calibrates bags too. Writes trend.html: each parameter, boresight and alignment over
+time, steps and drifts with p-values, and the change that a recalibration would have made.
 
   # all calibrations of a mission; another run adds only new ones
   starcal trend mission -o trend
@@ -85,15 +84,16 @@ def run(args: argparse.Namespace) -> int:
         )
     page = trend_page.write_page(table.cameras(), len(table.names()), folder, args.root)
     terminal.print_text(f'{done.computed} new, {done.known} known, {done.failed} failed')
-    for row in page.failures[:_FAILURES_SHOWN]:
-        terminal.print_text(f'failed: {row.path}: {row.error}')
+    failures = [*done.unreachable, *(f'{row.path}: {row.error}' for row in page.failures)]
+    for failure in failures[:_FAILURES_SHOWN]:
+        terminal.print_text(f'failed: {failure}')
     if args.parquet:
         terminal.print_text(f'written to {table.write_parquet()}')
     terminal.print_text(f'{page.span}; look at {page.path}')
     if done.silent == fleet.MOST_SILENT:
         arguments.complain(
-            f'{args.root}: no answer for {done.silent} files; run again when the store answers:'
-            ' the others are left for that run'
+            f'{args.root}: the last {done.silent} files cannot be read; run again when the store'
+            ' answers: the others are left for that run'
         )
         return arguments.EXIT_REFUSED
     return arguments.EXIT_ACCEPTED if page.calibrations else arguments.EXIT_REFUSED

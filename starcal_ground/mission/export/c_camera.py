@@ -95,7 +95,7 @@ def c_table(calibration: Calibration) -> bytes:
         turned,
         vectors,
     ]
-    body = np.concatenate([np.ravel(one) for one in numbers]).astype('<f8').tobytes()
+    body = np.concatenate([np.ravel(array) for array in numbers]).astype('<f8').tobytes()
     for part in calibration.sigma_budget:
         body += ascii_line(part.cause).encode()[: _NAME_SIZE - 1].ljust(_NAME_SIZE, b'\0')
         body += struct.pack('<2d', part.map_arcsec, part.pointing_arcsec)

@@ -2,7 +2,7 @@
 """
 Export to camera models of other tools; all lose the field.
 
-OpenCV, kalibr and ROS.  GIANT's ``OpenCVModel`` is OpenCV's rational model with thin prism, skew
+OpenCV and ROS.  GIANT's ``OpenCVModel`` is OpenCV's rational model with thin prism, skew
 (``alpha``) and a focal length that depends on temperature
 (``giant/camera_models/opencv_model.py``, its equations).  mrcal has OpenCV's models of 5, 8 and 12
 coefficients in OpenCV's order, without skew.  It has the pixel convention of starcal; its
@@ -31,8 +31,6 @@ from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.records import Calibration
 
-# kalibr's word for a lens model, and the parameters that kalibr lacks.
-_KALIBR = {'plumb_bob': ('radtan', ('skew', 'k3')), 'equidistant': ('equidistant', ('skew',))}
 _OF_GIANT = ('plumb_bob', 'rational_polynomial', 'thin_prism')  # within OpenCVModel
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
 _MRCAL = {
@@ -67,40 +65,6 @@ def opencv_yaml(calibration: Calibration) -> exported.Content:
         f'largest_error_px: {made.worst_px!r}',
     ]
     return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
-
-
-def kalibr_yaml(calibration: Calibration, topic: str) -> exported.Content:
-    """
-    A camchain of kalibr with one camera.
-
-    The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment, if there is one,
-    without translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller
-    error.
-    """
-    candidates = [
-        (*exported.fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()
-    ]
-    camera, made, word = min(candidates, key=lambda candidate: candidate[1].worst_px)
-    fx, _, fy, cx, cy = camera.intrinsics.tolist()
-    _, D = ros_distortion(camera.model, camera.distortion)
-    T = np.eye(4)
-    T[:3, :3] = calibration.geometry.star_tracker_from_camera.inv().as_matrix()
-    content = {
-        'cam0': {
-            'camera_model': 'pinhole',
-            'intrinsics': [fx, fy, cx, cy],
-            'distortion_model': word,
-            'distortion_coeffs': D[:4].tolist(),
-            **({'T_cam_imu': T.tolist()} if calibration.has_alignment else {}),
-            'timeshift_cam_imu': 0.0,
-            'rostopic': topic,
-            'resolution': [camera.width, camera.height],
-        }
-    }
-    note = ['# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker']
-    note *= calibration.has_alignment
-    text = '\n'.join([*_commented(exported.about(calibration, made)), *note, _yaml(content)])
-    return dataclasses.replace(made, files={'camchain.yaml': text})
 
 
 def ros_yaml(calibration: Calibration) -> exported.Content:

@@ -1,33 +1,24 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Files of a calibration in a format of another tool, and tables of lines of sight by pixel."""
+"""Files of a calibration in a format of another tool."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-import functools
-import io
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from starcal_ground.mission.export import camera_models, spice
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.exported import Content, Loss, temperature_losses
+from starcal_ground.mission.export.exported import Content, Loss
 from starcal_ground.outputs import check_outputs
-from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import line_of_sight_table, LineOfSightTable
-from starcal_ros.camera import pixel_grid
-from starcal_ros.errors import needing, OptionError, ProductError
+from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import Calibration, StarObservations
 
-FORMATS = ('spice', 'ck', 'isd', 'opencv', 'kalibr', 'ros', 'giant', 'mrcal', 'csv', 'c')
+FORMATS = ('spice', 'ck', 'isd', 'opencv', 'ros', 'giant', 'mrcal', 'c')
 _OF_ALIGNMENT = ('ros', 'spice', 'ck')
 _OF_SPICE = ('spice', 'ck', 'isd')
-CSV_POINTS = 65  # pixels a side
 
 
 @dataclass(frozen=True)
@@ -48,7 +39,6 @@ def export(
     kind: str,
     folder: Path,
     names: spice.SpiceNames | None,
-    topic: str = '',
     table: bool = False,
     observations: Iterable[StarObservations] = (),
     kernels: Sequence[Path] = (),
@@ -63,8 +53,6 @@ def export(
     ----------
     names : SpiceNames or None
         Needed for ``spice``, ``ck`` and ``isd``.
-    topic : str
-        Image topic, for kalibr.
     table : bool
         For ``c``: the binary table alone.
     observations, kernels
@@ -77,7 +65,7 @@ def export(
     if table and kind != 'c':
         raise OptionError(f'--table: only --to c has a table, not {kind}')
     if kind in _OF_ALIGNMENT and not calibration.has_alignment:
-        others = ', '.join(one for one in FORMATS if one not in _OF_ALIGNMENT)
+        others = ', '.join(other for other in FORMATS if other not in _OF_ALIGNMENT)
         raise OptionError(
             f'--to {kind}: the calibration is of the camera alone, without the alignment that'
             f' {kind} needs; choose one of {others}'
@@ -92,11 +80,9 @@ def export(
         'ck': lambda: spice.ck_of_images(calibration, observations, naif, kernels),
         'isd': lambda: camera_models.isd_files(calibration, naif),
         'opencv': lambda: camera_models.opencv_yaml(calibration),
-        'kalibr': lambda: camera_models.kalibr_yaml(calibration, topic),
         'ros': lambda: camera_models.ros_yaml(calibration),
         'giant': lambda: camera_models.giant_json(calibration),
         'mrcal': lambda: camera_models.mrcal_cameramodel(calibration),
-        'csv': lambda: _csv(calibration),
         'c': lambda: Content(
             {TABLE_FILE: c_table(calibration)} if table else c_files(calibration)
         ),
@@ -109,48 +95,3 @@ def export(
         else:
             write_atomically(folder / name, content)
     return Exported(tuple(folder / name for name in made.files), made.worst_px, made.losses)
-
-
-def _csv(calibration: Calibration) -> Content:
-    camera = calibration.geometry.camera
-    pixels = pixel_grid(camera, CSV_POINTS, CSV_POINTS)
-    sights = line_of_sight_table(camera, calibration.map_covariance, pixels)
-    files = {'lines_of_sight.csv': functools.partial(write_lookup_table, sights)}
-    return Content(files, losses=temperature_losses(calibration))
-
-
-def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
-    """
-    Write a table in the format of the file extension: .csv, .npz or .fits.
-
-    Raises ProductError for another extension, a file that cannot be written, or .fits without
-    astropy.
-    """
-    columns: dict[str, Any] = table.columns()  # the stub of savez_compressed wants no others
-    if path.suffix == '.csv':
-        rows = (
-            ','.join(repr(float(value)) for value in row)
-            for row in zip(*columns.values(), strict=True)
-        )
-        write_atomically(path, '\n'.join([','.join(columns), *rows]) + '\n')
-    elif path.suffix == '.npz':
-        memory = io.BytesIO()
-        np.savez_compressed(memory, **columns)
-        write_atomically(path, memory.getvalue())
-    elif path.suffix == '.fits':
-        write_atomically(path, _fits(columns, path))
-    else:
-        raise ProductError(f'{path}: ends neither in .csv nor in .npz nor in .fits')
-
-
-def _fits(values: dict[str, Floats], path: Path) -> bytes:
-    with needing('mission', ProductError, path):
-        from astropy.io import fits
-    units = {'px': 'pix', 'arcsec': 'arcsec'}
-    columns = [
-        fits.Column(name=name, format='D', array=column, unit=units.get(name.rsplit('_', 1)[-1]))
-        for name, column in values.items()
-    ]
-    memory = io.BytesIO()
-    fits.BinTableHDU.from_columns(columns, name='LINES_OF_SIGHT').writeto(memory)
-    return memory.getvalue()

@@ -362,16 +362,16 @@ def attitude_by_stars(
         return None
     degc = image.temperature_degc
     geometry = camera_at(calibration, degc) if np.isfinite(degc) else calibration.geometry
-    seen = line_of_sight(geometry.camera, image.measured_px)
+    measured = line_of_sight(geometry.camera, image.measured_px)
     information = 1.0 / image.covariance_px2[:, [0, 2]].mean(axis=1)
-    used = np.isfinite(seen).all(axis=1)
+    used = np.isfinite(measured).all(axis=1)
     for _ in range(2):  # the second without the stars that the first does not fit
         if used.sum() < _LEAST_STARS:
             return None
         rotation, _ = Rotation.align_vectors(
-            image.direction_icrf[used], seen[used], information[used]
+            image.direction_icrf[used], measured[used], information[used]
         )
-        off = np.linalg.norm(rotation.apply(seen) - image.direction_icrf, axis=1)
+        off = np.linalg.norm(rotation.apply(measured) - image.direction_icrf, axis=1)
         off = off * np.sqrt(information)
         used = used & (off <= _OUTLIER * RAYLEIGH_TO_SIGMA * np.median(off[used]))
     return rotation, float(1.0 / np.sqrt(information[used].sum()))
@@ -391,9 +391,9 @@ def ck_of_images(
     has stars, or SPICE refuses the file.  Raises IngestError for a kernel that cannot be read.
     """
     attitudes = {
-        image.time_ns: one
+        image.time_ns: attitude
         for image in observations
-        if (one := attitude_by_stars(calibration, image)) is not None
+        if (attitude := attitude_by_stars(calibration, image)) is not None
     }
     if not attitudes:
         raise ProductError('--to ck: no image with stars among the observations')

@@ -23,7 +23,6 @@ from xml.etree import ElementTree
 import erfa
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.time_systems import from_text, system_of
 from starcal_ground.mission.ingest import mission_records
@@ -36,15 +35,9 @@ _KM = 1000.0
 _DAY_S = 86400.0
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 _KVN = re.compile(rb'^\s*CCSDS_\w+_VERS\s*=', re.MULTILINE)
-# ATTITUDE_TYPE -> numbers of a line: of which four are the quaternion, or three the angles about
-# the axes of EULER_ROT_SEQ in turn, deg; 1.0 writes XYZ as 123.
-_BOTH = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8, 'EULER_ANGLE': 3}
-_TYPES = {
-    '1.0': {**_BOTH, 'QUATERNION/RATE': 7, 'EULER_ANGLE/RATE': 6},
-    '2.0': {**_BOTH, 'QUATERNION/ANGVEL': 7, 'EULER_ANGLE/DERIVATIVE': 6, 'EULER_ANGLE/ANGVEL': 6},
-}
-_AXES = str.maketrans('123', 'XYZ')
-_SEQUENCE = re.compile(r'(?!(.)\1|.(.)\2)[XYZ]{3}')
+# ATTITUDE_TYPE -> numbers of a line, of which four are the quaternion.
+_BOTH = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8}
+_TYPES = {'1.0': {**_BOTH, 'QUATERNION/RATE': 7}, '2.0': {**_BOTH, 'QUATERNION/ANGVEL': 7}}
 _STATE_NUMBERS = (6, 9)  # position and velocity, without and with acceleration
 
 
@@ -56,9 +49,7 @@ def is_ccsds(path: Path) -> bool:
 
 def read_aem(path: Path, star_tracker: str = '') -> mission_records.Attitudes:
     """
-    Attitudes of an AEM: quaternions or, in KVN, Euler angles.
-
-    ``star_tracker`` selects the body frame if the file has several.
+    Attitudes of an AEM of quaternions; ``star_tracker`` selects one of several body frames.
 
     Raises IngestError when the file cannot be read, is not an AEM, or has a time system or frames
     that cannot be converted.
@@ -157,29 +148,13 @@ def _quaternions(segment: Segment) -> tuple[Floats, bool]:
     kind = _keyword(segment, 'ATTITUDE_TYPE')
     count = _TYPES[segment.version].get(kind)
     if count is None:
-        raise ValueError(f'attitudes of type {kind}, not QUATERNION or EULER_ANGLE: convert them')
-    if kind.startswith('EULER_ANGLE'):
-        return _of_euler_angles(segment, count), is_a_to_b
+        raise ValueError(f'attitudes of type {kind}, not QUATERNION: convert them')
     if segment.is_xml:
         return _numbers(segment, (4,)), is_a_to_b
     values = _numbers(segment, (count,))[:, :4]
     if is_old and _keyword(segment, 'QUATERNION_TYPE', 'FIRST', 'LAST') == 'FIRST':
         values = np.roll(values, -1, axis=1)
     return values, is_a_to_b
-
-
-def _of_euler_angles(segment: Segment, count: int) -> Floats:
-    """
-    Quaternions (n, 4) of Euler angles.
-
-    Each rotation is about an axis of the frame that the rotation before it produced, so their
-    product in this order converts coordinates in the last frame to coordinates in the first.
-    """
-    sequence = _keyword(segment, 'EULER_ROT_SEQ').translate(_AXES)
-    if not _SEQUENCE.fullmatch(sequence):
-        raise ValueError(f'EULER_ROT_SEQ = {sequence[:20]} is not a sequence such as ZXZ')
-    angles = _numbers(segment, (count,))[:, :3]
-    return np.asarray(Rotation.from_euler(sequence, angles, degrees=True).as_quat())
 
 
 def _numbers(segment: Segment, counts: Sequence[int]) -> Floats:

@@ -2,7 +2,7 @@
 """
 A star catalog as deep as needed, from a table of stars and the bundled catalog.
 
-Read are VOTable, FITS, CSV and Parquet with the columns of a row of `_SOURCES`, and index files of
+Read are VOTable, FITS and CSV with the columns of a row of `_SOURCES`, and index files of
 astrometry.net.  Stars of the table take the place of those of the bundled catalog with their
 number; other stars stay, since Gaia lacks the brightest, and a blind search needs all of the sky.
 """
@@ -109,7 +109,6 @@ _RANGES = {
 }
 _NEEDED = ('number', 'ra', 'dec', 'magnitude')
 _MOST_COLUMNS = 1000  # gaia_source has 152
-_MOST_ROWS = 10_000_000  # of Parquet, whose rows may take no space in the file: V = 13 of all sky
 _PROCESSOR_S, _WALL_S = 60.0, 120.0  # three million rows of a VOTable in text
 _masked: Any = np.ma
 _NUMERAL = re.compile(r'[-+.\deE]+')
@@ -468,8 +467,6 @@ def _table(path: Path) -> Any:
         columns = start.count(b',') if path.suffix == '.csv' else 0
         with warnings.catch_warnings():
             warnings.simplefilter('ignore')  # of units that VizieR spells in its own way
-            if path.suffix == '.parquet':
-                return Table(_parquet(path))
             if columns > _MOST_COLUMNS:
                 raise ValueError(f'more than {_MOST_COLUMNS} columns')
             if start.startswith(b'SIMPLE  ='):
@@ -484,7 +481,7 @@ def _table(path: Path) -> Any:
         raise
     except Exception as error:  # astropy raises whatever a damaged file brings about
         words = ' '.join(str(error).split())[:120]
-        raise IngestError(f'{path}: no VOTable, FITS, CSV or Parquet table: {words}') from error
+        raise IngestError(f'{path}: no VOTable, FITS or CSV table: {words}') from error
 
 
 def index_stars(hdus: Any) -> dict[str, NDArray[Any]]:
@@ -509,22 +506,6 @@ def index_stars(hdus: Any) -> dict[str, NDArray[Any]]:
         if len(data) == len(ra_rad):
             stars |= {name.lower(): data[name] for name in data.names}
     return stars
-
-
-def _parquet(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns of `_SOURCES` in a Parquet file; astropy would need pandas."""
-    from pyarrow import parquet
-
-    with parquet.ParquetFile(path) as file:
-        if file.metadata.num_rows > _MOST_ROWS:
-            raise ValueError(f'more than {_MOST_ROWS} rows')
-        known = {name for row in _SOURCES for name in row.columns.values()}
-        names = [name for name in file.schema_arrow.names if name.lower() in known]
-        table, numbers = file.read(names), {row.columns.get('number') for row in _SOURCES}
-    return {
-        name: (table[name].fill_null(0) if name.lower() in numbers else table[name]).to_numpy()
-        for name in names
-    }
 
 
 def _numbers(path: Path, table: Any, name: str, kinds: str) -> Any:

@@ -161,7 +161,7 @@ def _rows(
     path: Path, needed: tuple[str, ...], read: Callable[[Row], Result]
 ) -> Iterator[tuple[int, Result]]:
     """Rows, one at a time: their stamps and what a function reads in them."""
-    lines = (found[0] for found in re.finditer(r'[^\r\n]+', text_of(path)))
+    lines = (match[0] for match in re.finditer(r'[^\r\n]+', text_of(path)))
     table = csv.DictReader(line for line in lines if not line.startswith('#'))
     number = 1
     try:

@@ -158,7 +158,7 @@ def write_bag(
         prior_files = _prior_files(prior, params, copied, files, scale, tuple(others))
     with writer:
         trackers = {ATTITUDE_TOPIC: attitudes}
-        trackers |= {f'/{frame}/attitude': one for frame, one in others.items()}
+        trackers |= {f'/{frame}/attitude': other for frame, other in others.items()}
         _write_messages(writer, files, options, scale, guard, trackers, velocities, on_image)
         # Just before the bag replaces an older one; the record first, which marks it as ours.
         product_files.write_atomically(record, json.dumps(content, indent=1) + '\n')

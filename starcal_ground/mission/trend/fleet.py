@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 import contextlib
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import errno
 import functools
 import hashlib
@@ -27,22 +27,21 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import outputs, products
+from starcal_ground import outputs
 from starcal_ground.file_kinds import explained
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ground.outputs import OBSERVATIONS_FILE
 from starcal_ros import untrusted
-from starcal_ros.constants import software_version
-from starcal_ros.errors import OptionError, ProductError, StarcalError
+from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
-from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
+from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.processes import one_blas_thread
-from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.records import StarObservations
 from starcal_ros.text import printable
 
 KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
@@ -51,8 +50,7 @@ _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
 _TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
-_NO_ANSWER = (errno.EIO, errno.ETIMEDOUT)  # of a store; other errors are answers
-MOST_SILENT = 5  # files that a store does not answer for, in a run; the others wait for the next
+MOST_SILENT = 5  # files in turn that a store does not give; the others wait for the next run
 _CONNECT_S = 10.0
 _AHEAD = 8  # tasks submitted ahead for each thread of a cluster: cancelling 100,000 is slow
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
@@ -74,27 +72,22 @@ class Task:
         Absolute path or URL.
     stamp : str
         Digest of name, identity and settings, none of which is read from the file: what has it is
-        not read again.  Empty where the listing has no identity.
+        not read again.
     files : tuple of str
         Those that are read, as far as the listing shows.
     size : int
         Their bytes; -1 if one could not be read when it was listed.
-    is_bag : bool
     params : str
-        Parameter file for a bag; empty: options and prior of the calibration beside it.
-    settings : tuple of str
-        Files that decide about the result of a bag as well.
+        Parameter file for a bag; empty for a calibration.
     spacecraft, camera : str
-        From the pattern of cameras; empty: from the metadata of the bag.
+        From the pattern of cameras.
     """
 
     url: str
     stamp: str
     files: tuple[str, ...]
     size: int = 0
-    is_bag: bool = False
     params: str = ''
-    settings: tuple[str, ...] = ()
     spacecraft: str = ''
     camera: str = ''
 
@@ -103,58 +96,44 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
     """
     Tasks below a root, as it is listed; no file is read.
 
-    A bag is a task where it has parameters and no calibration beside it.  Observations beside a
-    calibration are one too: it is done only if that is of another version.  Raises OSError when
-    a folder cannot be listed. Raises StarcalError when a parameter file or a file that it names
+    A bag is a task where it has parameters and no calibration beside it.  Raises OSError when a
+    folder cannot be listed. Raises StarcalError when a parameter file or a file that it names
     cannot be read.
     """
-    version, settings_of = software_version(), functools.cache(_settings)
+    settings_of = functools.cache(_settings)
     for entries in places.listings(root):
         listed = {e.name: e for e in entries if KEPT_FOLDER not in e.name.split('/')}
-        yield from _tasks(root, listed, cameras, version, settings_of)
+        yield from _tasks(root, listed, cameras, settings_of)
 
 
 def _tasks(
     root: str,
     listed: dict[str, places.Entry],
     cameras: Cameras,
-    version: str,
-    settings_of: Callable[[str], tuple[tuple[str, ...], str]],
+    settings_of: Callable[[str], str],
 ) -> Iterator[Task]:
     """Tasks of files by name: calibrations in order of their paths, then bags."""
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:
             observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
-            others = (observations,) if observations else ()
-            yield _task(root, name, (entry,), cameras, others=others)
+            yield _task(root, name, (entry,), cameras, beside=observations)
         elif _ARCHIVED.fullmatch(posixpath.basename(name)):
             yield _task(root, name, (entry,), cameras)
     for name, files in _bags(listed).items():
         folder = posixpath.dirname(name) if name in listed else name
-        calibration = listed.get(posixpath.join(folder, CALIBRATION_FILE))
         params = cameras.params_of(name)
-        if params and calibration is None:
-            yield _task(root, name, files, cameras, version, params, settings_of(params))
-        elif calibration is not None and posixpath.basename(name) == OBSERVATIONS_FILE:
-            yield _task(root, name, files, cameras, version, others=(calibration,))
+        if params and posixpath.join(folder, CALIBRATION_FILE) not in listed:
+            yield _task(root, name, files, cameras, params, settings_of(params))
 
 
-def _settings(params: str) -> tuple[tuple[str, ...], str]:
-    """Absolute paths of a parameter file and those that it names, and their digest."""
-    files = (Path(params), *files_of(read_setup(Path(params)).frames).values())
-    paths = tuple(map(os.path.abspath, files))
-    return paths, digest(paths)
-
-
-def digest(files: Sequence[str | Path], version: str = '') -> str:
-    """Digest of the contents of files, those that do not exist left out; raises OSError."""
-    sha256 = hashlib.sha256(version.encode())
-    for file in files:
-        if not os.path.lexists(file):
-            continue  # metadata.yaml of a bag, which need not be there
-        with untrusted.regular_file(Path(file)) as stream:
-            while block := stream.read(1 << 20):
-                sha256.update(block)
+def _settings(params: str) -> str:
+    """Digest of the contents of a parameter file and of those that it names, where they exist."""
+    sha256 = hashlib.sha256()
+    for file in (Path(params), *files_of(read_setup(Path(params)).frames).values()):
+        if os.path.lexists(file):
+            with untrusted.regular_file(file) as stream:
+                while block := stream.read(1 << 20):
+                    sha256.update(block)
     return sha256.hexdigest()
 
 
@@ -163,25 +142,19 @@ def _task(
     name: str,
     files: Sequence[places.Entry],
     cameras: Cameras,
-    version: str = '',
     params: str = '',
-    settings: tuple[tuple[str, ...], str] = ((), ''),
-    others: Sequence[places.Entry] = (),
+    settings: str = '',
+    beside: places.Entry | None = None,
 ) -> Task:
-    """A task; ``version`` is that which would calibrate a bag, ``others`` are read with it."""
-    # A calibration is the same whatever is beside it, a bag is not.
-    decide = [*files, *(others if version else ())]
-    identities = [(entry.name, entry.identity) for entry in decide]
+    """A task; a file ``beside`` is read with it, and decides nothing."""
     spacecraft, camera = map(printable, cameras.of(name))
-    text = f'{identities!r} {version} {settings[1]} {spacecraft!r} {camera!r}'
+    text = f'{[(entry.name, entry.identity) for entry in files]!r} {settings}'
     return Task(
         url=places.join(root, name),
-        stamp=hashlib.sha256(text.encode()).hexdigest() if all(i for _, i in identities) else '',
-        files=tuple(entry.url for entry in (*files, *others)),
+        stamp=hashlib.sha256(text.encode()).hexdigest(),
+        files=tuple(entry.url for entry in (*files, *filter(None, [beside]))),
         size=sum(entry.size for entry in files) if all(e.size >= 0 for e in files) else -1,
-        is_bag=bool(version),
         params=params,
-        settings=settings[0],
         spacecraft=spacecraft,
         camera=camera,
     )
@@ -262,14 +235,14 @@ def read_cameras(pattern: str, params: str) -> Cameras:
 @dataclass(frozen=True)
 class Answer:
     """
-    The row that a task gives, None where none is due, and ``calibration.json`` of a bag.
+    The row that a task gives, and ``calibration.json`` of a bag.
 
-    ``is_silence`` is True if the store of the file did not answer.
+    No row where a file cannot be reached; ``unreachable`` says why.
     """
 
-    row: trend_table.Row | None = None
+    row: trend_table.Row | None
     calibration: str = ''
-    is_silence: bool = False
+    unreachable: str = ''
 
 
 def compute(task: Task) -> Answer:
@@ -281,110 +254,44 @@ def compute(task: Task) -> Answer:
         with places.fetched(task.url, task.files, task.size) as path, one_blas_thread():
             return _answer(task, path)
     except (OSError, ModuleNotFoundError) as error:
-        return _unreachable(task, error)
+        reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
+        if task.size < 0:  # nor could the client
+            return failed(task, reason)
+        return Answer(None, unreachable=f'{task.url}: {socket.gethostname()}: {reason}')
     # One bag must not end a run over thousands, whatever is in it.
     except Exception as error:
         return failed(task, f'{type(error).__name__}: {error}')
 
 
-def failed(task: Task, error: str, is_passing: bool = False, is_silence: bool = False) -> Answer:
+def failed(task: Task, error: str) -> Answer:
     """Answer to a task that failed."""
-    row = dataclasses.replace(trend_table.failure(task.url, error), is_passing=is_passing)
-    return Answer(row=_of_task(row, task), is_silence=is_silence)
+    return Answer(_of_camera(trend_table.failure(task.stamp, task.url, error), task))
 
 
-def _unreachable(task: Task, error: OSError | ModuleNotFoundError) -> Answer:
-    """The row of a file that could not be read; it passes unless the client saw that too."""
-    reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
-    if task.size < 0:
-        return failed(task, reason)
-    is_silence = places.is_remote(task.url) and getattr(error, 'errno', None) in _NO_ANSWER
-    return failed(task, f'{socket.gethostname()}: {reason}', True, is_silence)
+def _of_camera(row: trend_table.Row, task: Task) -> trend_table.Row:
+    return dataclasses.replace(row, spacecraft=task.spacecraft, camera=task.camera)
 
 
 def _answer(task: Task, path: Path) -> Answer:
-    version = software_version() if task.is_bag else ''
+    """Answer by the file at a path; raises OSError where it cannot be read."""
+    text = ''
     try:
-        if task.is_bag and not task.params:
-            beside = path.with_name(CALIBRATION_FILE)
-            if not _is_older(beside, version):
-                return Answer()
-            settings: tuple[str | Path, ...] = (beside,)
+        if task.params:
+            campaign = calibrate_bags([path], read_setup(Path(task.params)), Topics())
+            made, kind = campaign.calibration, trend_table.COMPUTED
+            degc = _mean_temperature(campaign.observations)
+            text = product_files.calibration_text(made)
         else:
-            settings = task.settings
-        # By content: a copy counts once, a tree may move, and what is repaired is another task.
-        files = reader.files_of_bags([path]) if task.is_bag else (path,)
-        key = digest((*files, *settings), version)
-        if not task.is_bag:
-            made, temperature = _recorded(path)
-            row = trend_table.row_of(made, key, task.url, trend_table.RECORDED, temperature)
-            return Answer(_of_task(row, task))
-        setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
-        campaign = calibrate_bags([path], setup, Topics())
-        made, records = campaign.calibration, campaign.observations
-        row = trend_table.row_of(
-            made, key, task.url, trend_table.COMPUTED, _mean_temperature(records)
-        )
-        text = product_files.calibration_text(made)
-        return Answer(_of_task(row, task, path), text)
+            made, kind = product_files.read_calibration(path), trend_table.RECORDED
+            degc = _temperature(path.with_name(OBSERVATIONS_FILE))
+        row = trend_table.row_of(made, task.stamp, task.url, kind, degc)
+        return Answer(_of_camera(row, task), text)
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
             raise cause from error
         said = explained(error) if isinstance(error, StarcalError) else str(error)
         return failed(task, said.replace(str(path), task.url))
-
-
-def _of_task(row: trend_table.Row, task: Task, bag: Path = Path()) -> trend_table.Row:
-    """A row with what its task and the metadata of the bag add."""
-    names = _custom_data(bag / 'metadata.yaml') if task.is_bag else {}
-    return dataclasses.replace(
-        row,
-        stamp=task.stamp,
-        spacecraft=task.spacecraft or names.get('spacecraft', ''),
-        camera=task.camera or names.get('camera', ''),
-    )
-
-
-def _custom_data(metadata: Path) -> dict[str, str]:
-    """Texts that the recorder of a bag was given; empty where there are none."""
-    try:
-        content = untrusted.yaml_value(untrusted.read_text(metadata, untrusted.METADATA_BYTES))
-        texts = content['rosbag2_bagfile_information']['custom_data']
-        return {name: value for name, value in texts.items() if isinstance(value, str)}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
-
-
-def _recorded(path: Path) -> tuple[Calibration, float]:
-    """A recorded calibration and its mean temperature."""
-    temperature = _temperature(path.with_name(OBSERVATIONS_FILE))
-    return product_files.read_calibration(path), temperature
-
-
-def _setup_beside(bag: Path) -> Setup:
-    """The setup of the calibration beside a bag: its options and its prior."""
-    path = bag.with_name(CALIBRATION_FILE)
-    calibration = product_files.read_calibration(path)
-    prior = products.prior_of(calibration)
-    try:
-        options = untrusted.json_value(calibration.provenance['options'])
-    except (KeyError, ValueError) as error:
-        raise ProductError(f'{path}: has no options to calibrate with: give --params') from error
-    if prior is None:
-        raise ProductError(f'{path}: has no prior to calibrate with: give --params')
-    # Files that may be gone, and that observations do not need.
-    files = dict.fromkeys(('dark_frame', 'flat_field', 'bad_pixel_map', 'catalog'), '')
-    return load_setup({**options, **files}, prior=prior)
-
-
-def _is_older(calibration: Path, version: str) -> bool:
-    """True for a calibration by another version; False for none."""
-    try:
-        software = product_files.read_calibration(calibration).provenance.get('software', '')
-    except StarcalError:
-        return False  # named by its own task
-    return software != f'starcal {version}'
 
 
 def _temperature(observations: Path) -> float:
@@ -408,22 +315,25 @@ def _mean_temperature(records: Sequence[StarObservations]) -> float:
 @dataclass
 class Done:
     """
-    How many tasks were computed, failed, or have the content of a row in the table.
+    How many tasks were computed, failed, or have a row in the table.
 
-    ``silent``: how many of the failed ones a store did not answer for.
+    ``unreachable``: the reasons of those that failed and have no row; ``silent``: how many files
+    in turn a store did not give in the end.
     """
 
     computed: int = 0
     failed: int = 0
     known: int = 0
+    unreachable: list[str] = field(default_factory=list)
     silent: int = 0
 
     def count(self, table: trend_table.Table, task: Task, answer: Answer) -> None:
         """Put an answer into the table, and count it."""
         row = answer.row
-        if row is None or table.has(row):
-            table.add_seen(task.stamp, row.key if row else '')
-            self.known += row is not None
+        self.silent = 0 if row or not places.is_remote(task.url) else self.silent + 1
+        self.failed += not row or bool(row.error)
+        if row is None:
+            self.unreachable.append(answer.unreachable)
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
@@ -431,8 +341,6 @@ class Done:
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error
-        self.failed += bool(row.error)
-        self.silent += answer.is_silence
 
 
 def update(
@@ -446,8 +354,8 @@ def update(
     Add the rows of the tasks that the table does not have; a task is taken when it is submitted.
 
     A task that ends its worker process, also alone, becomes the row of a failure; the others go
-    on.  Failures that may pass are tried again, after the tasks that have no row.  The run ends
-    early, and the next one continues, once a store has not answered for 5 files.
+    on.  A file that cannot be reached has no row, so the next run tries it again.  The run ends
+    early, and the next one continues, once a store has not given 5 files in turn.
     The calibration of a bag is written beside the table before its row, and each row is on disk
     before the next, so a run that was stopped starts where it stopped.
     Raises OptionError when no scheduler answers at the address.
@@ -462,36 +370,30 @@ def update(
     on_row : callable
         Called after each answer.
     """
-    table.forget_failures([''])  # of files whose place does not tell when they change
     done, failures = Done(), table.failures()
-    waiting = _not_known(table, tasks, done, failures)
-    with contextlib.closing(_answers(waiting, workers, scheduler)) as answers:
+    with contextlib.closing(
+        _answers(_not_known(table, tasks, done, failures), workers, scheduler)
+    ) as answers:
         for task, answer in answers:
             done.count(table, task, answer)
             on_row()
             if done.silent == MOST_SILENT:
                 return done
     # A file that was repaired or removed is no longer among the tasks.
-    table.forget_failures(failures)
+    table.forget(failures)
     return done
 
 
 def _not_known(
-    table: trend_table.Table, tasks: Iterable[Task], done: Done, failures: dict[str, bool]
+    table: trend_table.Table, tasks: Iterable[Task], done: Done, failures: set[str]
 ) -> Iterator[Task]:
-    """Tasks that the table has no row of, then failures to try again; others are counted."""
-    again: list[Task] = []
+    """Tasks without a row, which are then no longer among the failures; others are counted."""
     for task in tasks:
-        is_again = failures.pop(task.stamp, False)
-        key = None if is_again else table.key_of(task.stamp)
-        if key is not None:
-            done.known += bool(key)
-            continue
-        if is_again:
-            again.append(task)
+        failures.discard(task.stamp)
+        if table.has(task.stamp, task.spacecraft, task.camera):
+            done.known += 1
         else:
             yield task
-    yield from again
 
 
 def _answers(

@@ -36,7 +36,7 @@ class Entry:
     """
     A file below a root; ``name`` is its path from there.
 
-    ``identity`` changes with the content: the etag, else size and time; empty without either.
+    ``identity`` changes with the content: the etag, else size and time, as far as they are known.
     ``size`` is -1 for a file that cannot be read.
     """
 
@@ -156,7 +156,7 @@ def _remote_entries(
 def _identity(info: dict[str, Any]) -> str:
     etag = next((str(info[name]) for name in _ETAGS if info.get(name)), '')
     time = next((str(info[name]) for name in _TIMES if info.get(name)), '')
-    return etag or (f'{info["size"]} {time}' if time else '')
+    return etag or f'{info["size"]} {time}'
 
 
 @contextlib.contextmanager

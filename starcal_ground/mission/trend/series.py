@@ -146,9 +146,9 @@ def _p_values(
     sums = sums[: len(names) + len(places)]
     sums[: len(names), 0] = np.sum((C * w) ** 2, axis=0)
     squares, along_b, along_Q = sums[:, 0], sums[:, 1], sums[:, 2:]
-    left = squares - np.sum(along_Q**2, axis=1)
+    remaining = squares - np.sum(along_Q**2, axis=1)
     # A column that the chosen ones span lowers nothing.
-    gain = np.where(left > 1e-12 * squares, along_b**2 / np.maximum(left, 1e-300), 0.0)
+    gain = np.where(remaining > 1e-12 * squares, along_b**2 / np.maximum(remaining, 1e-300), 0.0)
     freedom = n - len(chosen) - 2
     F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
     p_values = fdtrc(1, freedom, np.maximum(F, 0.0))
@@ -258,36 +258,38 @@ def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Ser
         values = np.array([row.values[k] for row in rows])
         sigmas = np.array([row.sigmas[k] for row in rows])
         unit = 'px' if name in INTRINSIC_NAMES else ''
-        series += _one(rows, name, unit, values, sigmas, max_p_value)
+        series += _known(rows, name, unit, values, sigmas, max_p_value)
     boresight = _boresight_arcsec([row.geometry for row in rows])
     of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
     for k, axis in enumerate('xy'):
         name = f'boresight about {axis}'
-        series += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
+        series += _known(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
     alignment = np.array(
         [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
     )
     sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
     for k, axis in enumerate('xyz'):
         name = f'alignment_{axis}'
-        series += _one(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
+        series += _known(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
     return series
 
 
 def findings(shown: Sequence[Series]) -> list[tuple[Series, Term]]:
     """Terms of series, a drift of several that trade with each other where it is clearest."""
-    terms = [(one, term) for one in shown for term in one.trend.terms]
+    terms = [(series, term) for series in shown for term in series.trend.terms]
     clearest: dict[object, tuple[float, str]] = {}
-    for one, term in terms:
+    for series, term in terms:
         if term.kind == 'drift':
-            group = _TRADING.get(one.name, one.name)
-            best = (abs(term.size) / term.sigma, one.name)
+            group = _TRADING.get(series.name, series.name)
+            best = (abs(term.size) / term.sigma, series.name)
             clearest[group] = max(best, clearest.get(group, best))
     names = {name for _, name in clearest.values()}
-    return [(one, term) for one, term in terms if term.kind != 'drift' or one.name in names]
+    return [
+        (series, term) for series, term in terms if term.kind != 'drift' or series.name in names
+    ]
 
 
-def _one(
+def _known(
     rows: Sequence[Row],
     name: str,
     unit: str,
@@ -310,10 +312,8 @@ def _boresight_arcsec(geometries: Sequence[CameraGeometry]) -> Floats:
     camera = geometries[0].camera
     middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
     in_tracker = [
-        Rotation.from_quat(one.star_tracker_from_camera_xyzw).apply(
-            line_of_sight(one.camera, middle)
-        )
-        for one in geometries
+        geometry.star_tracker_from_camera.apply(line_of_sight(geometry.camera, middle))
+        for geometry in geometries
     ]
     tracker_from_first = Rotation.from_quat(geometries[0].star_tracker_from_camera_xyzw)
     of_first = tracker_from_first.inv().apply(in_tracker)
@@ -340,7 +340,7 @@ def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
     """Change by each calibration against the one active at its last image."""
     made = []
     for k, row in enumerate(rows):
-        then = [one for one in active if one.since_ns <= row.last_ns and one.row != k]
+        then = [period for period in active if period.since_ns <= row.last_ns and period.row != k]
         if then:
             made.append(_change(rows, k, then[-1].row))
     return made
@@ -357,22 +357,8 @@ def _change(rows: Sequence[Row], row: int, against: int) -> Change:
     return Change(row, against, total_px, float(left_px.max()))
 
 
-def versions(rows: Sequence[Row]) -> list[Change]:
-    """Change by this version against the recorded calibration of the same images."""
-    recorded = {_images(row): k for k, row in enumerate(rows) if row.kind != COMPUTED}
-    return [
-        _change(rows, k, recorded[_images(row)])
-        for k, row in enumerate(rows)
-        if row.kind == COMPUTED and _images(row) in recorded
-    ]
-
-
 def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """
-    Calibrations by spacecraft, camera, frame name, size and lens model; the largest group first.
-
-    Of the same images the newest version counts, so that a series has each once.
-    """
+    """Calibrations by spacecraft, camera, frame, size and lens model; the largest group first."""
     by_name: dict[str, list[Row]] = {}
     for row in rows:
         if row.error:
@@ -384,23 +370,16 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return dict(sorted(by_name.items(), key=lambda item: (-len(item[1]), item[0])))
 
 
-def newest_of_each(rows: Sequence[Row]) -> list[Row]:
+def distinct(rows: Sequence[Row]) -> list[Row]:
     """
-    Rows of different calibrations, each once.
+    Rows of different calibrations, the first of each.
 
-    Without the recorded ones whose images this version has calibrated again, and without copies: a
-    state folder has a calibration once more for each activation.
+    A state folder has a calibration once more for each activation, and a folder may be copied.
     """
-    again = {_images(row) for row in rows if row.kind == COMPUTED}
-    newest: dict[object, Row] = {}
+    first: dict[object, Row] = {}
     for row in rows:
-        if row.kind == COMPUTED or _images(row) not in again:
-            newest.setdefault((_images(row), row.kind, tuple(row.values)), row)
-    return list(newest.values())
-
-
-def _images(row: Row) -> tuple[int, int]:
-    return row.first_ns, row.last_ns
+        first.setdefault((row.first_ns, row.last_ns, row.values), row)
+    return list(first.values())
 
 
 _OPEN = 'too few to tell'

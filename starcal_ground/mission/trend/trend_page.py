@@ -75,16 +75,16 @@ def write_page(
         failures += bad[: _LISTED - len(failures)]
         failed, count = failed + len(bad), count + len(rows) - len(bad)
         for name, group in trends.groups(rows).items():
-            one = _judged(name, group, max_p_value)
-            lines.append((one.overview, one.line))
+            camera = _judged(name, group, max_p_value)
+            lines.append((camera.overview, camera.line))
             times += [group[0].time_ns, group[-1].time_ns]
-            drawn = sorted([*drawn, one], key=_order)[:_DRAWN]
+            drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
     lines.sort(key=lambda line: not line[0].needs_attention)
     text = page_template('trend.html').render(
         root=printable(root),
         lines=[(overview, *line) for overview, line in lines] if len(lines) > 1 else (),
         attention=sum(overview.needs_attention for overview, _ in lines),
-        cameras=[_camera(one) for one in drawn],
+        cameras=[_camera(camera) for camera in drawn],
         failures=[(row.path, row.error) for row in failures],
         failure_count=failed,
         count=count,
@@ -99,14 +99,14 @@ def write_page(
     return Page(path, count, words, failed, tuple(failures))
 
 
-def _order(one: _Judged) -> tuple[bool, int, str]:
+def _order(camera: _Judged) -> tuple[bool, int, str]:
     """Sort key of the cameras with figures."""
-    return not one.overview.needs_attention, -len(one.group), one.overview.name
+    return not camera.overview.needs_attention, -len(camera.group), camera.overview.name
 
 
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
 def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
-    rows = trends.newest_of_each(group)
+    rows = trends.distinct(group)
     active = trends.activations(group)
     shown = trends.series_of(rows, max_p_value)
     new = trends.changes(group, active[-1:])
@@ -120,30 +120,21 @@ def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
 def _camera(judged: _Judged) -> dict[str, object]:
     """The part of the page on one camera."""
     group, shown = judged.group, judged.shown
-    rows = trends.newest_of_each(group)
+    rows = trends.distinct(group)
     active = trends.activations(group)
     new = trends.changes(group, active)
     charts = [_change_chart(group, new)] if new else []
-    charts += [_chart(one, rows) for one in shown]
+    charts += [_chart(series, rows) for series in shown]
     is_stable, verdict = verdict_of(rows, group, active, new, shown)
     return {
         'name': judged.overview.name,
         'headline': _HEADLINES[is_stable],
         'verdict': verdict,
         'rows': rows,
-        'findings': [_finding(one, term, rows) for one, term in trends.findings(shown)],
+        'findings': [_finding(series, term, rows) for series, term in trends.findings(shown)],
         'charts': charts,
-        'active': [_active(one, group, new) for one in active],
-        'versions': [
-            (
-                utc_text(group[v.against].time_ns)[:10],
-                group[v.against].software,
-                group[v.row].software,
-                f'{v.line_of_sight_px:.3f}',
-            )
-            for v in trends.versions(group)
-        ],
-        'assumed': any(one.assumed for one in active),
+        'active': [_active(period, group, new) for period in active],
+        'assumed': any(period.assumed for period in active),
     }
 
 
@@ -171,7 +162,7 @@ def verdict_of(
     changes = []
     for kind, word in words.items():
         names = list(
-            dict.fromkeys(one.name for one, t in trends.findings(shown) if t.kind == kind)
+            dict.fromkeys(series.name for series, t in trends.findings(shown) if t.kind == kind)
         )
         changes += [f'{word} {", ".join(names)}'] if names else []
     text = f'Found: {"; ".join(changes)}.' if changes else 'No step or drift was found.'
@@ -213,15 +204,15 @@ def _finding(series: trends.Series, term: trends.Term, rows: Sequence[Row]) -> d
 
 
 def _active(
-    one: trends.Active, rows: Sequence[Row], new: Sequence[trends.Change]
+    period: trends.Active, rows: Sequence[Row], new: Sequence[trends.Change]
 ) -> tuple[str, str, str, str]:
     """Times of a calibration, its name, and the largest change that was missed meanwhile."""
-    row = rows[one.row]
-    missed = [c.line_of_sight_px for c in new if c.against == one.row]
-    until = utc_text(one.until_ns)[:16] if one.until_ns else 'now'
+    row = rows[period.row]
+    missed = [c.line_of_sight_px for c in new if c.against == period.row]
+    until = utc_text(period.until_ns)[:16] if period.until_ns else 'now'
     name = f'{row.number}' if row.number else Path(row.path).parent.name
     worst = f'{max(missed):.3f}' if missed else 'none made'
-    return utc_text(one.since_ns)[:16], until, name, worst
+    return utc_text(period.since_ns)[:16], until, name, worst
 
 
 def _chart(series: trends.Series, rows: Sequence[Row]) -> svg.Chart:

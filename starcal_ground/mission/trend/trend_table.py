@@ -6,9 +6,6 @@ Each row is a transaction of its own, so a kill loses the calibration that was r
 other.  Only the client opens the file; workers send it their rows.  The journal is SQLite's
 default and not the write-ahead log, whose index is memory shared by all processes that have the
 file open: between machines on a network file system there is none.
-
-The table ``seen`` has the stamps of files whose row is that of another file with the same
-content, or that need no row.
 """
 
 from __future__ import annotations
@@ -16,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import contextlib
 from dataclasses import dataclass
-import hashlib
 import json
 import math
 import os
@@ -43,7 +39,7 @@ from starcal_ros.untrusted import check_text, json_value, regular_file
 RECORDED, COMPUTED, FAILED = 'recorded', 'computed', 'failed'
 _LONGEST = 20_000  # characters of a text: a path has 4096, each of up to four after `printable`
 _LONGEST_ERROR = 2000
-_LONGEST_NAME, _LONGEST_KEY = 100, 16  # of a bag, and of its key, in the name of a folder
+_LONGEST_NAME, _LONGEST_STAMP = 100, 16  # of a bag, in the name of a folder
 _MOST, _LEAST = 1e15, 1e-30  # of a number whose square and its inverse must stay finite
 
 
@@ -54,16 +50,15 @@ class Row:
 
     Raises ValueError in one line, for a row that the page could not show.
 
-    ``key`` is the digest of what the row was made from, ``stamp`` that of name, size and time, or
-    etag, of the file when it was read.  ``kind`` is ``recorded`` (read from a file), ``computed``
-    (from a bag by this version) or ``failed``, which may pass (``is_passing``): the file could
-    not be reached.  Times are of the middle, first and last image; ``active_since_ns`` is 0 where
-    it was not activated.  ``sigmas`` has those of ``values``, then of three alignment angles
-    (rad); ``boresight_sigma_arcsec`` is about x and y of the camera, of the middle of the
-    detector, in the star tracker frame.
+    ``stamp`` is the digest of name, size and time, or etag, of the file when it was read.
+    ``kind`` is ``recorded`` (read from a file), ``computed`` (from a bag) or ``failed``.  Times
+    are of the middle, first and last image; ``active_since_ns`` is 0 where it was not activated.
+    ``sigmas`` has those of ``values``, then of three alignment angles (rad);
+    ``boresight_sigma_arcsec`` is about x and y of the camera, of the middle of the detector, in
+    the star tracker frame.
     """
 
-    key: str
+    stamp: str
     path: str
     kind: str
     error: str = ''
@@ -92,8 +87,6 @@ class Row:
     boresight_sigma_arcsec: tuple[float, ...] = ()
     spacecraft: str = ''
     camera: str = ''
-    stamp: str = ''
-    is_passing: bool = False
 
     def __post_init__(self) -> None:
         """Check what `series` and `trend_page` rely on."""
@@ -121,7 +114,7 @@ class Row:
 
 
 def row_of(
-    calibration: Calibration, key: str, path: str, kind: str, temperature_degc: float
+    calibration: Calibration, stamp: str, path: str, kind: str, temperature_degc: float
 ) -> Row:
     """Row of a calibration."""
     camera, terms = calibration.geometry.camera, calibration.temperature
@@ -129,7 +122,7 @@ def row_of(
         temperature_degc = terms.reference_degc
     first_ns = calibration.first_image_ns or calibration.time_ns
     return Row(
-        key=key,
+        stamp=stamp,
         path=printable(path),
         kind=kind,
         software=calibration.provenance.get('software', ''),
@@ -167,13 +160,13 @@ def kept_name(row: Row) -> str:
         urllib.parse.quote(name, safe=' ') for name in (row.spacecraft, row.camera, bag)
     )
     series = f'spacecraft={spacecraft or "-"}/camera={camera or "-"}'
-    return f'{series}/{bag[:_LONGEST_NAME]}-{row.key[:_LONGEST_KEY]}'
+    return f'{series}/{bag[:_LONGEST_NAME]}-{row.stamp[:_LONGEST_STAMP]}'
 
 
-def failure(url: str, error: str) -> Row:
-    """Row of a calibration or bag that this version cannot use; a file has one at a time."""
+def failure(stamp: str, url: str, error: str) -> Row:
+    """Row of a calibration or bag that this version cannot use."""
     return Row(
-        key=hashlib.sha256(repr(url).encode()).hexdigest(),
+        stamp=stamp,
         path=printable(url),
         kind=FAILED,
         error=printable(' '.join(error.split()) or 'failed')[:_LONGEST_ERROR],
@@ -199,12 +192,10 @@ _LISTS = [name for name, kind in _COLUMNS.items() if kind not in _TYPES]  # as J
 _FLAGS = [name for name, kind in _COLUMNS.items() if kind is bool]
 _NAMES = ', '.join(f'"{name}"' for name in _COLUMNS)
 _SCHEMA = (
-    'CREATE TABLE calibration ({}, PRIMARY KEY (key)) STRICT'.format(
+    'CREATE TABLE calibration ({}, PRIMARY KEY (stamp)) STRICT'.format(
         ', '.join(f'"{name}" {_TYPES.get(kind, "text")}' for name, kind in _COLUMNS.items())
     ),
-    'CREATE TABLE seen (stamp text PRIMARY KEY, key text NOT NULL) STRICT',
-    'CREATE INDEX of_camera ON calibration (spacecraft, camera, time_ns, key)',
-    "CREATE UNIQUE INDEX of_stamp ON calibration (stamp) WHERE stamp != ''",
+    'CREATE INDEX of_camera ON calibration (spacecraft, camera, time_ns, stamp)',
 )
 
 
@@ -227,35 +218,19 @@ class Table:
                 if self._schema() != {*_SCHEMA}:
                     raise ValueError('a database of another program or version')
 
-    def key_of(self, stamp: str) -> str | None:
-        """Key of the row of a stamp; empty where none is due, None if not known."""
-        with self._naming():
-            keys = self._db.execute(
-                "SELECT key FROM calibration WHERE stamp = ?1 AND stamp != '' UNION ALL "
-                'SELECT key FROM seen WHERE stamp = ?1 AND '
-                "(key = '' OR EXISTS (SELECT 1 FROM calibration AS c WHERE c.key = seen.key))",
-                (stamp,),
-            ).fetchone()
-        return keys and str(keys[0])
-
-    def has(self, row: Row) -> bool:
-        """True if a row of the same content and camera is there that is no failure."""
+    def has(self, stamp: str, spacecraft: str, camera: str) -> bool:
+        """True for the row of a stamp and camera, recorded or made by this version."""
         with self._naming():
             return bool(
                 self._db.execute(
-                    'SELECT 1 FROM calibration WHERE key = ? AND spacecraft = ? AND camera = ? '
-                    "AND error = ''",
-                    (row.key, row.spacecraft, row.camera),
+                    'SELECT 1 FROM calibration WHERE stamp = ? AND spacecraft = ? AND camera = ? '
+                    'AND (kind = ? OR software = ?)',
+                    (stamp, spacecraft, camera, RECORDED, f'starcal {software_version()}'),
                 ).fetchone()
             )
 
     def add(self, row: Row) -> None:
-        """
-        Add a row.
-
-        It replaces a row of another camera with its key, since names of cameras change, and the
-        failure with its stamp.
-        """
+        """Add a row; it replaces that of its stamp, of another version or name of the camera."""
         values = json_object(row)
         values.update({name: json.dumps(values[name]) for name in _LISTS})
         places = ', '.join(f':{name}' for name in _COLUMNS)
@@ -264,27 +239,21 @@ class Table:
                 f'INSERT OR REPLACE INTO calibration ({_NAMES}) VALUES ({places})', values
             )
 
-    def add_seen(self, stamp: str, key: str) -> None:
-        """Note that a stamp is that of a row of another file, or needs none."""
-        if stamp:
-            with self._naming():
-                self._db.execute('INSERT OR REPLACE INTO seen VALUES (?, ?)', (stamp, key))
-
-    def failures(self) -> dict[str, bool]:
-        """Stamps of failures; True for those to try again: passing, or of another version."""
+    def failures(self) -> set[str]:
+        """Stamps of failures."""
         with self._naming():
             return {
-                stamp: is_passing or software != f'starcal {software_version()}'
-                for stamp, is_passing, software in self._db.execute(
-                    "SELECT stamp, is_passing, software FROM calibration WHERE error != ''"
+                stamp
+                for (stamp,) in self._db.execute(
+                    'SELECT stamp FROM calibration WHERE kind = ?', (FAILED,)
                 )
             }
 
-    def forget_failures(self, stamps: Iterable[str]) -> None:
-        """Remove the failures of some stamps."""
+    def forget(self, stamps: Iterable[str]) -> None:
+        """Remove the rows of some stamps."""
         with self.transaction():
             self._db.executemany(
-                "DELETE FROM calibration WHERE error != '' AND stamp = ?", zip(stamps, strict=True)
+                'DELETE FROM calibration WHERE stamp = ?', zip(stamps, strict=True)
             )
 
     def names(self) -> list[tuple[str, str]]:
@@ -301,7 +270,7 @@ class Table:
             with self._naming():
                 rows = self._db.execute(
                     f'SELECT {_NAMES} FROM calibration WHERE spacecraft = ? AND camera = ? '
-                    'ORDER BY time_ns, key',
+                    'ORDER BY time_ns, stamp',
                     camera,
                 ).fetchall()
                 of_camera = [_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
@@ -310,7 +279,7 @@ class Table:
     def rows(self) -> list[Row]:
         """All rows, in order of time."""
         rows = (row for rows in self.cameras() for row in rows)
-        return sorted(rows, key=lambda row: (row.time_ns, row.key))
+        return sorted(rows, key=lambda row: (row.time_ns, row.stamp))
 
     def write_parquet(self) -> Path:
         """Write the rows as a Parquet file beside the table, a row group for each camera."""

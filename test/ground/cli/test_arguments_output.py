@@ -162,7 +162,6 @@ WRITING: dict[str, str] = {
     'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
     'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
     'lookup HERE/out -o HERE/o/a.npz --points 2': 'a.npz',
-    'lookup HERE/out -o HERE/o/a.fits --points 2': 'a.fits',
     'simulate --scenario tiny -o HERE/o': (
         'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
     ),
@@ -175,10 +174,8 @@ WRITING: dict[str, str] = {
     'trend HERE/out -o HERE/o': 'trend.html',
     'export HERE/out --to c -o HERE/o': 'starcal_camera.c starcal_camera.h',
     'export HERE/out --to c --table -o HERE/o': 'starcal_camera.bin',
-    'export HERE/out --to csv -o HERE/o': 'lines_of_sight.csv',
     'export HERE/out --to giant -o HERE/o': 'giant_camera.json',
     'export HERE/out --to isd --spacecraft-id -9 -o HERE/o': 'camera_isd.json camera_isis.ti',
-    'export HERE/out --to kalibr --image-topic /a -o HERE/o': 'camchain.yaml',
     'export HERE/out --to mrcal -o HERE/o': 'camera.cameramodel',
     'export HERE/out --to opencv -o HERE/o': 'opencv.yaml',
     'export HERE/out --to ros -o HERE/o': 'camera_info.yaml alignment.yaml',

@@ -291,8 +291,8 @@ def test_lookup_writes_the_columns_of_the_interface_document(
             ['give 0.286 px (a table of 2000^2 pixels)'],
         ),
         ('a.csv', ('--step', '641'), ['--step', '641 px']),
-        ('a.txt', (), ['a.txt', '.csv', '.npz', '.fits']),
-        ('a', (), ['.csv', '.npz', '.fits']),
+        ('a.fits', (), ['a.fits', '.csv', '.npz']),
+        ('a', (), ['.csv', '.npz']),
         ('none/a.csv', (), ['none', 'cannot be written']),
     ],
 )

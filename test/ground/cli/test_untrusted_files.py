@@ -61,7 +61,7 @@ FILES = {
     'residuals.npz': 'report HERE/out',
     'observations.mcap': 'report HERE/out',
     'DIR of lookup': 'lookup FILE -o HERE/o.csv',
-    'DIR of export': 'export FILE --to csv -o HERE/o',
+    'DIR of export': 'export FILE --to opencv -o HERE/o',
     '--kernels': 'export HERE/out --to ck --spacecraft-id -999 -o HERE/o --kernels FILE',
     'kernel of a meta-kernel': (
         'export HERE/out --to ck --spacecraft-id -999 -o HERE/o --kernels HERE/meta.tm'

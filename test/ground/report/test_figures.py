@@ -36,26 +36,6 @@ def noise(seed: int) -> Residuals:
     )
 
 
-def test_the_spectrum_of_noise_is_that_of_noise() -> None:
-    """The mean over 20 draws of every wave number is within 15 % of the expectation."""
-    found = [figures.wave_amplitudes(noise(seed), CAMERA) for seed in range(20)]
-    power = np.mean([amplitude**2 for _, amplitude, _ in found], axis=0)
-    expected_px = 2 * SIGMA_PX / np.sqrt(STARS)
-    # The first ring has 8 coefficients, half of them conjugates, on 2 axes: 160 squares, 11 %.
-    assert np.sqrt(power) == pytest.approx(np.full(16, expected_px), rel=0.15)
-    assert found[0][2] == pytest.approx(expected_px, rel=0.02)
-
-
-def test_a_wave_is_found_at_its_frequency() -> None:
-    plain = noise(1)
-    waves = plain.residual_px.copy()
-    waves[:, 0] += 0.05 * np.sin(2 * np.pi * 6 * plain.measured_px[:, 0] / 640)
-    moved = dataclasses.replace(plain, residual_px=waves)
-    number, amplitude, noise_px = figures.wave_amplitudes(moved, CAMERA)
-    assert number[np.argmax(amplitude)] == 6
-    assert amplitude[5] > 3 * noise_px > amplitude[[0, 1, 2, 3, 7, 8, 9]].max()
-
-
 def test_means_in_bins_and_their_errors() -> None:
     x = np.repeat([0.5, 1.5, 2.5], [100, 9, 25])
     y = np.concatenate([np.tile([1.0, 3.0], 50), np.ones(9), np.full(25, -2.0)])

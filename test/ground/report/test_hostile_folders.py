@@ -56,7 +56,7 @@ def test_a_calibration_with_odd_values_is_read_or_refused_in_one_line(
 
 
 def _in_pictures(here: Path, name: str) -> Path:
-    write_thumbnails([Thumbnail(1, '', 0, b'\xff\xd8\xff')], here / THUMBNAILS_FOLDER)
+    write_thumbnails([Thumbnail(1, b'\xff\xd8\xff')], here / THUMBNAILS_FOLDER)
     return here / THUMBNAILS_FOLDER / name
 
 

@@ -47,7 +47,6 @@ FIGURES = (
     'histogram',
     'lens_field',
     'field',
-    'spectrum',
     'magnitude',
     'colour',
     'phase',

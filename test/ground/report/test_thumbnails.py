@@ -11,13 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ground.report.thumbnails import (
-    Album,
-    read_thumbnails,
-    star_of,
-    Thumbnail,
-    write_thumbnails,
-)
+from starcal_ground.report.thumbnails import Album, read_thumbnails, Thumbnail, write_thumbnails
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.errors import ProductError
 from starcal_ros.records import CameraGeometry, Image, StarObservations
@@ -27,7 +21,6 @@ GEOMETRY = CameraGeometry(CAMERA, np.array([0.0, 0, 0, 1]))
 RNG = np.random.default_rng(5)
 PIXELS = RNG.poisson(40, (512, 640)).astype(np.uint8)
 PIXELS[100, 200] = 255
-CUT_OUTS = (('blend', 0), ('blend', 1), ('blend', 2), ('saturated', 5), ('faint', 0))
 
 
 def observed(time_ns: int, refusal: str = '') -> StarObservations:
@@ -60,7 +53,6 @@ def test_few_are_kept_of_many_and_evenly() -> None:
     assert steps.max() - steps.min() <= 2
     assert used[-1] > 400 - 2 * steps.max()
     assert [one.observations.time_ns for one in album.refused['no_stars']] == [0, 50]
-    assert len(album.stars['saturated']) == 6
 
 
 @pytest.mark.parametrize('expected', [10, 400, 500, 4000])
@@ -78,34 +70,6 @@ def test_all_are_kept_of_few() -> None:
         3,
         4,
     ]
-
-
-def test_a_star_is_in_the_middle_of_its_picture() -> None:
-    thumbnail = album_of(1, refused_every=2).stars['saturated'][0]
-    picture = cv2.imdecode(np.frombuffer(thumbnail.encoded, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert picture is not None
-    assert picture.argmax() == 12 * 25 + 12 and picture.shape == (25, 25)
-
-
-def test_a_star_outside_the_image_does_no_harm() -> None:
-    album = Album()
-    for place in ([-5.0, 3.0], [639.0, 511.0], [1e9, -1e9], [float('nan'), 4.0]):
-        record = observed(1)
-        record.refused_px[0] = place
-        album.show(Image(1, PIXELS), record, GEOMETRY)
-    assert len(album.stars['saturated']) == 4
-
-
-def test_a_thumbnail_finds_its_star() -> None:
-    record = dataclasses.replace(
-        observed(1),
-        refused_stars={'blend': 2, 'saturated': 1},
-        refused_catalog_id=np.array([7, 8, 9]),
-        refused_px=np.zeros((3, 2), np.float32),
-        refused_reason=np.array([0, 1, 0], np.uint8),
-    )
-    stars = [star_of(Thumbnail(1, reason, n, b''), record) for reason, n in CUT_OUTS]
-    assert stars == [7, 9, 7, 8, None]
 
 
 def test_a_large_image_is_reduced_before_it_is_drawn() -> None:
@@ -142,6 +106,8 @@ def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path: Path) -> No
     album = album_of(3, refused_every=2)
     write_thumbnails(album.thumbnails(), folder)
     assert set(read_thumbnails(folder)) == set(album.thumbnails())
+    (folder / 'expected_1.png').write_bytes(b'\x89PNG\r\n\x1a\n')
+    assert [one.is_expected for one in read_thumbnails(folder)] == [False, False, True, False]
     assert (folder / 'notes.txt').read_text() == 'mine'
     assert read_thumbnails(tmp_path / 'nowhere') == ()
 
@@ -150,13 +116,13 @@ def test_only_pictures_of_the_folder_are_read(tmp_path: Path) -> None:
     """No link, FIFO, huge file or other content: it would be in the report."""
     secret, folder = tmp_path / 'secret', tmp_path / 'thumbnails'
     secret.write_bytes(b'\xff\xd8\xff secret')
-    own = Thumbnail(1, '', 0, b'\xff\xd8\xff')
+    own = Thumbnail(1, b'\xff\xd8\xff')
     write_thumbnails([own], folder)
     (folder / 'image_2.jpg').symlink_to(secret)
     os.mkfifo(folder / 'image_3.jpg')
     (folder / 'image_4.jpg').write_bytes(b'no picture')
     (folder / 'image_5.jpg').write_bytes(b'\xff\xd8\xff' + bytes(2 << 20))
-    (folder / 'star_6_blend_0.png').mkdir()
+    (folder / 'expected_6.png').mkdir()
     assert read_thumbnails(folder) == (own,)
     (tmp_path / 'link').symlink_to(folder)
     assert read_thumbnails(tmp_path / 'link') == ()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.mission.export.export_formats import write_lookup_table
+from starcal_ground.cli.commands.lookup import write_lookup_table
 from starcal_ros.assessment.lookup import (
     COLUMNS,
     Derivatives,
@@ -220,19 +220,7 @@ def test_npz_comes_back_to_the_last_bit(table: LineOfSightTable, tmp_path: Path)
             np.testing.assert_array_equal(archive[name], values, name)
 
 
-def test_fits_comes_back_to_the_last_bit(table: LineOfSightTable, tmp_path: Path) -> None:
-    fits = pytest.importorskip('astropy.io.fits')
-    write_lookup_table(table, tmp_path / 'a.fits')
-    with fits.open(tmp_path / 'a.fits') as file:
-        made = file['LINES_OF_SIGHT']
-        assert tuple(made.columns.names) == COLUMNS
-        units = [unit or '' for unit in made.columns.units]
-        assert units == ['pix', 'pix', '', '', '', 'arcsec', 'arcsec']
-        for name, values in columns_of(table).items():
-            np.testing.assert_array_equal(made.data[name], values, name)
-
-
-@pytest.mark.parametrize('name', ['a.txt', 'a', 'a.CSV.gz'])
+@pytest.mark.parametrize('name', ['a.txt', 'a.fits', 'a', 'a.CSV.gz'])
 def test_another_ending_is_refused(table: LineOfSightTable, tmp_path: Path, name: str) -> None:
     with pytest.raises(ProductError, match=f'{name}: ends neither in .csv'):
         write_lookup_table(table, tmp_path / name)

@@ -82,7 +82,7 @@ def broken(*_: object) -> None:
         ('starcal_ground.report.page._context', 'report'),
         ('starcal_ground.report.page.page_template', 'report'),
         ('starcal_ground.report.thumbnails.annotate_reduced', 'pictures of images'),
-        ('starcal_ground.report.thumbnails._cut_out', 'pictures of images'),
+        ('starcal_ground.report.thumbnails._reduced', 'pictures of images'),
     ],
 )
 def test_a_drawing_that_fails_costs_the_drawing_only(

@@ -36,7 +36,7 @@ def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, capsys) -
 
 
 def test_export_states_the_cost_of_each_part(folder: Path, tmp_path: Path, capsys) -> None:
-    assert main(f'export {folder} --to kalibr -o {tmp_path}'.split()) == 0
+    assert main(f'export {folder} --to opencv -o {tmp_path}'.split()) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')
 
@@ -60,11 +60,11 @@ def test_export_warns_of_a_refused_calibration(folder, tmp_path, capsys, accepte
     reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
     judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
     write_calibration(judged, folder / 'calibration.json')
-    assert main(f'export {folder} --to csv -o {tmp_path}'.split()) == 0
+    assert main(f'export {folder} --to opencv -o {tmp_path}'.split()) == 0
     expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
     assert capsys.readouterr().err.splitlines() == expected
 
 
 def test_export_needs_a_calibration(tmp_path: Path, capsys) -> None:
-    assert main(f'export {tmp_path} --to csv -o {tmp_path}'.split()) == 2
+    assert main(f'export {tmp_path} --to opencv -o {tmp_path}'.split()) == 2
     assert 'holds no calibration.json' in capsys.readouterr().err

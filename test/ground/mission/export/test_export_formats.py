@@ -85,36 +85,6 @@ def parts(done: Exported) -> list[str]:
     return [loss.part for loss in done.losses]
 
 
-@pytest.mark.parametrize('model', ['plumb_bob', 'tilted', 'equidistant'])
-def test_a_camchain_of_kalibr_has_the_error_it_states(tmp_path: Path, model: str) -> None:
-    made = calibration(model)
-    done = export(made, 'kalibr', tmp_path, None, topic='/opnav/image_raw')
-    cam = yaml.safe_load(done.files[0].read_text())['cam0']
-    assert cam['resolution'] == [1296, 1024] and cam['rostopic'] == '/opnav/image_raw'
-    fx, fy, cx, cy = cam['intrinsics']
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    # kalibr's models are those of OpenCV with four coefficients.
-    fisheye = cam['distortion_model'] == 'equidistant'
-    assert fisheye or cam['distortion_model'] == 'radtan'
-    pixels, directions = grid_of(made)
-    D = np.array(cam['distortion_coeffs'])
-    assert len(D) == 4
-    found_px = worst_px(opencv_pixels(directions, K, D, fisheye), pixels)
-    assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
-    T = np.array(cam['T_cam_imu'])
-    tracker_from_camera = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw)
-    assert np.abs(T[:3, :3].T - tracker_from_camera.as_matrix()).max() < 1e-15
-    assert (T[:3, 3] == 0).all()
-
-
-def test_kalibr_without_k3_costs_more_than_the_skew_alone(tmp_path: Path) -> None:
-    made = calibration('plumb_bob')
-    strong = made.geometry.camera.replace(k3=40.0)
-    made = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=strong))
-    opencv, kalibr = (export(made, kind, tmp_path, None) for kind in ('opencv', 'kalibr'))
-    assert kalibr.worst_px > opencv.worst_px > 0
-
-
 def test_ros_files_are_the_camera_without_skew_and_the_transform(tmp_path: Path) -> None:
     made = calibration(with_field=True)
     done = export(made, 'ros', tmp_path, None)
@@ -181,16 +151,6 @@ def test_a_model_of_mrcal_has_the_error_it_states(tmp_path: Path, model: str) ->
     assert content['extrinsics'][3:] == [0.0, 0.0, 0.0]
 
 
-def test_csv_is_the_table_of_lines_of_sight(tmp_path: Path) -> None:
-    made = calibration(with_field=True)
-    done = export(made, 'csv', tmp_path, None)
-    table = np.genfromtxt(done.files[0], delimiter=',', names=True)
-    assert len(table) == 65 * 65
-    pixels = np.c_[table['u_px'], table['v_px']]
-    expected = line_of_sight(made.geometry.camera, pixels)
-    assert (np.c_[table['x'], table['y'], table['z']] == expected).all()
-
-
 def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path: Path) -> None:
     done = export(calibration(skew=0.0, temperature=True), 'opencv', tmp_path, None)
     cost = {loss.part: loss.cost_px for loss in done.losses}
@@ -223,7 +183,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
         sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
     )
     names = SpiceNames(-999, camera_frame='CAMERA', star_tracker_frame='TRACKER')
-    for path in export(made, kind, tmp_path, names, topic=HOSTILE).files:
+    for path in export(made, kind, tmp_path, names).files:
         text = path.read_text('ascii')
         assert all(line.isprintable() for line in text.split('\n')), path
         READERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
@@ -239,7 +199,7 @@ def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:
         export(calibration(), 'opencvv', tmp_path, None)
     with pytest.raises(OptionError, match=r'--spacecraft-id'):
         export(calibration(), 'spice', tmp_path, None)
-    assert len(FORMATS) == 10
+    assert len(FORMATS) == 8
 
 
 def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
@@ -257,7 +217,6 @@ def test_a_camera_without_alignment_is_not_exported_with_one(kind: str, tmp_path
 
 ROTATIONS = {
     'opencv': 'rotation:',
-    'kalibr': 'T_cam_imu',
     'giant': '"star_tracker_from_camera_xyzw": [',
     'mrcal': "'extrinsics': [0.1",
 }
@@ -328,7 +287,7 @@ def test_isd_and_isis_keywords_have_the_errors_they_state(
     assert isis_px < 1.0
 
 
-@pytest.mark.parametrize('form', ['opencv', 'kalibr', 'ros'])
+@pytest.mark.parametrize('form', ['opencv', 'ros'])
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
 def test_an_exported_camera_is_read_as_a_prior_camera(
     tmp_path: Path, form: str, model: str

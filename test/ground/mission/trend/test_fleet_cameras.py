@@ -5,9 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 import re
-import shutil
 
-from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
 from trend_missions import write  # type: ignore[import-not-found]
 
@@ -64,17 +62,3 @@ def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path: Path) -> None
     assert sorted(map(len, groups(rows).values())) == [4, 4]
     page = (tmp_path / 'out/trend.html').read_text()
     assert re.findall('<h2>([AB])', page) == ['A', 'B']
-
-
-@pytest.mark.slow
-def test_the_metadata_of_a_bag_names_them(few_images: Path, tmp_path: Path) -> None:
-    shutil.copytree(few_images, tmp_path / 'fleet/one')
-    metadata = tmp_path / 'fleet/one/metadata.yaml'
-    text = metadata.read_text()
-    named = re.sub('custom_data: .*', 'custom_data: {spacecraft: A, camera: nav, x: 1}', text)
-    assert named != text
-    metadata.write_text(named)
-    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
-    assert main([*line, '--params', str(TINY / 'params.yaml')]) == 0
-    (row,) = Table(tmp_path / 'out').rows()
-    assert (row.error, row.spacecraft, row.camera) == ('', 'A', 'nav')

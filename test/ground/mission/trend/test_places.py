@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from pathlib import Path
 import shutil
@@ -15,7 +14,7 @@ from trend_missions import make_mission, trend, write  # type: ignore[import-not
 
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet, places
-from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
+from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.trend_table import Table
 
 
@@ -33,34 +32,19 @@ def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
     def unread(*_: object) -> None:
         raise AssertionError('a file is read')
 
-    monkeypatch.setattr(fleet, 'digest', unread)
     monkeypatch.setattr(fleet, 'compute', unread)
     assert trend(mission) == 0
     assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
 
 
-def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(
-    mission: Path, monkeypatch
-) -> None:
+def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(mission: Path) -> None:
     found = list(fleet.find(str(mission), Cameras()))
     away = mission.rename(mission.parent / 'unmounted')
-    assert fleet.update(Table(mission.parent), found) == fleet.Done(failed=8)
-    row = Table(mission.parent).rows()[0]
-    assert row.is_passing and 'not seen by this worker; mount it' in row.error
+    done = fleet.update(Table(mission.parent), found)
+    assert (done.failed, len(done.unreachable), Table(mission.parent).rows()) == (8, 8, [])
+    assert 'not seen by this worker; mount it' in done.unreachable[0]
     away.rename(mission)
-    # After the files that were not tried before: those that never answer hold up no others.
-    new = dataclasses.replace(found.pop(), stamp='new')
-    computed: list[Task] = []
-    compute = fleet.compute
-
-    def noted(task: Task) -> Answer:
-        computed.append(task)
-        return compute(task)
-
-    monkeypatch.setattr(fleet, 'compute', noted)
-    assert fleet.update(Table(mission.parent), [*found, new]) == fleet.Done(computed=8)
-    assert [task.url for task in computed] == [new.url, *(task.url for task in found)]
-    assert [row.error for row in Table(mission.parent).rows()] == [''] * 8
+    assert fleet.update(Table(mission.parent), found) == fleet.Done(computed=8)
 
 
 def test_relative_paths_are_made_absolute(mission: Path, monkeypatch) -> None:

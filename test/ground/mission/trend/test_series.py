@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 from trend_rows import DAY_NS, made  # type: ignore[import-not-found]
 
-from starcal_ground.mission.trend.series import (
-    activations,
-    changes,
-    groups,
-    newest_of_each,
-    series_of,
-    versions,
-)
-from starcal_ground.mission.trend.trend_table import COMPUTED, FAILED, Row
+from starcal_ground.mission.trend.series import activations, changes, distinct, groups, series_of
+from starcal_ground.mission.trend.trend_table import FAILED, Row
 from starcal_ros.constants import ARCSECOND_RAD
 
 
@@ -60,19 +53,9 @@ def test_refused_calibrations_alone_were_never_active() -> None:
     assert activations(rows) == [] and changes(rows, []) == []
 
 
-def test_a_newer_version_of_the_same_images_is_compared_and_counts_once() -> None:
-    old = made(1)
-    new = dataclasses.replace(made(1, (5.0, 0, 0)), kind=COMPUTED, key='new', software='starcal 9')
-    rows = [old, new, made(2)]
-    (pair,) = versions(rows)
-    assert (pair.against, pair.row) == (0, 1)
-    assert pair.line_of_sight_px == pytest.approx(5 * ARCSECOND_RAD * 3641.5, rel=0.05)
-    assert [row.key for row in newest_of_each(rows)] == ['new', '2']
-
-
 def test_a_calibration_that_was_activated_twice_counts_once_in_a_series() -> None:
     rows = [made(1, active_since_ns=5), made(2, active_since_ns=8), made(1, active_since_ns=9)]
-    assert [row.key for row in newest_of_each(rows)] == ['1', '2']
+    assert [row.stamp for row in distinct(rows)] == ['1', '2']
     assert [one.row for one in activations(rows)] == [0, 1, 2]
 
 

@@ -21,6 +21,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from starcal_ground.mission.trend.trend_table import (
+    COMPUTED,
+    FAILED,
     failure,
     RECORDED,
     Row,
@@ -28,16 +30,13 @@ from starcal_ground.mission.trend.trend_table import (
     Table,
     TABLE_FILE,
 )
+from starcal_ros.constants import software_version
 from starcal_ros.errors import ProductError
 
 
-def row(key: str, time_ns: int = 5, **changed: Any) -> Row:
-    made = row_of(calibration(with_field=True), key, '/some/where.json', RECORDED, 21.5)
+def row(stamp: str, time_ns: int = 5, **changed: Any) -> Row:
+    made = row_of(calibration(with_field=True), stamp, '/some/where.json', RECORDED, 21.5)
     return dataclasses.replace(made, time_ns=time_ns, **changed)
-
-
-def failed(url: str, error: str, stamp: str) -> Row:
-    return dataclasses.replace(failure(url, error), stamp=stamp)
 
 
 def table_of(folder: Path, *rows: Row) -> Table:
@@ -54,7 +53,7 @@ def test_rows_come_back_to_the_last_bit_in_order_of_time(tmp_path: Path) -> None
 
 
 def test_parquet_has_the_columns_of_the_table(tmp_path: Path) -> None:
-    rows = [row('a', 3, camera='x'), row('b', 9, camera='y'), failure('/bad', 'no stars')]
+    rows = [row('a', 3, camera='x'), row('b', 9, camera='y'), failure('c', '/bad', 'no stars')]
     path = table_of(tmp_path, *rows).write_parquet()
     columns = [field.name for field in dataclasses.fields(Row)]
     parquet = pq.read_table(path)
@@ -63,7 +62,7 @@ def test_parquet_has_the_columns_of_the_table(tmp_path: Path) -> None:
     assert parquet.column_names == columns == of_sqlite
     assert parquet['values'].to_pylist()[1:] == [list(rows[0].values), list(rows[1].values)]
     assert pq.ParquetFile(path).num_row_groups == 3
-    table_of(tmp_path, row('c')).write_parquet()  # replaces it
+    table_of(tmp_path, row('d')).write_parquet()  # replaces it
     assert len(pq.read_table(path)) == 4
 
 
@@ -73,18 +72,11 @@ def test_a_parquet_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         table_of(tmp_path, row('a')).write_parquet()
 
 
-ROWS = {  # what replaces what: rows that are added, keys and cameras that are left
+ROWS = {  # what replaces what: rows that are added, stamps and cameras that are left
     'a camera has another name now': ([row('a', camera='x'), row('a', camera='y')], ['a y']),
-    'a key of another camera': ([row('a', camera='x'), row('b', camera='x')], ['a x', 'b x']),
-    'a failure is mended': (
-        [failed('/1', 'bad', '1'), row('a', stamp='1')],
-        ['a '],
-    ),
-    'a failure fails again': (
-        [failed('/1', 'bad', '1'), failed('/1', 'worse', '2')],
-        ['worse '],
-    ),
-    'no stamps': ([row('a'), row('b'), failure('/1', 'bad')], ['bad ', 'a ', 'b ']),
+    'another stamp': ([row('a', camera='x'), row('b', camera='x')], ['a x', 'b x']),
+    'a failure is mended': ([failure('a', '/1', 'bad'), row('a')], ['a ']),
+    'it fails again': ([failure('a', '/1', 'bad'), failure('a', '/1', 'worse')], ['worse ']),
 }
 
 
@@ -93,38 +85,44 @@ def test_a_row_replaces_what_it_mends(tmp_path: Path, case: str) -> None:
     rows, expected = ROWS[case]
     table_of(tmp_path, *rows)
     left = Table(tmp_path).rows()
-    assert [f'{one.error or one.key} {one.camera}' for one in left] == expected
+    assert [f'{one.error or one.stamp} {one.camera}' for one in left] == expected
 
 
 def test_rows_come_one_camera_after_the_other(tmp_path: Path) -> None:
-    table = table_of(tmp_path, *(row(key, camera=key[0]) for key in ('x1', 'y1', 'x2')))
+    table = table_of(tmp_path, *(row(stamp, camera=stamp[0]) for stamp in ('x1', 'y1', 'x2')))
     other = table_of(tmp_path, row('y2', camera='y'))  # another run, at the same time
     for each in (table, other, Table(tmp_path)):
-        assert [[one.key for one in rows] for rows in each.cameras()] == [
+        assert [[one.stamp for one in rows] for rows in each.cameras()] == [
             ['x1', 'x2'],
             ['y1', 'y2'],
         ]
     assert table.names() == [('', 'x'), ('', 'y')]
 
 
-def test_a_stamp_leads_to_its_row(tmp_path: Path) -> None:
-    table = table_of(tmp_path, row('a', stamp='1', spacecraft='A'))
-    table.add_seen('2', 'a')
-    table.add_seen('3', '')
-    table.add_seen('4', 'gone')
-    table.add_seen('', 'a')
-    assert [Table(tmp_path).key_of(stamp) for stamp in ('1', '2', '3', '4', '', '5')] == [
-        *('a', 'a', '', None, None, None)
-    ]
+KNOWN = {  # changes of a row, and whether its task is done with
+    'recorded': ({'kind': RECORDED, 'software': 'starcal 0.0.1'}, True),
+    'computed': ({'kind': COMPUTED}, True),
+    'computed by another version': ({'kind': COMPUTED, 'software': 'starcal 0.0.1'}, False),
+    'failed': ({'kind': FAILED, 'error': 'bad'}, True),
+    'failed with another version': (
+        {'kind': FAILED, 'error': 'bad', 'software': 'starcal 0.0.1'},
+        False,
+    ),
+    'of another stamp': ({'stamp': 'b'}, False),
+    'of another camera': ({'camera': 'x'}, False),
+}
 
 
-def test_failures_that_are_tried_again(tmp_path: Path) -> None:
-    before = dataclasses.replace(failed('/1', 'bad', '1'), software='starcal 0.0.1')
-    passing = dataclasses.replace(failed('/2', 'bad', '2'), is_passing=True)
-    table = table_of(tmp_path, before, passing, failed('/3', 'bad', '3'), row('a'))
-    assert table.failures() == {'1': True, '2': True, '3': False}
-    table.forget_failures(['1', '3', 'none'])
-    assert [one.error or one.key for one in Table(tmp_path).rows()] == ['bad', 'a']
+@pytest.mark.parametrize('case', KNOWN)
+def test_a_row_of_this_version_is_not_made_again(tmp_path: Path, case: str) -> None:
+    changed, expected = KNOWN[case]
+    software = f'starcal {software_version()}'
+    made = dataclasses.replace(row('a', software=software), **changed)  # type: ignore[arg-type]
+    table = table_of(tmp_path, made)
+    assert table.has('a', '', '') is expected
+    assert table.failures() == ({'a'} if made.error else set())
+    table.forget(['a', 'none'])
+    assert table.rows() == ([] if made.stamp == 'a' else [made])
 
 
 _KILLED = """
@@ -144,7 +142,7 @@ def test_a_kill_loses_no_row_that_was_added(tmp_path: Path) -> None:
     here = Path(__file__).parent
     line = [sys.executable, '-c', _KILLED, str(tmp_path), str(here), str(here.parents[2])]
     assert subprocess.run(line).returncode == -signal.SIGKILL
-    assert [one.key for one in Table(tmp_path).rows()] == list('01234')
+    assert [one.stamp for one in Table(tmp_path).rows()] == list('01234')
 
 
 def changed_by(*statements: str) -> Callable[[Path], object]:
@@ -178,12 +176,12 @@ HOSTILE = {
     'torn': content(lambda sound: sound[:5000] + bytes(15_000) + sound[20_000:]),
     'another database': changed_by('drop table calibration', 'create table calibration (a)'),
     'a view': changed_by(
-        'drop table seen',
-        'create view seen as with recursive n(k) as (select 1 union all select k + 1 from n) '
-        'select k as stamp, k as key from n',
+        'drop index of_camera',
+        'create view v as with recursive n(k) as (select 1 union all select k + 1 from n) '
+        'select k from n',
     ),
     'a trigger': changed_by(
-        'create trigger t after insert on seen begin delete from calibration; end'
+        'create trigger t after insert on calibration begin delete from calibration; end'
     ),
     'null': changed_by(f'{SET} "values" = \'[null]\''),
     'no list': changed_by(f'{SET} "values" = \'7\''),
