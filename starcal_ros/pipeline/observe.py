@@ -269,10 +269,7 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
             observations, tracked_camera = track_stars(
                 exposure, track.tracked_camera, setup.star_search
             )
-            # In a narrow field the tracked camera may have another principal point, and so another
-            # alignment.
-            geometry = realigned(track.geometry, observations)
-            after = dataclasses.replace(track, geometry=geometry, tracked_camera=tracked_camera)
+            after = dataclasses.replace(track, tracked_camera=tracked_camera)
             return observations, _after_image(after, exposure, observations, setup)
     observations, instrument = observe_stars(exposure, track.geometry, setup.star_search)
     if observations.refusal:

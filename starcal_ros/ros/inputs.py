@@ -168,9 +168,9 @@ class Inputs:
             callback_group=entry.group,
             qos_overriding_options=entry.override,
             raw=entry.raw,
-            # rclpy's own event callback warns of the name before remapping.
+            # Those of rclpy warn of the name before remapping, and each costs every wait time.
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda _event: None, message_lost=count
+                message_lost=count, use_default_callbacks=False
             ),
         )
 

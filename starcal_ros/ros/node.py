@@ -347,6 +347,20 @@ class Executor(MultiThreadedExecutor):
     """
 
     _sigint_gc: Any = None
+    _due: tuple[Any, ...] = ()  # their callbacks may not have begun
+
+    def _make_handler(self, entity: Any, *arguments: Any) -> Any:
+        self._due = (*(other for other in self._due if other._executor_event), entity)
+        return super()._make_handler(entity, *arguments)
+
+    def can_execute(self, entity: Any) -> bool:
+        """
+        Return True if a callback may begin, and no other of its group is about to.
+
+        Until a thread has taken a message, the events of its subscription would end each wait.
+        """
+        groups = [other.callback_group for other in self._due if other._executor_event]
+        return bool(super().can_execute(entity)) and entity.callback_group not in groups
 
     def join(self) -> None:
         """

@@ -366,13 +366,16 @@ def rate_of(
 
 def _between(before: AttitudeSample, after: AttitudeSample, time_ns: int) -> Floats:
     """Attitude (4,) at a time between two samples."""
-    from scipy.spatial.transform import Rotation, Slerp  # half of the start of a short command
+    from scipy.spatial.transform import Rotation  # half of the start of a short command
 
-    ends = np.array([before.icrf_from_star_tracker_xyzw, after.icrf_from_star_tracker_xyzw])
+    start, end = (
+        Rotation.from_quat(sample.icrf_from_star_tracker_xyzw) for sample in (before, after)
+    )
     # Times are relative: a double holds seconds since 1970 to 0.1 us only.
     gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
     since_s = (time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
-    return np.asarray(Slerp([0.0, gap_s], Rotation.from_quat(ends))(since_s).as_quat())
+    turned = Rotation.from_rotvec(since_s / gap_s * (start.inv() * end).as_rotvec())
+    return np.asarray((start * turned).as_quat())
 
 
 IDENTITY_XYZW = np.array([0.0, 0.0, 0.0, 1.0])

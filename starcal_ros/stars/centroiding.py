@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
-from starcal_ros.robust_statistics import centre_and_scatter
+from starcal_ros.robust_statistics import centre_and_scatter, medians
 from starcal_ros.stars import detection, psf_fit
 from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import (
@@ -150,7 +150,7 @@ def _measure_by_psf(
         (~inside, StarRefusal.BORDER),
         (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
         ((snr < options.min_snr) | ~np.isfinite(snr), StarRefusal.FAINT),
-        (np.abs(parameters[:, :2]).max(axis=1) > in_place_px, StarRefusal.NOT_DETECTED),
+        (np.maximum(*np.abs(parameters[:, :2].T)) > in_place_px, StarRefusal.NOT_DETECTED),
         (misshapen, StarRefusal.ELONGATED),
     )
     xy_px = centre + parameters[:, :2]
@@ -189,7 +189,8 @@ def _brightest_beside(
     near[hot_in_stamps(hot_pixels, centre, 1, width)] = 0
     near = near.reshape(len(centre), 9)
     best = near.argmax(axis=1)
-    best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
+    # On a saturated plateau, the predicted pixel.
+    best[near[:, 4] == near[np.arange(len(near)), best]] = 4
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     return np.minimum(np.maximum(centre, 1), innermost), inside
 
@@ -261,7 +262,7 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     change = measured.fit.shape_change[measured.fit.snr > _BRIGHT_SNR]
     if len(change) < _FEWEST_BRIGHT:
         return False
-    return bool(np.abs(np.median(change, axis=0) - model.shape_median).max() > _COMMON_CHANGE)
+    return bool(np.abs(medians(change) - model.shape_median).max() > _COMMON_CHANGE)
 
 
 def _without_neighbours(
@@ -284,7 +285,7 @@ def _without_neighbours(
     snr = expected_snr(flux, blurred, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
     widest_px = float(sigma_px.max(initial=0.0))
     in_place_px = _IN_PLACE_PX + math.hypot(widest_px, streak_px / math.sqrt(12.0)) - widest_px
-    in_place = np.abs(parameters[:, :2]).max(axis=1) < in_place_px
+    in_place = np.maximum(*np.abs(parameters[:, :2].T)) < in_place_px
     modelled = usable & (snr > _MODELLED_SNR) & in_place
     if len(stamps) < 2:
         return stamps, parameters, done, modelled

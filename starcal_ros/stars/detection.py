@@ -441,7 +441,8 @@ _GROUP = 256  # stars of one mean: its noise is 0.06 of that of a star
 _DARK = 0.05
 _MOST_SNR = 3.0  # limits the effect of a bright neighbour on the mean of a group
 _RADIUS_PX = 3
-_CORE_PIXELS = 9
+_CORE = np.zeros((7, 7), np.float32)  # weights of the light of 3 x 3 pixels above their border
+_CORE[2:-2, 2:-2], _CORE[[0, -1]], _CORE[1:-1, [0, -1]] = 1.0, -9 / 24, -9 / 24
 
 
 def detectable_count(pixels: Pixels, xy_px: Floats, background: Background, min_snr: float) -> int:
@@ -459,13 +460,8 @@ def detectable_count(pixels: Pixels, xy_px: Floats, background: Background, min_
     # A window at the edge is moved inside: it shows no star, and few windows are at an edge.
     centre = np.clip(np.rint(xy_px).astype(np.int64), _RADIUS_PX, inner)
     windows = windows_about(pixels, centre, _RADIUS_PX).astype(np.float32)
-    core = windows[:, 2:-2, 2:-2].sum(axis=(1, 2))
-    windows[:, 1:-1, 1:-1] = 0.0
-    border_pixels = 4 * (2 * _RADIUS_PX)
-    light = core - _CORE_PIXELS / border_pixels * windows.sum(axis=(1, 2))
-    noise = background.noise_at(xy_px) * np.sqrt(
-        _CORE_PIXELS * (1.0 + _CORE_PIXELS / border_pixels)
-    )
+    light = windows.reshape(len(windows), -1) @ _CORE.ravel()
+    noise = background.noise_at(xy_px) * np.linalg.norm(_CORE)
     snr = np.clip(light / noise, -_MOST_SNR, _MOST_SNR)
     groups = len(snr) // _GROUP
     mean = snr[: groups * _GROUP].reshape(groups, _GROUP).mean(axis=1)

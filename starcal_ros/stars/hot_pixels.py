@@ -162,9 +162,12 @@ def refuse_on_hot_pixels(
         np.isin(refusal, (StarRefusal.NONE, StarRefusal.ELONGATED, StarRefusal.AMBIGUOUS))
     )
     core, _ = tree.query(xy_px[candidates], distance_upper_bound=CORE_PX)
-    window, _ = tree.query(xy_px[candidates], p=np.inf, distance_upper_bound=window_px + 0.5)
-    at_peak = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
-    cause = at_peak | (np.isfinite(window) & (refusal[candidates] != StarRefusal.NONE))
+    cause = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
+    misshapen = refusal[candidates] != StarRefusal.NONE
+    window, _ = tree.query(
+        xy_px[candidates[misshapen]], p=np.inf, distance_upper_bound=window_px + 0.5
+    )
+    cause[misshapen] |= np.isfinite(window)
     changed = refusal.copy()
     changed[candidates[cause]] = StarRefusal.HOT_PIXEL
     return changed

@@ -9,6 +9,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from typing import Any, TYPE_CHECKING
 
@@ -24,8 +25,10 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import rclpy
+from std_msgs.msg import Empty
 
 from starcal_ros.ros.calibrator import Calibrator
+from starcal_ros.ros.node import Executor
 
 pytestmark = pytest.mark.nodes
 
@@ -282,6 +285,37 @@ except Exception:
 
 def test_a_signal_while_the_executor_is_constructed_prints_no_traceback() -> None:
     assert run(EXECUTOR_AFTER_THE_SHUTDOWN) == (0, 'refused\n', '')
+
+
+def test_no_event_ends_a_wait_while_a_message_waits_for_a_thread(client: Client) -> None:
+    """The middleware shows events of a subscription as ready until its message is taken."""
+    context = client.node.context
+    executor, node = Executor(2, context=context), rclpy.create_node('waits', context=context)
+    executor.add_node(node)
+    free, taken = threading.Event(), list[Any]()
+    subscription: Any = node.create_subscription(Empty, 'waits', taken.append, 1)
+    publisher = node.create_publisher(Empty, 'waits', 1)
+
+    def may_wait_for_events() -> bool:
+        executor.spin_once(timeout_sec=0.1)
+        return all(executor.can_execute(event) for event in subscription.event_handlers)
+
+    def is_due() -> bool:
+        publisher.publish(Empty())
+        return not may_wait_for_events() and bool(subscription._executor_event)
+
+    try:
+        for _ in range(2):
+            executor._executor.submit(free.wait)
+        client.until(is_due)
+        assert not any(executor.can_execute(event) for event in subscription.event_handlers)
+        assert subscription.event_handlers and not taken
+        free.set()
+        client.until(lambda: may_wait_for_events() and bool(taken))
+    finally:
+        free.set()
+        executor.shutdown()
+        node.destroy_node()
 
 
 ARENAS_OF_A_NODE = """
