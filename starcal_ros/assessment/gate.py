@@ -27,6 +27,7 @@ from starcal_ros.records import (
     Calibration,
     CameraGeometry,
     GateCheck,
+    HeldTerm,
     ModelChecks,
     ResidualBin,
     StarTrackerAlignment,
@@ -353,14 +354,21 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
             term.significance,
             'sigma',
         )
-        estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-        note = f'{estimated} by the stars, {assumed} assumed'
-        if not check.passed:
-            note += '; ' + REMEDIES.get(
-                f'assumed {term.name.replace(" ", "_").partition("_")[0]}',
-                'estimate it, or widen its prior (estimate, prior_sigma)',
-            )
+        note, remedy = of_held(term)
+        note = note if check.passed else f'{note}; {remedy}'
         yield dataclasses.replace(check, note=note)
+
+
+def of_held(term: HeldTerm) -> tuple[str, str]:
+    """What the stars say of an assumed value, and the remedy if they contradict it."""
+    kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
+    estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
+    is_departure = kind in ('assumed velocity', 'assumed stamp', 'assumed mounting')
+    note = f'{estimated} by the stars, {assumed} assumed'
+    return (
+        f'the stars add {estimated} to it' if is_departure else note,
+        REMEDIES.get(kind, 'estimate it, or widen its prior (estimate, prior_sigma)'),
+    )
 
 
 def _group(part: ResidualBin) -> str:
@@ -583,7 +591,7 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'check the velocity; on the ground state the site',
+    'assumed velocity': 'correct the velocity so; on the ground state the site',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',

@@ -62,12 +62,16 @@ def read_image(
         values = sensor_messages.plane(values, 'rgb', channel)
     elif bayer:
         values = sensor_messages.of_mosaic(values, bayer.lower(), channel)
-    if values.ndim != _GREY or min(values.shape) < 2:
-        raise IngestError(
-            f'{path}: array of shape {values.shape}, neither an image nor three colour planes: '
-            'write each image to its own file'
-        )
+    _check_shape(path, values.shape)
     return values, header
+
+
+def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
+    if not (len(shape) == _GREY or shape[_GREY:] == (_RGB,)) or min(shape) < 2:
+        raise IngestError(
+            f'{path}: array of shape {shape}, neither an image nor three colour planes: write '
+            'each image to its own file'
+        )
 
 
 def tiff_header(content: bytes) -> sensor_messages.Header | None:
@@ -135,6 +139,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
     values = values.squeeze()
     if values.ndim == _RGB and values.shape[0] == _RGB:
         values = np.moveaxis(values, 0, -1)  # a cube of three planes
+    _check_shape(path, values.shape)
     return values.astype(values.dtype.newbyteorder('=')), header
 
 
