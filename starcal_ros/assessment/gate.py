@@ -610,7 +610,8 @@ REMEDIES: Mapping[str, str] = {
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',
     'star tracker noise': 'take more images',
-    'star tracker slow error': 'take images in more attitudes of the star tracker',
+    'star tracker slow error': 'take images in more attitudes of the star tracker; if it is over'
+    ' the data sheet, run starcal diagnose',
     'held parameters': 'estimate the held parameters (estimate)',
 }
 """Name -> remedy; a check of the gate that has none states it in its note."""

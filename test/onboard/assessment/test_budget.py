@@ -164,6 +164,12 @@ def test_what_is_stated_is_not_asked_for() -> None:
     assert statements(sigma_budget(*found), *found) == ()
 
 
+def test_a_value_that_the_images_contradict_is_not_asked_for() -> None:
+    """Attitudes in axes of another epoch are off by as much as they turn."""
+    found = estimate(World(smooth_arcsec=1000.0))
+    assert not [row for row in statements(sigma_budget(*found), *found) if 'slow' in row.option]
+
+
 @pytest.mark.parametrize('names', [['velocity'], ['field'], ['velocity', 'field']])
 def test_known_unknowns_leave_their_schur_complement(names: list[str]) -> None:
     found, _ = estimate(RAM)
