@@ -358,7 +358,7 @@ def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
     )
     if options.velocity_sigma_m_s >= 0:
         return f'{size} per axis stated'
-    return f'not given: {size} per axis assumed'
+    return f'no barycentric one given: {size} per axis assumed'
 
 
 def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:

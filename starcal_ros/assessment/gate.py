@@ -598,7 +598,7 @@ REMEDIES: Mapping[str, str] = {
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
     # Causes of the sigma of a line of sight (`SigmaPart.cause`).
     'stars': 'take more images',
-    'velocity': 'state the velocity of the camera: the topic velocity or observer_velocity_m_s; '
+    'velocity': 'state the barycentric velocity: the topic velocity or observer_velocity_m_s; '
     'of photographs, observer and their times (EXIF, FITS)',
     'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',

@@ -99,7 +99,7 @@ def test_velocity_is_the_fall_of_an_estimate_that_is_given_it() -> None:
     of_map, _ = fall(parts(RAM)['total'], given['total'])
     assert part.map_arcsec == pytest.approx(of_map, rel=0.03)
     assert part.map_arcsec > 0.5 * parts(RAM)['total'].map_arcsec
-    assert part.assumption == 'not given: 20 km/s per axis assumed'
+    assert part.assumption == 'no barycentric one given: 20 km/s per axis assumed'
     stated = parts(RAM, velocity_sigma_m_s=10.0)['velocity']
     assert stated.assumption == '10 m/s per axis stated'
     assert stated.map_arcsec < 0.01 * part.map_arcsec
