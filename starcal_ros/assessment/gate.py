@@ -360,7 +360,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
 
 
 def of_held(term: HeldTerm) -> tuple[str, str]:
-    """What the stars say of an assumed value, and the remedy if they contradict it."""
+    """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
     is_departure = kind in ('assumed velocity', 'assumed stamp', 'assumed mounting')
