@@ -133,7 +133,7 @@ def calibration() -> Calibration:
                 'velocity',
                 0.6,
                 0.75,
-                'not given: 20 km/s per axis assumed',
+                'no barycentric one given: 20 km/s per axis assumed',
                 tuple(0.01 * k for k in range(63)),
             ),
         ),

@@ -12,7 +12,7 @@ import numpy as np
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import REMEDIES, requirement_answers, REQUIREMENTS
+from starcal_ros.assessment.gate import of_held, REMEDIES, requirement_answers, REQUIREMENTS
 from starcal_ros.camera import (
     CameraModel,
     INTRINSIC_NAMES,
@@ -221,12 +221,12 @@ def _held(held: Sequence[records.HeldTerm]) -> Iterator[ModelRow]:
     agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
     for term in held:
         if term.significance >= INFORMATIVE_SIGMAS:
+            note, remedy = of_held(term)
             yield ModelRow(
-                f'{term.name} is {significant(term.assumed, 6)}',
-                f'the stars put it at {significant(term.estimated, 6)}: '
-                f'{term.significance:.1f} sigma of the difference',
+                f'{term.name} is as assumed',
+                f'{note}: {term.significance:.1f} sigma of the difference',
                 _p(math.erfc(term.significance / math.sqrt(2))),
-                f'estimate {term.name} (estimate) or widen its prior (prior_sigma)',
+                remedy,
             )
     if agreeing:
         names = ', '.join(f'{term.name} is {significant(term.assumed, 6)}' for term in agreeing)

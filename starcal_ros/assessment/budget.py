@@ -49,6 +49,7 @@ _UNKNOWNS = {
 _SIGMAS = {'stamps': 'stamp_sigma_s', 'mountings': 'star_tracker_mounting_sigma_arcsec'}
 """Options that are a sigma, by cause: a tenth may be stated."""
 _WORTH_STATING = 0.9  # of the sigma before
+_SHOWN = 3.0  # times its noise: a slow error of a star tracker that the images show
 _OF_TRACKERS = (TRACKER_NOISE, TRACKER_SLOW, 'mountings', 'stamps')
 
 
@@ -152,6 +153,8 @@ def _to_state(
         noise = options.star_tracker_sigma_arcsec
         if not tracker_sigma_is_given(options):
             noise = tuple(estimate.star_tracker_sigma_rad / ARCSECOND_RAD)
+        if _slow(estimate) > _SHOWN * max(noise):
+            return '', '', 1.0  # the images contradict the usual value
         usual = 0.5 * min(noise)
         return 'star_tracker_slow_arcsec', significant(usual, 2), (usual / _slow(estimate)) ** 2
     if cause == 'velocity' and options.velocity_sigma_m_s < 0:
@@ -355,7 +358,7 @@ def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
     )
     if options.velocity_sigma_m_s >= 0:
         return f'{size} per axis stated'
-    return f'not given: {size} per axis assumed'
+    return f'no barycentric one given: {size} per axis assumed'
 
 
 def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:

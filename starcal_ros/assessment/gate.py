@@ -27,6 +27,7 @@ from starcal_ros.records import (
     Calibration,
     CameraGeometry,
     GateCheck,
+    HeldTerm,
     ModelChecks,
     ResidualBin,
     StarTrackerAlignment,
@@ -353,14 +354,21 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
             term.significance,
             'sigma',
         )
-        estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-        note = f'{estimated} by the stars, {assumed} assumed'
-        if not check.passed:
-            note += '; ' + REMEDIES.get(
-                f'assumed {term.name.replace(" ", "_").partition("_")[0]}',
-                'estimate it, or widen its prior (estimate, prior_sigma)',
-            )
+        note, remedy = of_held(term)
+        note = note if check.passed else f'{note}; {remedy}'
         yield dataclasses.replace(check, note=note)
+
+
+def of_held(term: HeldTerm) -> tuple[str, str]:
+    """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
+    kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
+    estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
+    is_departure = kind in ('assumed velocity', 'assumed stamp', 'assumed mounting')
+    note = f'{estimated} by the stars, {assumed} assumed'
+    return (
+        f'the stars add {estimated} to it' if is_departure else note,
+        REMEDIES.get(kind, 'estimate it, or widen its prior (estimate, prior_sigma)'),
+    )
 
 
 def _group(part: ResidualBin) -> str:
@@ -583,14 +591,14 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'check the velocity; on the ground state the site',
+    'assumed velocity': 'correct the velocity so; on the ground state the site',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
     # Causes of the sigma of a line of sight (`SigmaPart.cause`).
     'stars': 'take more images',
-    'velocity': 'state the velocity of the camera: the topic velocity or observer_velocity_m_s; '
+    'velocity': 'state the barycentric velocity: the topic velocity or observer_velocity_m_s; '
     'of photographs, observer and their times (EXIF, FITS)',
     'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
@@ -602,7 +610,8 @@ REMEDIES: Mapping[str, str] = {
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',
     'star tracker noise': 'take more images',
-    'star tracker slow error': 'take images in more attitudes of the star tracker',
+    'star tracker slow error': 'take images in more attitudes of the star tracker; if it is over'
+    ' the data sheet, run starcal diagnose',
     'held parameters': 'estimate the held parameters (estimate)',
 }
 """Name -> remedy; a check of the gate that has none states it in its note."""

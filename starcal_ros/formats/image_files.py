@@ -62,22 +62,31 @@ def read_image(
         values = sensor_messages.plane(values, 'rgb', channel)
     elif bayer:
         values = sensor_messages.of_mosaic(values, bayer.lower(), channel)
-    if values.ndim != _GREY or min(values.shape) < 2:
-        raise IngestError(
-            f'{path}: array of shape {values.shape}, neither an image nor three colour planes: '
-            'write each image to its own file'
-        )
+    _check_shape(path, values.shape)
     return values, header
 
 
-def tiff_header(content: bytes) -> sensor_messages.Header | None:
-    """Header of the first image of a TIFF (TIFF 6.0, section 2); None if it is not a TIFF."""
+def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
+    if not (len(shape) == _GREY or shape[_GREY:] == (_RGB,)) or min(shape) < 2:
+        raise IngestError(
+            f'{path}: array of shape {shape}, neither an image nor three colour planes: write '
+            'each image to its own file'
+        )
+
+
+def tiff_header(content: bytes, page: int = 0) -> sensor_messages.Header | None:
+    """Header of an image of a TIFF (TIFF 6.0, section 2); None if it is not there, or no TIFF."""
     order = {b'II*\0': '<', b'MM\0*': '>'}.get(content[:4])
     if order is None:
         return None
     tags = {_CHANNELS: 1}
     try:
         (start,) = struct.unpack_from(f'{order}I', content, 4)
+        for _ in range(page):
+            (count,) = struct.unpack_from(f'{order}H', content, start)
+            (start,) = struct.unpack_from(f'{order}I', content, start + 2 + count * 12)
+        if not start:
+            return None
         (count,) = struct.unpack_from(f'{order}H', content, start)
         for at in range(start + 2, start + 2 + min(count, _TIFF_MOST_ENTRIES) * 12, 12):
             tag, kind, number = struct.unpack_from(f'{order}HHI', content, at)
@@ -135,6 +144,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
     values = values.squeeze()
     if values.ndim == _RGB and values.shape[0] == _RGB:
         values = np.moveaxis(values, 0, -1)  # a cube of three planes
+    _check_shape(path, values.shape)
     return values.astype(values.dtype.newbyteorder('=')), header
 
 
@@ -178,6 +188,8 @@ def decoded(path: Path, content: bytes) -> NDArray[Any]:
     header = png or tiff_header(content)
     if header and header.width * header.height * header.channels > MOST_VALUES:
         raise IngestError(f'{path}: its header claims {header.width} x {header.height} pixels')
+    if header and tiff_header(content, 1) == header:
+        raise IngestError(f'{path}: several images: write each image to its own file')
     if png and sensor_messages.has_surplus(content, png):
         raise IngestError(f'{path}: inflates to far more than its pixels')
     import cv2  # slow to import, and the kind of a file needs it not

@@ -82,7 +82,7 @@ class Velocity:
     m_s : (3,) or None
         Velocity; None for that of the Earth.
     sigma_m_s : float
-        1-sigma of each component; NaN if unknown: the Earth's velocity is then used.
+        1-sigma of each component; NaN if unknown.
     """
 
     m_s: Floats | None = None
@@ -93,15 +93,24 @@ EARTH = Velocity()
 """Velocity of the Earth, used where that of the observer is unknown."""
 # The last sample of telemetry is up to a second old, in which an orbital velocity changes by this.
 GIVEN_SIGMA_M_S = 10.0
+# An orbit about the Earth is slower than this about the Earth, and none is about the barycentre.
+_ESCAPE_M_S = 11.2e3
 
 
 def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
-    """Velocity of the observer from a message (3,), or from the options without one."""
+    """
+    Velocity of the observer from a message (3,), or from the options without one.
+
+    The sigma of a velocity that may be one about the Earth is not known.
+    """
     if site.observer == 'ground':
         return Velocity(None, 0.0)
     if measured_m_s is None and any(site.observer_velocity_m_s):
         measured_m_s = np.array(site.observer_velocity_m_s)
-    return EARTH if measured_m_s is None else Velocity(measured_m_s, GIVEN_SIGMA_M_S)
+    if measured_m_s is None:
+        return EARTH
+    is_slow = np.linalg.norm(measured_m_s) < _ESCAPE_M_S
+    return Velocity(measured_m_s, math.nan if is_slow else GIVEN_SIGMA_M_S)
 
 
 def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:

@@ -10,12 +10,13 @@ same for all images.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
 import math
 
+import erfa
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -33,7 +34,7 @@ from starcal_ros.sky.catalog import StarCatalog
 
 CAUSES = (
     'none', 'mirrored', 'rotated', 'attitude_direction', 'quaternion_order', 'prior_alignment',
-    'focal_length', 'clock', 'smear', 'no_stars', 'not_linear', 'unknown',
+    'focal_length', 'clock', 'axes', 'smear', 'no_stars', 'not_linear', 'unknown',
 )  # fmt: skip
 IMAGES_OF_AN_ALIGNMENT = 3
 _FEW_SOURCES = 10  # in an image that nothing identifies: hot pixels are sources too
@@ -52,6 +53,13 @@ _CLOCK_IMAGES = 3  # fewest: estimating the shift absorbs part of the informatio
 _ALIKE_RAD = math.radians(0.003)  # a smaller scatter is due to the stars
 _WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance agreement is this close in one case of 200
 _TURNED_RAD = math.radians(5.0)  # roll of a mounting that is right but for quarter turns
+# Rotation matrices from the ICRF to other axes that attitudes may be in, at a Julian date (UTC).
+_OTHER_AXES: Mapping[str, Callable[..., Floats]] = {
+    'the mean equator and equinox of date': lambda *utc_jd: erfa.bp06(*utc_jd)[2],
+    'the ecliptic of J2000': lambda *_: erfa.ecm06(erfa.DJ00, 0.0),
+    'the rotating Earth': lambda *utc_jd: erfa.c2t06a(*utc_jd, *utc_jd, 0.0, 0.0),
+}
+_UNIX_EPOCH_JD = 2440587.5
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 _ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in range(4)]
 
@@ -80,9 +88,11 @@ class Reading:
     scatter_rad: float
     star_tracker_from_camera: Rotation
     shift_s: float = 0.0
+    axes: str = ''  # of `_OTHER_AXES`; empty: ICRF
 
     def __str__(self) -> str:
-        return f'{self.direction} ({", ".join(self.order)})'
+        axes = f' in axes of {self.axes}' if self.axes else ''
+        return f'{self.direction} ({", ".join(self.order)}){axes}'
 
     def off_by(self, prior: Rotation) -> tuple[float, float]:
         """Errors of a prior alignment against the one found, in pointing and in roll, rad."""
@@ -139,12 +149,10 @@ class Case:
         fit = self._fitting(self.readings())
         least_rad = min((reading.scatter_rad for reading in fit), default=math.inf)
         if len(self.solved) >= _CLOCK_IMAGES and least_rad > _CLOCK_LEAST_RAD:
-            shifted = self._shifted()
             most = max((reading.agreeing for reading in fit), default=0)
-            if shifted is not None and (
-                not fit or (shifted.agreeing >= most and shifted.scatter_rad * _CLEAR < least_rad)
-            ):
-                return shifted
+            for other in self._others():
+                if not fit or (other.agreeing >= most and other.scatter_rad * _CLEAR < least_rad):
+                    return other
         return self._likeliest(fit)
 
     def readings(self) -> list[Reading]:
@@ -182,7 +190,7 @@ class Case:
         ]
         return likely[0] if len(likely) == 1 else None
 
-    def _at_shifts(self, way: tuple[str, str], shift_s: Floats) -> list[Reading]:
+    def _at_shifts(self, way: tuple[str, str], shift_s: Floats, axes: str = '') -> list[Reading]:
         """The reading of each shift (s,) of the stamps, with the most alignments that agree."""
         images = len(self.solved)
         stamps_ns = np.array([image.time_ns for image in self.solved])
@@ -190,6 +198,7 @@ class Case:
         read, usable = _read_at(self.attitudes, at_ns.ravel(), way, self.setup)
         quaternion = np.zeros((len(usable), 4))  # of no rotation: it agrees with none
         if read is not None:
+            read = _to_icrf(axes, at_ns.ravel()[usable]) * read if axes else read
             icrf_from_camera = Rotation.concatenate(
                 [image.sky.camera_from_icrf for image in self.solved]
             ).inv()
@@ -197,21 +206,26 @@ class Case:
             quaternion[usable] = (read.inv() * icrf_from_camera[image]).as_quat()
         agreeing, scatter_rad, mean = _agreed(quaternion.reshape(-1, images, 4))
         return [
-            Reading(*way, int(agreeing[k]), float(scatter_rad[k]), mean[k], float(shift_s[k]))
+            Reading(
+                *way, int(agreeing[k]), float(scatter_rad[k]), mean[k], float(shift_s[k]), axes
+            )
             for k in range(len(shift_s))
         ]
 
-    def _shifted(self) -> Reading | None:
-        """The reading and stamp shift that most images support; None if there is none."""
+    def _others(self) -> Iterator[Reading]:
+        """Readings that most images support in other axes, then with a shift of the stamps."""
+        ways, none = _ways(self.setup), np.zeros(1)
+        turned = [self._at_shifts(way, none, axes)[0] for axes in _OTHER_AXES for way in ways]
+        yield from self._fitting(turned)[:1]
         steps = round(_CLOCK_SEARCH_S / _COARSE_STEP_S)
         coarse: Floats = _COARSE_STEP_S * np.arange(-steps, steps + 1, dtype=np.float64)
         fine: Floats = _FINE_STEP_S * np.arange(-12, 13, dtype=np.float64)
         readings = []
-        for way in _ways(self.setup):
+        for way in ways:
             tried = self._at_shifts(way, coarse)
             tried += self._at_shifts(way, min(tried, key=_rank).shift_s + fine)
             readings.append(_middle_of_best(tried))
-        return next(iter(self._fitting(readings)), None)
+        yield from self._fitting(readings)[:1]
 
 
 def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> list[Rotation]:
@@ -274,6 +288,12 @@ def _read_at(
     part = (at_ns[usable] - times[ends - 1]) / np.maximum(gap_ns[usable], 1)
     sent = before * Rotation.from_rotvec(part[:, None] * (before.inv() * behind).as_rotvec())
     return (sent.inv() if direction == 'inertial_to_st' else sent), usable
+
+
+def _to_icrf(axes: str, at_ns: NDArray[np.int64]) -> Rotation:
+    day_ns = 86400 * NANOSECONDS_PER_SECOND
+    from_icrf = [_OTHER_AXES[axes](_UNIX_EPOCH_JD, float(ns) / day_ns) for ns in at_ns]
+    return Rotation.from_matrix(np.array(from_icrf)).inv()
 
 
 def _rank(reading: Reading) -> tuple[int, float]:
@@ -451,7 +471,7 @@ def _held_against(case: Case, tried: int, shift_s: float) -> Diagnosis:
     findings = [_mirrored(reading, setup)] if is_mirrored else []
     if reading is not None:
         evidence += _agreement(reading, case)
-        findings += [*_order(reading), *_direction(reading, setup)]
+        findings += [*_order(reading), *_direction(reading, setup), *_axes(reading)]
         findings += _clock(shift_s + reading.shift_s, setup)
         if solved[0].quarter_turned:
             findings.append(_sides_exchanged(reading, setup))
@@ -490,7 +510,7 @@ def _agreement(reading: Reading, case: Case) -> list[str]:
     of = f'{reading.agreeing} of {len(case.solved)} images'
     lines = [f'read as {reading}, the attitudes of {of} {alike}']
     given = case.readings()[0]
-    if (reading.order, reading.direction) != (given.order, given.direction):
+    if str(reading) != str(given):
         agree = f'those of {given.agreeing} agree to {math.degrees(given.scatter_rad):.3f} degrees'
         if given.agreeing < 2:
             agree = 'no two agree'
@@ -516,6 +536,14 @@ def _direction(reading: Reading, setup: Setup) -> list[Diagnosis]:
     sentence = f'The attitude quaternions are {reading}, not {given}.'
     mend = f'attitude_direction: {shown}'
     return [Diagnosis('attitude_direction', shown, sentence, mend=(mend,))]
+
+
+def _axes(reading: Reading) -> list[Diagnosis]:
+    if not reading.axes:
+        return []
+    sentence = f'The attitudes are in axes of {reading.axes}, not of the ICRF.'
+    mend = f'# {_NO_PARAMETER}send attitudes in axes of the ICRF (J2000)'
+    return [Diagnosis('axes', reading.axes, sentence, mend=(mend,))]
 
 
 def _clock(shift_s: float, setup: Setup) -> list[Diagnosis]:

@@ -75,6 +75,8 @@ BAD: Mapping[str, tuple[Callable[[Path], object], str]] = {
     'clip.mov': (content(b'\0\0\0\x14ftypqt  ' + bytes(40)), 'a video, .*: ffmpeg -i FILE'),
     'a.webp': (content(encoded('.webp')), 'a WebP image, which is not read: magick FILE'),
     'raw.jpg.zst': (content(b'(\xb5/\xfd' + bytes(40)), 'compressed by zstd, .*: zstd -d FILE'),
+    'cube.fits': (lambda path: fits.PrimaryHDU(np.zeros((8, 9, 10))).writeto(path), 'each image'),
+    'pages.tif': (lambda path: cv2.imwritemulti(str(path), [PIXELS, PIXELS]), 'each image'),
     'bag.mcap': (content(b'\x89MCAP0\r\n' + bytes(40)), 'an MCAP bag: calibrate it by itself'),
 }
 

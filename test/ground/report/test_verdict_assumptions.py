@@ -13,11 +13,19 @@ from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import HeldTerm
 
 
-def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
+@pytest.mark.parametrize(
+    ('held', 'by_stars', 'remedy'),
+    [
+        (HeldTerm('cx', 320.0, 326.0, 2.0), '326 by the stars, 320 assumed', 'estimate it'),
+        (HeldTerm('velocity_x_m_s', 0.0, 6e4, 2e4), 'the stars add 60000 to it', 'correct the'),
+    ],
+)
+def test_rows_say_what_was_found_and_what_to_do(
+    held: HeldTerm, by_stars: str, remedy: str, tiny_products: Path
+) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
     checks = calibration.model_checks
     assert checks is not None
-    held = HeldTerm('cx', 320.0, 326.0, 2.0)
     found = dataclasses.replace(checks, field_rms_px=0.25, field_worst_px=0.86, held=(held,))
     lens, term, *others = model_rows(
         dataclasses.replace(calibration, model_checks=found, zero_skew_cost_px=0.5)
@@ -27,9 +35,10 @@ def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
         'camera_info, without field and skew, differs from the calibration by at most 0.5 px'
     )
     assert lens.p_value == '' and 'starcal lookup' in lens.remedy
-    assert term.found == 'the stars put it at 326: 3.0 sigma of the difference'
+    assert term.assumption == f'{held.name} is as assumed'
+    assert term.found == f'{by_stars}: 3.0 sigma of the difference'
     assert float(term.p_value) == pytest.approx(0.0027)
-    assert term.remedy.startswith('estimate cx')
+    assert term.remedy.startswith(remedy)
     assert [row.assumption for row in others] == [
         'The detector has no step',
         'The camera is the same in all images',

@@ -192,8 +192,8 @@ def test_a_good_calibration_passes() -> None:
             7.4,
             (
                 'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
-                'of 7.4 sigma (max_held_term_sigma); -60000 by the stars, 0 assumed; check '
-                'the velocity; on the ground state the site'
+                'of 7.4 sigma (max_held_term_sigma); the stars add -60000 to it; correct '
+                'the velocity so; on the ground state the site'
             ),
         ),
         (
@@ -203,7 +203,7 @@ def test_a_good_calibration_passes() -> None:
             159.0,
             (
                 'distance of mounting of head_2 x_deg from its assumed value is 160 sigma, over '
-                'the limit of 159 sigma (max_held_term_sigma); 20 by the stars, 0 assumed; '
+                'the limit of 159 sigma (max_held_term_sigma); the stars add 20 to it; '
                 'check more_alignments'
             ),
         ),

@@ -430,6 +430,8 @@ def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> 
     [
         ({}, None, np.nan),
         ({}, [0.0, 3e4, 0.0], 10.0),
+        ({}, [0.0, 7.6e3, 0.0], np.nan),
+        ({'observer_velocity_m_s': [0.0, 0.0, 1.0]}, None, np.nan),
         ({'observer_velocity_m_s': [0.0, 3e4, 0.0]}, None, 10.0),
         ({'observer_velocity_m_s': [9e4, 0.0, 0.0]}, [0.0, 3e4, 0.0], 10.0),
         ({'observer': 'ground', 'latitude_deg': 30.0}, [0.0, 3e4, 0.0], 0.0),

@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import erfa
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -168,6 +169,43 @@ def test_conjugated(night: Night, catalog: StarCatalog) -> None:
     found = found_in(with_quaternions(night, lambda q: q * [-1, -1, -1, 1]), catalog)
     assert (found.cause, found.found) == ('attitude_direction', 'inertial_to_st')
     assert found.mend[0] == 'attitude_direction: inertial_to_st'
+
+
+DATE_JD = (2440587.5, START_NS / 86400e9)
+
+
+@pytest.mark.parametrize(
+    ('axes', 'from_icrf'),
+    [
+        ('the mean equator and equinox of date', erfa.pmat06(*DATE_JD)),
+        ('the ecliptic of J2000', Rotation.from_euler('x', -84381.406 / 3600, True).as_matrix()),
+    ],
+)
+def test_attitudes_in_other_axes(axes: str, from_icrf: Any, catalog: StarCatalog) -> None:
+    turn = Rotation.from_matrix(from_icrf)
+    for change in (lambda n: n, conjugated):
+        night = with_quaternions(
+            slewing_night(), lambda q: (turn * Rotation.from_quat(q)).as_quat()
+        )
+        found = found_in(change(night), catalog)
+        assert 'axes' in (found.cause, *found.also) and 'clock' not in found.also
+        assert axes in ' '.join((found.sentence, *found.evidence))
+        assert any(
+            line.endswith('send attitudes in axes of the ICRF (J2000)') for line in found.mend
+        )
+
+
+def test_attitudes_that_turn_with_the_earth(catalog: StarCatalog) -> None:
+    night = slewing_night()
+    days = night.attitudes.time_ns / 86400e9
+    earth_from_icrf = [
+        erfa.rz(erfa.gst06a(DATE_JD[0], day, DATE_JD[0], day), erfa.pnm06a(DATE_JD[0], day))
+        for day in days
+    ]
+    turns = Rotation.from_matrix(np.array(earth_from_icrf))
+    sent = with_quaternions(night, lambda q: (turns * Rotation.from_quat(q)).as_quat())
+    found = found_in(sent, catalog)
+    assert (found.cause, found.found) == ('axes', 'the rotating Earth')
 
 
 def test_wrong_attitude_direction(night: Night, catalog: StarCatalog) -> None:
