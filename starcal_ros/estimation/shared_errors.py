@@ -45,7 +45,9 @@ _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # of octaves: not tied to the one before, as any amplitude
 _STRIPS = (1 / 48, 1 / 192)  # of the width: height of groups of rows, width of groups of columns
-_NO_EFFECT = 0.01  # of the variance of the mean of a group
+# Of the variance of the mean of a group.  In the thousands of images in which a star is seen a
+# hundred times, what no residual shows of its place comes to 0.01, and costs a third of the time.
+_NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _ROUNDING = 1e-9  # of sums over pairs, where there are none
 _ROUNDS = 8  # of the factors of stars
@@ -93,7 +95,7 @@ class SharedError:
     @property
     def matters(self) -> bool:
         """True if the precision of an estimate changes by the error."""
-        return self.effect > _NO_EFFECT
+        return self.effect > (_NO_EFFECT_OF_STAR if self.of_star else _NO_EFFECT)
 
 
 @dataclass(frozen=True)
