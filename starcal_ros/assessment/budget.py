@@ -257,7 +257,8 @@ def _known(errors: ErrorParts, estimate: Estimate, names: Sequence[str]) -> Floa
 def _known_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
     """Return T (r, r) of an estimator that is given the shapes of the images."""
     without = equations(estimate.sums, estimate.linear, _KNOWN_SHAPE_PX)
-    hidden = errors.root.T @ (without.information - estimate.posterior.information) @ errors.root
+    given = estimate.posterior.equations
+    hidden = errors.root.T @ (without.information - given.information) @ errors.root
     values, vectors = np.linalg.eigh(hidden)
     return np.asarray((vectors * (1.0 + values.clip(0.0)) ** -0.5) @ vectors.T)
 

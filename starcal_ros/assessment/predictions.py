@@ -188,6 +188,7 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
 def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     """Return unknowns (d,), means (P,) of all and information (d, d) at the best amplitudes."""
     posterior, layout = estimate.posterior, estimate.linear.layout
+    given = posterior.equations
     entry, field = layout['field'], layout.of(['field'])
     assert entry.octave is not None and entry.term is not None
     sigma_px = entry.sigma * np.exp(posterior.field.log_px)[entry.octave]
@@ -195,16 +196,16 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     term[field], precision[field] = entry.term * np.exp(posterior.term.log_px[0]), sigma_px**-2.0
     # The sidereal time of an image that is left out is not known from the others: kept as found.
     # Coefficients of the field that their prior holds at zero say nothing of an image.
-    shown = (sigma_px**2 + term[field] ** 2) * np.diag(posterior.information)[field]
+    shown = (sigma_px**2 + term[field] ** 2) * np.diag(given.information)[field]
     kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])
     part, held = np.setdiff1d(posterior.estimated, kept), np.intersect1d(posterior.estimated, kept)
     own = precision[part]
     pull = own * term[part]
-    information = posterior.information[np.ix_(part, part)] + np.diag(own)
+    information = given.information[np.ix_(part, part)] + np.diag(own)
     information -= np.outer(pull, pull) / (1.0 + term[part] @ pull)
     mean = posterior.mean.copy()
-    right = posterior.gradient[part] - own * layout.prior_offset[part]
-    right -= posterior.information[np.ix_(part, held)] @ mean[held]
+    right = given.gradient[part] - own * layout.prior_offset[part]
+    right -= given.information[np.ix_(part, held)] @ mean[held]
     mean[part] = inverse(information) @ right
     return part, mean, information
 
@@ -213,7 +214,8 @@ def _images(
     estimate: Estimate, part: Indices, mean: Floats
 ) -> Iterator[tuple[Indices, Floats, Floats, Floats]]:
     """Yield rows, columns (2 n, d), own columns (2 n, b) and residuals (2 n,) of each image."""
-    of_images = estimate.posterior.own - estimate.posterior.back @ mean
+    equations = estimate.posterior.equations
+    of_images = equations.own - equations.back @ mean
     for chunk, shared, own, residual in star_rows(estimate.linear):
         left = residual - shared @ mean
         left -= np.einsum('mij,mj->mi', own, of_images[chunk.image])

@@ -79,7 +79,6 @@ from starcal_ros.estimation.weights import (
     Judged,
     sky_rotations,
     tracker_attitudes,
-    tracker_covariances,
     weighted_attitudes,
 )
 from starcal_ros.records import (
@@ -286,7 +285,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         judged.inflation_px2(table),
         from_sky,
         judged.errors,
-        tracker_covariances(last.linear.problem, data, last.attitudes),
+        last.attitudes.trackers,
     )
     return _result(data, ensemble, last, judged, weights, iterations, termination)
 
@@ -331,7 +330,7 @@ def _round(
     # What is not in the state, as a velocity, is at its mean: the images follow both.
     shared = found.mean.copy()
     shared[layout.of(_IN_STATE)] *= share
-    own = found.own - found.back @ shared
+    own = found.equations.own - found.equations.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
     left_px = residuals_px(problem, after, table, layout, found, size)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
@@ -475,7 +474,7 @@ def _result(
         covariance=covariance[np.ix_(basic, basic)],
         joint_covariance=covariance[np.ix_(joint, joint)],
         pixel_sigma_px=math.sqrt(pixel_variance_px2(judged.errors)),
-        information=found.information[np.ix_(asked, asked)],
+        information=found.equations.information[np.ix_(asked, asked)],
         information_names=tuple(layout.labels[k] for k in asked),
         shared_covariance=covariance[np.ix_(shared, shared)],
         shared_names=names,
@@ -526,7 +525,7 @@ def _considered(found: Posterior, problem: Problem, layout: Layout) -> Floats:
         return found.covariance
     by_held = np.zeros((layout.count, len(held)))
     by_held[held] = np.diag(sigma[held])
-    by_held -= found.working @ found.information[:, held] * sigma[held]
+    by_held -= found.working @ found.equations.information[:, held] * sigma[held]
     return np.asarray(found.covariance + by_held @ by_held.T)
 
 
