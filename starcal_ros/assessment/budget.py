@@ -315,7 +315,7 @@ def _shared(
 
     causes = []
     for name, of_star in (('star places', True), ('fine structure', False)):
-        group = [error for error in estimate.shared_errors if error.of_star == of_star]
+        group = [error for error in estimate.weights.errors if error.of_star == of_star]
         if group:
             text = _estimated(
                 math.sqrt(sum(error.variance_px2 for error in group)),

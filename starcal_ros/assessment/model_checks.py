@@ -62,7 +62,7 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
         ),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)
-            for error in estimate.shared_errors
+            for error in estimate.weights.errors
         ),
         *(
             Amplitude(

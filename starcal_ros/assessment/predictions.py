@@ -282,7 +282,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
     edges = np.quantile(magnitude, np.linspace(0.0, 1.0, _BINS + 1)[1:-1])
     alike = estimate.table.image[rows] * _BINS + np.searchsorted(edges, magnitude)
     alike = np.unique(alike, return_inverse=True)[1]
-    of_stars, *finer = (error.share_px2[rows] for error in estimate.shared_errors)
+    of_stars, *finer = (error.share_px2[rows] for error in estimate.weights.errors)
     fine = np.sum(finer, axis=0)
     weight = 1.0 / variance
     bins = []

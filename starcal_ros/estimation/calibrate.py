@@ -31,7 +31,13 @@ from starcal_ros.estimation.options import (
     check_options,
 )
 from starcal_ros.estimation.outliers import dropped_stars
-from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
+from starcal_ros.estimation.posterior import (
+    LEAST_SHAPE_PX,
+    Posterior,
+    posterior,
+    Weights,
+    with_shared_errors,
+)
 from starcal_ros.estimation.problem import (
     canonical_xyzw,
     image_parameters,
@@ -39,14 +45,10 @@ from starcal_ros.estimation.problem import (
     reference_degc,
     star_tracker_names,
     State,
-    why_unsupported,
+    supported_terms,
 )
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
-from starcal_ros.estimation.shared_errors import (
-    observation_groups,
-    pixel_variance_px2,
-    SharedError,
-)
+from starcal_ros.estimation.shared_errors import observation_groups, pixel_variance_px2
 from starcal_ros.estimation.star_equations import (
     arrange,
     Measurements,
@@ -95,7 +97,6 @@ _ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
 _ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
-_FIRST_SHAPE_PX = 1e-4
 _IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')
 _SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
 _USUAL_M_S = 8000.0  # of orbits about the Earth
@@ -152,7 +153,6 @@ class Estimate:
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
-    shared_errors : tuple of SharedError
     star_trackers : tuple of StarTrackerAlignment
         Empty where there is one only.
     """
@@ -183,7 +183,6 @@ class Estimate:
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
-    shared_errors: tuple[SharedError, ...]
     star_trackers: tuple[StarTrackerAlignment, ...]
 
     @property
@@ -210,12 +209,9 @@ def estimate_calibration(
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
     problem = problem_of(ensemble, prior, options)
-    order, with_rate = options.focal_temperature_order, options.alignment_temperature
-    note = (order or with_rate) and why_unsupported(
-        np.array([image.temperature_degc for image in ensemble.images]), order
+    order, with_rate, note = supported_terms(
+        ensemble, options.focal_temperature_order, options.alignment_temperature
     )
-    if note:
-        order, with_rate = 0, False
     stated_rad = assumed_tracker_sigma_rad(options)
     data = Data(
         table,
@@ -254,7 +250,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     residual_px = residuals_px(problem, state, table)
     from_sky = sky_rotations(state, table, data.prior.camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats | float = _FIRST_SHAPE_PX
+    shape_px: Floats | float = LEAST_SHAPE_PX
     before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
@@ -265,7 +261,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shapes.sigma_px, _FIRST_SHAPE_PX)
+        shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.linear.layout, last.posterior)
         if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
@@ -496,7 +492,6 @@ def _result(
         iterations=iterations,
         termination=termination,
         thermal=_thermal(after, layout, covariance, ensemble, options),
-        shared_errors=judged.errors,
         star_trackers=star_tracker_alignments(
             star_tracker_names(ensemble),
             problem,

@@ -43,12 +43,12 @@ from starcal_ros.estimation.equations import (
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.problem import whitened_attitude_errors
-from starcal_ros.estimation.shared_errors import GroupSums, SharedError
+from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
 
 _WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
-_SMALL_SHAPE_PX = 1e-4  # to begin with
+LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Posterior:
 def posterior(
     sums: StarSums,
     linear: Linearisation,
-    before: Floats | float,
+    before: Floats | float = LEAST_SHAPE_PX,
     near: Posterior | None = None,
 ) -> Posterior:
     """
@@ -197,7 +197,7 @@ def without_prior(
     linear = dataclasses.replace(linear, layout=wide)
     at = wide.of([name])
     try:
-        found = posterior(sums, linear, _SMALL_SHAPE_PX)
+        found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
         return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
@@ -419,16 +419,16 @@ def _of_observations(
 
     With the whole variance of each error that they share.
     """
-    r = root.shape[1]
-    groups = GroupSums(
-        weights.errors, weights.variance_px2, weights.inflation_px2, weights.from_sky, r
+    rows = weighted_rows_by(linear, root, -found.equations.back @ root)
+    whole, own = group_sums(
+        weights.errors,
+        weights.variance_px2,
+        weights.inflation_px2,
+        weights.from_sky,
+        ((chunk.row, Y) for chunk, Y in rows),  # stars of no weight add nothing
+        root.shape[1],
     )
-    if not groups.own_px2.any():  # the errors are those of the working weights
-        return groups.own, {}
-    for chunk, rows in weighted_rows_by(linear, root, -found.equations.back @ root):
-        groups.add(chunk.row, rows)  # stars of no weight add nothing
-    whole = groups.whole()
-    return sum(whole.values(), -groups.own), whole
+    return sum(whole.values(), -own), whole
 
 
 def _of_attitudes(

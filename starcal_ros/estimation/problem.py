@@ -279,19 +279,21 @@ def geometry_at(
     return CameraGeometry(camera, alignment)
 
 
-def why_unsupported(temperatures_degc: Floats, order: int) -> str:
-    """Reason why temperatures (m,) do not determine thermal terms; '' if they do."""
-    unknown = int(np.count_nonzero(~np.isfinite(temperatures_degc)))
-    count = len(temperatures_degc)
-    if unknown:
-        return f'{unknown} of {count} images have no temperature'
-    spread = float(temperatures_degc.std())
-    if spread < FEWEST_SPREAD_K:
-        return f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
-    distinct = len(np.unique(temperatures_degc))
-    if distinct <= order:
-        return f'{distinct} temperatures do not determine a polynomial of degree {order}'
-    return ''
+def supported_terms(ensemble: Ensemble, order: int, with_rate: bool) -> tuple[int, bool, str]:
+    """Return order and rate of thermal terms, or none and why temperatures determine none."""
+    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
+    count, spread = len(temperatures_degc), float(temperatures_degc.std())
+    distinct, note = len(np.unique(temperatures_degc)), ''
+    if not np.isfinite(spread):
+        unknown = int(np.count_nonzero(~np.isfinite(temperatures_degc)))
+        note = f'{unknown} of {count} images have no temperature'
+    elif spread < FEWEST_SPREAD_K:
+        note = f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
+    elif distinct <= order:
+        note = f'{distinct} temperatures do not determine a polynomial of degree {order}'
+    if note and (order or with_rate):
+        return 0, False, note
+    return order, with_rate, ''
 
 
 def _powers(above_reference_k: Floats, order: int) -> Floats:

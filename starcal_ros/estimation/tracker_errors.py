@@ -402,12 +402,8 @@ def star_tracker_alignments(
         here = problem.star_tracker == k
         assumed = problem.first_from_star_tracker[here][0] if k else Rotation.identity()
         alignment = Rotation.from_rotvec(-mountings[k]) * A * assumed
-        to_angles = np.zeros((3, len(covariance)))
-        to_mounting = np.zeros_like(to_angles)
-        if k:
-            to_mounting[:, 3 * k : 3 * k + 3] = np.eye(3)
-        to_angles[:, :3] = np.eye(3)
-        to_angles += to_mounting
+        to_mounting = np.eye(3, len(covariance), 3 * k) * bool(k)
+        to_angles = np.eye(3, len(covariance)) + to_mounting
         of_mounting = to_mounting @ covariance @ to_mounting.T
         rate, total, p_value = _drift(time_ns, attitudes, sigma_rad, here)
         found.append(
