@@ -32,6 +32,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.shared_errors import pairs_of
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Ensemble, ResidualBin
 
@@ -294,7 +295,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
         count = np.bincount(group)
         predicted = np.bincount(group, weight * free) + _of_pairs(group, weight, shared)
         if by == 'cell':  # a star that comes again in its cell brings its error again
-            again = np.unique(cell * (int(star.max()) + 1) + star, return_inverse=True)[1]
+            again = pairs_of(cell, star)
             first = np.unique(again, return_index=True)[1]
             twice = _of_pairs(again, weight, of_stars)
             predicted += np.bincount(cell[first], twice, len(predicted))

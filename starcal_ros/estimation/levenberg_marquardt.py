@@ -133,8 +133,6 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     """
     p = len(normal.a)
     A = normal.A + damping * np.diag(np.diag(normal.A))
-    if len(normal.C) == 0:
-        return inverse(A) @ normal.a, np.empty_like(normal.c)
     q = normal.C.shape[-1]
     C = normal.C * (1.0 + damping * np.eye(q))
     C_inverse = inverse(C)
