@@ -282,18 +282,16 @@ def geometry_at(
 def supported_terms(ensemble: Ensemble, order: int, with_rate: bool) -> tuple[int, bool, str]:
     """Return order and rate of thermal terms, or none and why temperatures determine none."""
     temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
-    count, spread = len(temperatures_degc), float(temperatures_degc.std())
-    distinct, note = len(np.unique(temperatures_degc)), ''
-    if not np.isfinite(spread):
-        unknown = int(np.count_nonzero(~np.isfinite(temperatures_degc)))
-        note = f'{unknown} of {count} images have no temperature'
-    elif spread < FEWEST_SPREAD_K:
+    note = ''
+    if not (order or with_rate):
+        pass
+    elif unknown := np.count_nonzero(~np.isfinite(temperatures_degc)):
+        note = f'{unknown} of {len(temperatures_degc)} images have no temperature'
+    elif (spread := float(temperatures_degc.std())) < FEWEST_SPREAD_K:
         note = f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
-    elif distinct <= order:
+    elif (distinct := len(np.unique(temperatures_degc))) <= order:
         note = f'{distinct} temperatures do not determine a polynomial of degree {order}'
-    if note and (order or with_rate):
-        return 0, False, note
-    return order, with_rate, ''
+    return (0, False, note) if note else (order, with_rate, '')
 
 
 def _powers(above_reference_k: Floats, order: int) -> Floats:
