@@ -263,7 +263,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         residual_px, before = last.residual_px, last
         shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
         iterations += 1
-        step_sigma = _step_sigma(last.linear.layout, last.posterior)
+        step_sigma = _step_sigma(last.posterior)
         if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
             termination = 'converged'
             break
@@ -328,7 +328,7 @@ def _round(
     shared[layout.of(_IN_STATE)] *= share
     own = found.equations.own - found.equations.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
-    left_px = residuals_px(problem, after, table, layout, found, size)
+    left_px = residuals_px(problem, after, table, found, size)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
@@ -365,9 +365,9 @@ def _refraction(ensemble: Ensemble) -> Refraction | None:
     return Refraction(stamps, zenith, float(size), float(sigma))
 
 
-def _step_sigma(layout: Layout, found: Posterior) -> Floats:
+def _step_sigma(found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
-    in_state = layout.of(_IN_STATE)
+    in_state = found.layout.of(_IN_STATE)
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
     steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
     return np.asarray(steps)
@@ -383,9 +383,9 @@ def _check_not_mirrored(state: State) -> None:
         )
 
 
-def field_of(layout: Layout, found: Posterior, size: tuple[int, int]) -> DetectorField:
+def _field_of(found: Posterior, size: tuple[int, int]) -> DetectorField:
     """Return the field of a posterior on a detector (width, height)."""
-    coefficients = found.mean[layout.places['field']].reshape(2, -1)
+    coefficients = found.mean[found.layout.places['field']].reshape(2, -1)
     return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
@@ -393,7 +393,6 @@ def residuals_px(
     problem: Problem,
     state: State,
     table: StarTable,
-    layout: Layout | None = None,
     found: Posterior | None = None,
     size: tuple[int, int] = (0, 0),
 ) -> Floats:
@@ -407,13 +406,14 @@ def residuals_px(
     measured = table.measured_px
     rotations = state.camera_from_icrf.as_matrix()
     e = turned(rotations, table.image, table.direction_icrf)
-    if layout is not None and found is not None:
+    if found is not None:
+        layout = found.layout
         own = np.broadcast_to(own, (table.image_count, problem.camera_count)).copy()
         shapes_px = found.of_images[:, layout.places['shape']]
         modes = layout['shape'].camera
         assert modes is not None
         own += np.einsum('mps,ms->mp', modes, shapes_px)
-        measured = measured - field_of(layout, found, size).displacement_px(measured)
+        measured = measured - _field_of(found, size).displacement_px(measured)
         turn = np.zeros((3, len(table)))
         for entry in layout.entries:
             if entry.turn is not None:
@@ -443,12 +443,12 @@ def _result(
     linear, after, attitudes, kept = last.linear, last.after, last.attitudes, judged.kept
     problem, layout, residual_px = linear.problem, linear.layout, last.residual_px
     found = with_shared_errors(last.posterior, last.sums, linear, weights)
-    camera = dataclasses.replace(prior.camera, field=field_of(layout, found, size)).replace(
+    camera = dataclasses.replace(prior.camera, field=_field_of(found, size)).replace(
         **{problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
     )
     alignment = after.camera_from_star_tracker
     geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
-    covariance = _considered(found, problem, layout)
+    covariance = _considered(found, problem)
     basic = layout.of(['camera', 'alignment'])
     joint = layout.of(['camera', 'alignment', 'field'])
     shared = layout.of(_IN_STATE)
@@ -504,23 +504,20 @@ def _result(
     )
 
 
-def _considered(found: Posterior, problem: Problem, layout: Layout) -> Floats:
+def _considered(found: Posterior, problem: Problem) -> Floats:
     """
     Covariance (P, P) with that of camera parameters that are held.
 
     A held parameter with a prior sigma is a consider parameter: it keeps its prior variance, whose
     effect on the estimated unknowns is added.  Without a prior sigma its variance is zero.
     """
-    sigma = np.zeros(layout.count)
-    sigma[layout.places['camera']] = np.where(
+    sigma = np.zeros(found.layout.count)
+    sigma[found.layout.places['camera']] = np.where(
         np.isfinite(problem.prior_sigma), problem.prior_sigma, 0.0
     )
     held = np.setdiff1d(np.flatnonzero(sigma), found.estimated)
-    if len(held) == 0:
-        return found.covariance
-    by_held = np.zeros((layout.count, len(held)))
-    by_held[held] = np.diag(sigma[held])
-    by_held -= found.working @ found.equations.information[:, held] * sigma[held]
+    follow = found.working @ found.equations.information[:, held]
+    by_held = (np.eye(len(sigma))[:, held] - follow) * sigma[held]
     return np.asarray(found.covariance + by_held @ by_held.T)
 
 

@@ -244,8 +244,7 @@ def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
     Relative error: a twelfth of the squared rotation, 1e-7 at 0.06 degrees.
     """
     dT = above_reference_k[:, None, None]
-    x, y, z = rate
-    half = np.eye(3) - 0.5 * dT * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    half = np.eye(3) - 0.5 * dT * cross_matrix(rate[None])
     return np.concatenate([turns(rate, above_reference_k).as_matrix(), dT * half], axis=-1)
 
 

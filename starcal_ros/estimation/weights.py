@@ -56,7 +56,7 @@ from starcal_ros.estimation.tracker_errors import (
     tracker_errors,
     TrackerErrors,
 )
-from starcal_ros.estimation.unknowns import Layout, Refraction
+from starcal_ros.estimation.unknowns import Refraction
 from starcal_ros.records import CameraGeometry
 
 # Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
@@ -315,7 +315,7 @@ def tracker_attitudes(
     m, problem = data.table.image_count, linear.problem
     stated = data.stated_rad
     trackers: list[TrackerErrors] = []
-    rotation, covariance, seen = _rotations_of_stars(sums, linear.layout, found)
+    rotation, covariance, seen = _rotations_of_stars(sums, found)
     by_stars = Rotation.from_rotvec(-rotation) * linear.state.camera_from_icrf
     error = attitude_errors(problem, after, by_stars)
     tracker_from_camera = np.swapaxes(image_alignment(problem, after).as_matrix(), -1, -2)
@@ -367,11 +367,9 @@ def tracker_attitudes(
     return Attitudes(error, covariance, seen, misfit, tuple(trackers))
 
 
-def _rotations_of_stars(
-    sums: StarSums, layout: Layout, found: Posterior
-) -> tuple[Floats, Floats, Mask]:
+def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Floats, Mask]:
     """Rotations (m, 3) by the stars alone, their covariances (m, 3, 3), images with enough."""
-    blocks = sums.blocks
+    blocks, layout = sums.blocks, found.layout
     stars, own, rotation = chain_columns(layout)
     C = blocks[:, rotation, rotation]
     values = np.zeros(blocks.shape[:2])
