@@ -155,7 +155,7 @@ def forecast(
     A variance of fine structure that the stars show stays; one that they do not is their bound on
     it, which falls as their number grows.
     """
-    fine = [error for error in estimate.shared_errors if not error.of_star]
+    fine = [error for error in estimate.weights.errors if not error.of_star]
     hidden = sum(error.variance_px2 for error in fine if error.likelihood_ratio < _SHOWN)
     share = hidden / max(sum(error.variance_px2 for error in fine), 1e-300)
     added = np.concatenate([[0.0], np.cumsum(stars)])

@@ -205,7 +205,7 @@ def _seen(estimate: Estimate) -> tuple[_Seen, Floats]:
     camera = estimate.geometry.camera
     grid = grid_derivatives(camera)
     common = common_rotation(camera, grid)
-    means, of_pixel = _mean_squares(estimate, grid, common)
+    means, of_pixel = mean_squares(estimate, grid)
     found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
     J = np.zeros((len(found.J), 3, estimate.linear.layout.count))
     J[:, :, _rows(estimate)] = np.nan_to_num(found.of_shape(camera, common))
@@ -213,19 +213,16 @@ def _seen(estimate: Estimate) -> tuple[_Seen, Floats]:
     return _Seen(means, J), np.concatenate([[of_pixel, of_pixel], by_pixel])
 
 
-def mean_squares(estimate: Estimate) -> tuple[Floats, float]:
+def mean_squares(estimate: Estimate, grid: Derivatives | None = None) -> tuple[Floats, float]:
     """
     Return the mean of ``J' J`` over the detector for map and pointing, (2, P, P).
 
-    By the shared unknowns; with that of a displacement of the pixel along both axes.
+    By the shared unknowns; with that of a displacement of the pixel along both axes.  ``grid``:
+    the `grid_derivatives` of the camera, where they are at hand.
     """
-    grid = grid_derivatives(estimate.geometry.camera)
-    return _mean_squares(estimate, grid, common_rotation(estimate.geometry.camera, grid))
-
-
-def _mean_squares(estimate: Estimate, grid: Derivatives, common: Floats) -> tuple[Floats, float]:
     camera, layout = estimate.geometry.camera, estimate.linear.layout
-    seen = np.isfinite(grid.directions[:, 0])
+    grid = grid or grid_derivatives(camera)
+    common, seen = common_rotation(camera, grid), np.isfinite(grid.directions[:, 0])
     squares = np.zeros((2, layout.count, layout.count))
     rows = _rows(estimate)
     for k, J in enumerate((grid.of_shape(camera, common), grid.J)):
@@ -260,7 +257,8 @@ def _known(errors: ErrorParts, estimate: Estimate, names: Sequence[str]) -> Floa
 def _known_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
     """Return T (r, r) of an estimator that is given the shapes of the images."""
     without = equations(estimate.sums, estimate.linear, _KNOWN_SHAPE_PX)
-    hidden = errors.root.T @ (without.information - estimate.posterior.information) @ errors.root
+    given = estimate.posterior.equations
+    hidden = errors.root.T @ (without.information - given.information) @ errors.root
     values, vectors = np.linalg.eigh(hidden)
     return np.asarray((vectors * (1.0 + values.clip(0.0)) ** -0.5) @ vectors.T)
 
@@ -317,7 +315,7 @@ def _shared(
 
     causes = []
     for name, of_star in (('star places', True), ('fine structure', False)):
-        group = [error for error in estimate.shared_errors if error.of_star == of_star]
+        group = [error for error in estimate.weights.errors if error.of_star == of_star]
         if group:
             text = _estimated(
                 math.sqrt(sum(error.variance_px2 for error in group)),

@@ -62,7 +62,7 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
         ),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)
-            for error in estimate.shared_errors
+            for error in estimate.weights.errors
         ),
         *(
             Amplitude(
@@ -108,11 +108,11 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
-        cross = found.information[k]
+        cross = found.equations.information[k]
         information = float(cross[k] - cross @ found.working @ cross)
         if information <= 1e-9 * cross[k]:
             continue
-        step = float(found.gradient[k] - cross @ found.mean) / information
+        step = float(found.equations.gradient[k] - cross @ found.mean) / information
         held = float(estimate.linear.state.parameters[k - camera[0]])
         terms.append(HeldTerm(layout.labels[k], held, held + step, information**-0.5))
     total, working = np.diag(found.covariance), np.diag(found.working)

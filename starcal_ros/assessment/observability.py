@@ -17,7 +17,7 @@ from starcal_ros.estimation.equations import information_of_images, stars_alone,
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.outliers import FEWEST_STARS
-from starcal_ros.estimation.problem import image_blocks, Problem, State, why_unsupported
+from starcal_ros.estimation.problem import image_blocks, Problem, State, supported_terms
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
@@ -64,7 +64,9 @@ def image_information(
     with fewer than three stars in front of the camera has zero information.
     """
     ensemble = Ensemble(images)
-    order, with_rate = _supported_terms(ensemble, options)
+    order, with_rate, _ = supported_terms(
+        ensemble, options.focal_temperature_order, options.alignment_temperature
+    )
     problem, state, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
     layout = unknowns_in_state(problem, state)
     kept = estimated(layout)
@@ -98,21 +100,14 @@ def predicted_sigma(
     names = estimated_names(options, prior.camera.model)
     if not ensemble.images:
         return np.full(len(names), np.inf)
-    terms = _supported_terms(ensemble, options)
-    found = _sigma_with(ensemble, prior, options, *terms)
-    if not found and terms != (0, False):
+    order, with_rate, _ = supported_terms(
+        ensemble, options.focal_temperature_order, options.alignment_temperature
+    )
+    found = _sigma_with(ensemble, prior, options, order, with_rate)
+    if not found and (order or with_rate):
         # Sigmas without temperature terms, until images cover a wider range of temperatures.
         found = _sigma_with(ensemble, prior, options, 0, False)
     return np.array([found.get(name, np.inf) for name in names])
-
-
-def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
-    """Order of the focal terms, and True for an alignment rate: if requested and supported."""
-    order, with_rate = options.focal_temperature_order, options.alignment_temperature
-    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
-    if (order or with_rate) and why_unsupported(temperatures_degc, order):
-        return 0, False
-    return order, with_rate
 
 
 def _at_the_prior(

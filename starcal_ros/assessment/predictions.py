@@ -32,6 +32,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.shared_errors import pairs_of
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Ensemble, ResidualBin
 
@@ -188,6 +189,7 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
 def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     """Return unknowns (d,), means (P,) of all and information (d, d) at the best amplitudes."""
     posterior, layout = estimate.posterior, estimate.linear.layout
+    given = posterior.equations
     entry, field = layout['field'], layout.of(['field'])
     assert entry.octave is not None and entry.term is not None
     sigma_px = entry.sigma * np.exp(posterior.field.log_px)[entry.octave]
@@ -195,16 +197,16 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     term[field], precision[field] = entry.term * np.exp(posterior.term.log_px[0]), sigma_px**-2.0
     # The sidereal time of an image that is left out is not known from the others: kept as found.
     # Coefficients of the field that their prior holds at zero say nothing of an image.
-    shown = (sigma_px**2 + term[field] ** 2) * np.diag(posterior.information)[field]
+    shown = (sigma_px**2 + term[field] ** 2) * np.diag(given.information)[field]
     kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])
     part, held = np.setdiff1d(posterior.estimated, kept), np.intersect1d(posterior.estimated, kept)
     own = precision[part]
     pull = own * term[part]
-    information = posterior.information[np.ix_(part, part)] + np.diag(own)
+    information = given.information[np.ix_(part, part)] + np.diag(own)
     information -= np.outer(pull, pull) / (1.0 + term[part] @ pull)
     mean = posterior.mean.copy()
-    right = posterior.gradient[part] - own * layout.prior_offset[part]
-    right -= posterior.information[np.ix_(part, held)] @ mean[held]
+    right = given.gradient[part] - own * layout.prior_offset[part]
+    right -= given.information[np.ix_(part, held)] @ mean[held]
     mean[part] = inverse(information) @ right
     return part, mean, information
 
@@ -213,7 +215,8 @@ def _images(
     estimate: Estimate, part: Indices, mean: Floats
 ) -> Iterator[tuple[Indices, Floats, Floats, Floats]]:
     """Yield rows, columns (2 n, d), own columns (2 n, b) and residuals (2 n,) of each image."""
-    of_images = estimate.posterior.own - estimate.posterior.back @ mean
+    equations = estimate.posterior.equations
+    of_images = equations.own - equations.back @ mean
     for chunk, shared, own, residual in star_rows(estimate.linear):
         left = residual - shared @ mean
         left -= np.einsum('mij,mj->mi', own, of_images[chunk.image])
@@ -280,7 +283,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
     edges = np.quantile(magnitude, np.linspace(0.0, 1.0, _BINS + 1)[1:-1])
     alike = estimate.table.image[rows] * _BINS + np.searchsorted(edges, magnitude)
     alike = np.unique(alike, return_inverse=True)[1]
-    of_stars, *finer = (error.share_px2[rows] for error in estimate.shared_errors)
+    of_stars, *finer = (error.share_px2[rows] for error in estimate.weights.errors)
     fine = np.sum(finer, axis=0)
     weight = 1.0 / variance
     bins = []
@@ -292,7 +295,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
         count = np.bincount(group)
         predicted = np.bincount(group, weight * free) + _of_pairs(group, weight, shared)
         if by == 'cell':  # a star that comes again in its cell brings its error again
-            again = np.unique(cell * (int(star.max()) + 1) + star, return_inverse=True)[1]
+            again = pairs_of(cell, star)
             first = np.unique(again, return_index=True)[1]
             twice = _of_pairs(again, weight, of_stars)
             predicted += np.bincount(cell[first], twice, len(predicted))

@@ -31,7 +31,13 @@ from starcal_ros.estimation.options import (
     check_options,
 )
 from starcal_ros.estimation.outliers import dropped_stars
-from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
+from starcal_ros.estimation.posterior import (
+    LEAST_SHAPE_PX,
+    Posterior,
+    posterior,
+    Weights,
+    with_shared_errors,
+)
 from starcal_ros.estimation.problem import (
     canonical_xyzw,
     image_parameters,
@@ -39,14 +45,10 @@ from starcal_ros.estimation.problem import (
     reference_degc,
     star_tracker_names,
     State,
-    why_unsupported,
+    supported_terms,
 )
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
-from starcal_ros.estimation.shared_errors import (
-    observation_groups,
-    pixel_variance_px2,
-    SharedError,
-)
+from starcal_ros.estimation.shared_errors import observation_groups, pixel_variance_px2
 from starcal_ros.estimation.star_equations import (
     arrange,
     Measurements,
@@ -79,7 +81,6 @@ from starcal_ros.estimation.weights import (
     Judged,
     sky_rotations,
     tracker_attitudes,
-    tracker_covariances,
     weighted_attitudes,
 )
 from starcal_ros.records import (
@@ -96,7 +97,6 @@ _ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
 _ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
-_FIRST_SHAPE_PX = 1e-4
 _IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')
 _SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
 _USUAL_M_S = 8000.0  # of orbits about the Earth
@@ -153,7 +153,6 @@ class Estimate:
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
-    shared_errors : tuple of SharedError
     star_trackers : tuple of StarTrackerAlignment
         Empty where there is one only.
     """
@@ -184,7 +183,6 @@ class Estimate:
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
-    shared_errors: tuple[SharedError, ...]
     star_trackers: tuple[StarTrackerAlignment, ...]
 
     @property
@@ -211,12 +209,9 @@ def estimate_calibration(
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
     problem = problem_of(ensemble, prior, options)
-    order, with_rate = options.focal_temperature_order, options.alignment_temperature
-    note = (order or with_rate) and why_unsupported(
-        np.array([image.temperature_degc for image in ensemble.images]), order
+    order, with_rate, note = supported_terms(
+        ensemble, options.focal_temperature_order, options.alignment_temperature
     )
-    if note:
-        order, with_rate = 0, False
     stated_rad = assumed_tracker_sigma_rad(options)
     data = Data(
         table,
@@ -255,7 +250,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     residual_px = residuals_px(problem, state, table)
     from_sky = sky_rotations(state, table, data.prior.camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats | float = _FIRST_SHAPE_PX
+    shape_px: Floats | float = LEAST_SHAPE_PX
     before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
@@ -266,9 +261,9 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shapes.sigma_px, _FIRST_SHAPE_PX)
+        shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
         iterations += 1
-        step_sigma = _step_sigma(last.linear.layout, last.posterior)
+        step_sigma = _step_sigma(last.posterior)
         if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
             termination = 'converged'
             break
@@ -286,7 +281,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         judged.inflation_px2(table),
         from_sky,
         judged.errors,
-        tracker_covariances(last.linear.problem, data, last.attitudes),
+        last.attitudes.trackers,
     )
     return _result(data, ensemble, last, judged, weights, iterations, termination)
 
@@ -331,9 +326,9 @@ def _round(
     # What is not in the state, as a velocity, is at its mean: the images follow both.
     shared = found.mean.copy()
     shared[layout.of(_IN_STATE)] *= share
-    own = found.own - found.back @ shared
+    own = found.equations.own - found.equations.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
-    left_px = residuals_px(problem, after, table, layout, found, size)
+    left_px = residuals_px(problem, after, table, found, size)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
@@ -370,9 +365,9 @@ def _refraction(ensemble: Ensemble) -> Refraction | None:
     return Refraction(stamps, zenith, float(size), float(sigma))
 
 
-def _step_sigma(layout: Layout, found: Posterior) -> Floats:
+def _step_sigma(found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
-    in_state = layout.of(_IN_STATE)
+    in_state = found.layout.of(_IN_STATE)
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
     steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
     return np.asarray(steps)
@@ -388,9 +383,9 @@ def _check_not_mirrored(state: State) -> None:
         )
 
 
-def field_of(layout: Layout, found: Posterior, size: tuple[int, int]) -> DetectorField:
+def _field_of(found: Posterior, size: tuple[int, int]) -> DetectorField:
     """Return the field of a posterior on a detector (width, height)."""
-    coefficients = found.mean[layout.places['field']].reshape(2, -1)
+    coefficients = found.mean[found.layout.places['field']].reshape(2, -1)
     return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
@@ -398,7 +393,6 @@ def residuals_px(
     problem: Problem,
     state: State,
     table: StarTable,
-    layout: Layout | None = None,
     found: Posterior | None = None,
     size: tuple[int, int] = (0, 0),
 ) -> Floats:
@@ -412,13 +406,14 @@ def residuals_px(
     measured = table.measured_px
     rotations = state.camera_from_icrf.as_matrix()
     e = turned(rotations, table.image, table.direction_icrf)
-    if layout is not None and found is not None:
+    if found is not None:
+        layout = found.layout
         own = np.broadcast_to(own, (table.image_count, problem.camera_count)).copy()
         shapes_px = found.of_images[:, layout.places['shape']]
         modes = layout['shape'].camera
         assert modes is not None
         own += np.einsum('mps,ms->mp', modes, shapes_px)
-        measured = measured - field_of(layout, found, size).displacement_px(measured)
+        measured = measured - _field_of(found, size).displacement_px(measured)
         turn = np.zeros((3, len(table)))
         for entry in layout.entries:
             if entry.turn is not None:
@@ -448,12 +443,12 @@ def _result(
     linear, after, attitudes, kept = last.linear, last.after, last.attitudes, judged.kept
     problem, layout, residual_px = linear.problem, linear.layout, last.residual_px
     found = with_shared_errors(last.posterior, last.sums, linear, weights)
-    camera = dataclasses.replace(prior.camera, field=field_of(layout, found, size)).replace(
+    camera = dataclasses.replace(prior.camera, field=_field_of(found, size)).replace(
         **{problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
     )
     alignment = after.camera_from_star_tracker
     geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
-    covariance = _considered(found, problem, layout)
+    covariance = _considered(found, problem)
     basic = layout.of(['camera', 'alignment'])
     joint = layout.of(['camera', 'alignment', 'field'])
     shared = layout.of(_IN_STATE)
@@ -475,7 +470,7 @@ def _result(
         covariance=covariance[np.ix_(basic, basic)],
         joint_covariance=covariance[np.ix_(joint, joint)],
         pixel_sigma_px=math.sqrt(pixel_variance_px2(judged.errors)),
-        information=found.information[np.ix_(asked, asked)],
+        information=found.equations.information[np.ix_(asked, asked)],
         information_names=tuple(layout.labels[k] for k in asked),
         shared_covariance=covariance[np.ix_(shared, shared)],
         shared_names=names,
@@ -497,7 +492,6 @@ def _result(
         iterations=iterations,
         termination=termination,
         thermal=_thermal(after, layout, covariance, ensemble, options),
-        shared_errors=judged.errors,
         star_trackers=star_tracker_alignments(
             star_tracker_names(ensemble),
             problem,
@@ -510,23 +504,20 @@ def _result(
     )
 
 
-def _considered(found: Posterior, problem: Problem, layout: Layout) -> Floats:
+def _considered(found: Posterior, problem: Problem) -> Floats:
     """
     Covariance (P, P) with that of camera parameters that are held.
 
     A held parameter with a prior sigma is a consider parameter: it keeps its prior variance, whose
     effect on the estimated unknowns is added.  Without a prior sigma its variance is zero.
     """
-    sigma = np.zeros(layout.count)
-    sigma[layout.places['camera']] = np.where(
+    sigma = np.zeros(found.layout.count)
+    sigma[found.layout.places['camera']] = np.where(
         np.isfinite(problem.prior_sigma), problem.prior_sigma, 0.0
     )
     held = np.setdiff1d(np.flatnonzero(sigma), found.estimated)
-    if len(held) == 0:
-        return found.covariance
-    by_held = np.zeros((layout.count, len(held)))
-    by_held[held] = np.diag(sigma[held])
-    by_held -= found.working @ found.information[:, held] * sigma[held]
+    follow = found.working @ found.equations.information[:, held]
+    by_held = (np.eye(len(sigma))[:, held] - follow) * sigma[held]
     return np.asarray(found.covariance + by_held @ by_held.T)
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 
@@ -104,7 +105,7 @@ class Equations:
     own: Floats
     covariance: Floats
 
-    @property
+    @functools.cached_property
     def back(self) -> Floats:
         """``C_k^-1 B_k`` (m, b, P): unknowns of an image follow the shared by ``own - back x``."""
         return np.asarray(self.covariance @ self.cross)

@@ -55,11 +55,8 @@ class NormalEquations:
     c: Floats
 
 
-NormalT = TypeVar('NormalT', bound=NormalEquations)
-
-
 @dataclass(frozen=True)
-class Solution(Generic[StateT, NormalT]):
+class Solution(Generic[StateT]):
     """
     Final state of the search, its normal equations, and the reason of its termination.
 
@@ -68,7 +65,7 @@ class Solution(Generic[StateT, NormalT]):
     """
 
     state: StateT
-    normal: NormalT
+    normal: NormalEquations
     iterations: int
     termination: str
 
@@ -136,8 +133,6 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     """
     p = len(normal.a)
     A = normal.A + damping * np.diag(np.diag(normal.A))
-    if len(normal.C) == 0:
-        return inverse(A) @ normal.a, np.empty_like(normal.c)
     q = normal.C.shape[-1]
     C = normal.C * (1.0 + damping * np.eye(q))
     C_inverse = inverse(C)
@@ -150,10 +145,10 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
 
 def levenberg_marquardt(
     state: StateT,
-    evaluate: Callable[[StateT], NormalT],
+    evaluate: Callable[[StateT], NormalEquations],
     move: Callable[[StateT, Floats, Floats], StateT],
     least_gain: float = 0.0,
-) -> Solution[StateT, NormalT]:
+) -> Solution[StateT]:
     """
     Minimum of the cost from a start.
 

@@ -90,9 +90,8 @@ def _squared_beside(
 
 def dropped_stars(table: StarTable, kept: Mask) -> NDArray[np.int64]:
     """Return catalog stars seen often enough to be told apart and left out of all images."""
-    catalog_id, star = np.unique(table.catalog_id, return_inverse=True)
-    sightings, uses = np.bincount(star), np.bincount(star, kept)
-    return np.asarray(catalog_id[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
+    sightings, uses = np.bincount(table.star), np.bincount(table.star, kept)
+    return np.asarray(np.unique(table.catalog_id)[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
 
 
 def misfit_images(

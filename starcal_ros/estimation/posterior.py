@@ -43,11 +43,12 @@ from starcal_ros.estimation.equations import (
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.problem import whitened_attitude_errors
-from starcal_ros.estimation.shared_errors import GroupSums, SharedError
+from starcal_ros.estimation.shared_errors import group_sums, SharedError
+from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
 
 _WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
-_SMALL_SHAPE_PX = 1e-4  # to begin with
+LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,8 @@ class Posterior:
     working : (P, P)
         Covariance under independent errors of the working weights; what all images share in their
         shapes is not in it.
-    own, back : (m, b), (m, b, P)
-        The unknowns of an image are ``own - back mean``.
-    image_covariance : (m, b, b)
-        Covariance of the unknowns of an image, the shared ones known.
+    equations : Equations
+        From the stars and the star trackers, at these amplitudes of the shapes.
     estimated : (e,) int
         Shared unknowns that are estimated; the others are held.
     field, term : Amplitudes
@@ -95,8 +94,6 @@ class Posterior:
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
-    information, gradient : (P, P), (P,)
-        From the stars and the star trackers, without priors, the images eliminated.
     log_evidence : float
         Of the data given the priors, but for what follows from the data alone.
     layout : Layout
@@ -106,17 +103,13 @@ class Posterior:
 
     mean: Floats
     working: Floats
-    own: Floats
-    back: Floats
-    image_covariance: Floats
+    equations: Equations
     estimated: Indices
     field: Amplitudes
     term: Amplitudes
     shapes: Shapes
     last_octave: tuple[Floats, Floats]
     resolved: float
-    information: Floats
-    gradient: Floats
     log_evidence: float
     layout: Layout
     errors: ErrorParts | None = None
@@ -132,13 +125,13 @@ class Posterior:
     @property
     def of_images(self) -> Floats:
         """Mean (m, b) of the unknowns of the images."""
-        return np.asarray(self.own - self.back @ self.mean)
+        return np.asarray(self.equations.own - self.equations.back @ self.mean)
 
 
 def posterior(
     sums: StarSums,
     linear: Linearisation,
-    before: Floats | float,
+    before: Floats | float = LEAST_SHAPE_PX,
     near: Posterior | None = None,
 ) -> Posterior:
     """
@@ -174,17 +167,13 @@ def posterior(
     return Posterior(
         mean=mean,
         working=covariance,
-        own=last.own,
-        back=last.back,
-        image_covariance=last.covariance,
+        equations=last,
         estimated=solver.estimated,
         field=base,
         term=term,
         shapes=found,
         last_octave=last_octave,
         resolved=resolved,
-        information=last.information,
-        gradient=last.gradient,
         log_evidence=log_evidence,
         layout=layout,
     )
@@ -208,7 +197,7 @@ def without_prior(
     linear = dataclasses.replace(linear, layout=wide)
     at = wide.of([name])
     try:
-        found = posterior(sums, linear, _SMALL_SHAPE_PX)
+        found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
         return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
@@ -364,17 +353,14 @@ class Weights:
         Variance per axis that the working weights have beyond that of each observation.
     from_sky : (n, 2, 2)
     errors : tuple of SharedError
-    attitudes : tuple of (images, axes, groups, covariance, independent)
-        Images (k,) of each star tracker, some of its axes, the groups (k,) of the images and the
-        covariance (g, g) of errors of images of these groups about each axis in working sigmas,
-        with the part of its diagonal that images do not share.
+    trackers : tuple of TrackerErrors
     """
 
     variance_px2: Floats
     inflation_px2: Floats
     from_sky: Floats
     errors: tuple[SharedError, ...]
-    attitudes: tuple[tuple[Indices, tuple[int, ...], Indices, Floats, float], ...]
+    trackers: tuple[TrackerErrors, ...]
 
 
 def with_shared_errors(
@@ -433,16 +419,16 @@ def _of_observations(
 
     With the whole variance of each error that they share.
     """
-    r = root.shape[1]
-    groups = GroupSums(
-        weights.errors, weights.variance_px2, weights.inflation_px2, weights.from_sky, r
+    rows = weighted_rows_by(linear, root, -found.equations.back @ root)
+    whole, own = group_sums(
+        weights.errors,
+        weights.variance_px2,
+        weights.inflation_px2,
+        weights.from_sky,
+        ((chunk.row, Y) for chunk, Y in rows),  # stars of no weight add nothing
+        root.shape[1],
     )
-    if not groups.own_px2.any():  # the errors are those of the working weights
-        return groups.own, {}
-    for chunk, rows in weighted_rows_by(linear, root, -found.back @ root):
-        groups.add(chunk.row, rows)  # stars of no weight add nothing
-    whole = groups.whole()
-    return sum(whole.values(), -groups.own), whole
+    return sum(whole.values(), -own), whole
 
 
 def _of_attitudes(
@@ -451,17 +437,20 @@ def _of_attitudes(
     """Return the same (r, r) of the star-tracker attitudes, by noise and slow errors."""
     _, J = whitened_attitude_errors(linear.problem, linear.state)
     at, turns = tracker_turns(linear.layout)
-    rows = J @ (-(turns @ root[at]) - found.back[:, IMAGE_ROTATION] @ root)
+    rows = J @ (-(turns @ root[at]) - found.equations.back[:, IMAGE_ROTATION] @ root)
     r = root.shape[1]
     working, noise, slow = np.zeros((3, r, r))
-    for images, axes, group, covariance, independent in weights.attitudes:
-        shared = covariance - independent * np.eye(len(covariance))
+    sigma_rad = linear.problem.star_tracker_sigma_rad
+    for tracker in weights.trackers:
+        group, images = tracker.group, tracker.images
+        to_working2 = (tracker.sigma_rad / sigma_rad[images[0], tracker.axes[0]]) ** 2
+        shared = tracker.covariance - tracker.independent * np.eye(len(tracker.covariance))
         member = csr_array((np.ones(len(group)), (group, np.arange(len(group)))))
-        for axis in axes:
+        for axis in tracker.axes:
             part = rows[images, axis]
             square = part.T @ part
             working += square
-            noise += independent * square
+            noise += to_working2 * tracker.independent * square
             summed = member @ part
-            slow += summed.T @ shared @ summed
+            slow += to_working2 * summed.T @ shared @ summed
     return noise + slow - working, {TRACKER_NOISE: noise, TRACKER_SLOW: slow}

@@ -244,8 +244,7 @@ def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
     Relative error: a twelfth of the squared rotation, 1e-7 at 0.06 degrees.
     """
     dT = above_reference_k[:, None, None]
-    x, y, z = rate
-    half = np.eye(3) - 0.5 * dT * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    half = np.eye(3) - 0.5 * dT * cross_matrix(rate[None])
     return np.concatenate([turns(rate, above_reference_k).as_matrix(), dT * half], axis=-1)
 
 
@@ -279,19 +278,19 @@ def geometry_at(
     return CameraGeometry(camera, alignment)
 
 
-def why_unsupported(temperatures_degc: Floats, order: int) -> str:
-    """Reason why temperatures (m,) do not determine thermal terms; '' if they do."""
-    unknown = int(np.count_nonzero(~np.isfinite(temperatures_degc)))
-    count = len(temperatures_degc)
-    if unknown:
-        return f'{unknown} of {count} images have no temperature'
-    spread = float(temperatures_degc.std())
-    if spread < FEWEST_SPREAD_K:
-        return f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
-    distinct = len(np.unique(temperatures_degc))
-    if distinct <= order:
-        return f'{distinct} temperatures do not determine a polynomial of degree {order}'
-    return ''
+def supported_terms(ensemble: Ensemble, order: int, with_rate: bool) -> tuple[int, bool, str]:
+    """Return order and rate of thermal terms, or none and why temperatures determine none."""
+    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
+    note = ''
+    if not (order or with_rate):
+        pass
+    elif unknown := np.count_nonzero(~np.isfinite(temperatures_degc)):
+        note = f'{unknown} of {len(temperatures_degc)} images have no temperature'
+    elif (spread := float(temperatures_degc.std())) < FEWEST_SPREAD_K:
+        note = f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
+    elif (distinct := len(np.unique(temperatures_degc))) <= order:
+        note = f'{distinct} temperatures do not determine a polynomial of degree {order}'
+    return (0, False, note) if note else (order, with_rate, '')
 
 
 def _powers(above_reference_k: Floats, order: int) -> Floats:

@@ -43,7 +43,7 @@ from starcal_ros.estimation.star_equations import Measurements, StarTable, turne
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
 from starcal_ros.records import CameraGeometry, Ensemble
 
-Minimum = Solution[State, NormalEquations]
+Minimum = Solution[State]
 _SERIES_RAD = 0.3  # angle from the axis at which all orders of a distortion may be as large
 
 

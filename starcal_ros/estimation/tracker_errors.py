@@ -18,7 +18,7 @@ the noise of the star tracker that gave the rate, which is estimated anyway.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
@@ -89,6 +89,11 @@ class TrackerErrors:
         Part of the diagonal of ``covariance`` that images do not share.
     axes : tuple of int
         Those of the star tracker.
+    sigma_rad : float
+        Their stated sigma.
+    images : (m,) int
+    correlations : Correlations or None
+        None where the star tracker is taken as exact.
     """
 
     noise: float
@@ -100,6 +105,9 @@ class TrackerErrors:
     correlation: str
     independent: float
     axes: tuple[int, ...] = (0, 1, 2)
+    sigma_rad: float = 1.0
+    images: Indices = field(default_factory=lambda: np.empty(0, np.int64))
+    correlations: Correlations | None = None
 
 
 def tracker_errors(
@@ -360,8 +368,6 @@ class Attitudes:
     seen: Mask
     misfit: Mask
     trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
-    images: tuple[Indices, ...]  # of each of them, those that fit
-    correlations: tuple[Correlations, ...] = ()  # of these images
 
 
 def star_tracker_alignments(
@@ -396,12 +402,8 @@ def star_tracker_alignments(
         here = problem.star_tracker == k
         assumed = problem.first_from_star_tracker[here][0] if k else Rotation.identity()
         alignment = Rotation.from_rotvec(-mountings[k]) * A * assumed
-        to_angles = np.zeros((3, len(covariance)))
-        to_mounting = np.zeros_like(to_angles)
-        if k:
-            to_mounting[:, 3 * k : 3 * k + 3] = np.eye(3)
-        to_angles[:, :3] = np.eye(3)
-        to_angles += to_mounting
+        to_mounting = np.eye(3, len(covariance), 3 * k) * bool(k)
+        to_angles = np.eye(3, len(covariance)) + to_mounting
         of_mounting = to_mounting @ covariance @ to_mounting.T
         rate, total, p_value = _drift(time_ns, attitudes, sigma_rad, here)
         found.append(

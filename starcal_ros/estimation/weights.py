@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import CameraModel, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import (
@@ -51,13 +51,12 @@ from starcal_ros.estimation.shared_errors import (
 from starcal_ros.estimation.star_equations import ROTATION, StarTable, turned, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
     Attitudes,
-    Correlations,
     correlations_of,
     Rates,
     tracker_errors,
     TrackerErrors,
 )
-from starcal_ros.estimation.unknowns import Layout, Refraction
+from starcal_ros.estimation.unknowns import Refraction
 from starcal_ros.records import CameraGeometry
 
 # Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
@@ -264,26 +263,12 @@ def weighted_attitudes(
         error = attitude_errors(problem, state, state.camera_from_icrf) / data.stated_rad
         factor *= max(1.0, _SIGMA_PER_MEDIAN * float(np.median(np.abs(error))))
     else:
-        for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
-            factor[images[:, None], tracker.axes] = tracker.working
+        for tracker in attitudes.trackers:
+            factor[tracker.images[:, None], tracker.axes] = tracker.working
         factor[attitudes.misfit] = np.inf
     if data.options.method == 'per_image':
         factor *= FREE_FACTOR
     return dataclasses.replace(problem, star_tracker_sigma_rad=factor * data.stated_rad)
-
-
-def tracker_covariances(
-    problem: Problem, data: Data, attitudes: Attitudes
-) -> tuple[tuple[Indices, tuple[int, ...], Indices, Floats, float], ...]:
-    """Return `Weights.attitudes`."""
-    found = []
-    for images, tracker in zip(attitudes.images, attitudes.trackers, strict=True):
-        axis = tracker.axes[0]
-        working2 = (problem.star_tracker_sigma_rad[images[0], axis] / data.stated_rad[axis]) ** 2
-        independent = tracker.independent / working2
-        covariance = tracker.covariance / working2
-        found.append((images, tracker.axes, tracker.group, covariance, independent))
-    return tuple(found)
 
 
 def degrees_of_freedom(
@@ -297,7 +282,7 @@ def degrees_of_freedom(
     # By camera and rotation: an image turns no star by itself.
     rows = np.arange(E.shape[1])
     used_rows = np.concatenate([rows[: problem.camera_count], rows[ROTATION]])
-    root = np.linalg.cholesky(found.image_covariance)
+    root = np.linalg.cholesky(found.equations.covariance)
     by_root = (E[:, used_rows, own] @ root).transpose(0, 2, 1)
     given = image_parameters(problem, state), state.camera_from_icrf.as_matrix()
     for chunk, J in whitened_chunks(linear.measurements, problem.model, *given):
@@ -329,7 +314,8 @@ def tracker_attitudes(
     """
     m, problem = data.table.image_count, linear.problem
     stated = data.stated_rad
-    rotation, covariance, seen = _rotations_of_stars(sums, linear.layout, found)
+    trackers: list[TrackerErrors] = []
+    rotation, covariance, seen = _rotations_of_stars(sums, found)
     by_stars = Rotation.from_rotvec(-rotation) * linear.state.camera_from_icrf
     error = attitude_errors(problem, after, by_stars)
     tracker_from_camera = np.swapaxes(image_alignment(problem, after).as_matrix(), -1, -2)
@@ -338,27 +324,25 @@ def tracker_attitudes(
     variance = np.einsum('mii->mi', covariance) / stated**2
     if data.options.method == 'single':
         # Star trackers that are taken as exact have no misfits; their errors are as stated.
-        images = tuple(
-            np.flatnonzero(problem.star_tracker == k) for k in np.unique(problem.star_tracker)
-        )
-        working = EXACT_RAD / stated[0]
-        trackers = tuple(
-            TrackerErrors(1.0, 0.0, np.eye(1), np.zeros(len(i), np.int64), working, 0.0, '', 1.0)
-            for i in images
-        )
-        return Attitudes(error, covariance, seen, np.zeros(m, bool), trackers, images)
+        for k in np.unique(problem.star_tracker):
+            images = np.flatnonzero(problem.star_tracker == k)
+            group, working = np.zeros(len(images), np.int64), EXACT_RAD / stated[0]
+            exact = TrackerErrors(1.0, 0.0, np.eye(1), group, working, 0.0, '', 1.0)
+            trackers.append(dataclasses.replace(exact, sigma_rad=stated[0], images=images))
+        return Attitudes(error, covariance, seen, np.zeros(m, bool), tuple(trackers))
     is_stated = tracker_sigma_is_given(data.options)
     misfit = misfit_images(
         error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
     )
-    found_images, found_trackers, found_correlations = [], [], []
+    known_trackers = before.trackers if before else ()
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
         if len(here) == 0:
             continue
-        correlations = _known_correlations(here, before)
-        if correlations is None:
-            correlations = correlations_of(data.time_ns[here], after.camera_from_icrf[here])
+        known = (t.correlations for t in known_trackers if np.array_equal(t.images, here))
+        correlations = next(known, None) or correlations_of(
+            data.time_ns[here], after.camera_from_icrf[here]
+        )
         for size in np.unique(stated):
             # Noise about the boresight is that of few photons: slow errors are those of the
             # best axis, or as stated.
@@ -371,34 +355,21 @@ def tracker_attitudes(
                 data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(size),
                 float(stated.min() / size),
             )
-            found_images.append(here)
-            found_correlations.append(correlations)
-            found_trackers.append(dataclasses.replace(tracker, axes=tuple(axes.tolist())))
-    return Attitudes(
-        error,
-        covariance,
-        seen,
-        misfit,
-        tuple(found_trackers),
-        tuple(found_images),
-        tuple(found_correlations),
-    )
+            trackers.append(
+                dataclasses.replace(
+                    tracker,
+                    axes=tuple(axes.tolist()),
+                    sigma_rad=float(size),
+                    images=here,
+                    correlations=correlations,
+                )
+            )
+    return Attitudes(error, covariance, seen, misfit, tuple(trackers))
 
 
-def _known_correlations(images: Indices, before: Attitudes | None) -> Correlations | None:
-    """Return the correlations of these images of the round before, if it had them."""
-    if before is not None:
-        for those, correlations in zip(before.images, before.correlations, strict=True):
-            if np.array_equal(those, images):
-                return correlations
-    return None
-
-
-def _rotations_of_stars(
-    sums: StarSums, layout: Layout, found: Posterior
-) -> tuple[Floats, Floats, Mask]:
+def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Floats, Mask]:
     """Rotations (m, 3) by the stars alone, their covariances (m, 3, 3), images with enough."""
-    blocks = sums.blocks
+    blocks, layout = sums.blocks, found.layout
     stars, own, rotation = chain_columns(layout)
     C = blocks[:, rotation, rotation]
     values = np.zeros(blocks.shape[:2])

@@ -271,7 +271,8 @@ def test_places_of_stars_that_the_model_has_are_no_fault() -> None:
     assert bins and max(one.normalised for one in bins) < 1.15
     unshared = tuple(
         dataclasses.replace(one, share_px2=0.0 * one.share_px2) if one.of_star else one
-        for one in found.shared_errors
+        for one in found.weights.errors
     )
-    blind = predictions(dataclasses.replace(found, shared_errors=unshared))
+    weights = dataclasses.replace(found.weights, errors=unshared)
+    blind = predictions(dataclasses.replace(found, weights=weights))
     assert min(one.normalised for one in blind if one.by == 'star') > 1.3

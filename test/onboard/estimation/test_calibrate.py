@@ -458,7 +458,7 @@ def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
     kept = np.ones(len(table), bool)
     seen: Mask = np.ones(table.image_count, bool)
     none = np.zeros((table.image_count, 3))
-    attitudes = Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, (), ())
+    attitudes = Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, ())
 
     def judged(variance_px2: float, stars: Indices) -> weights.Judged:
         share_px2 = np.full(len(stars), variance_px2)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +42,7 @@ from starcal_ros.estimation.posterior import (
     with_shared_errors,
 )
 from starcal_ros.estimation.shared_errors import SharedError
+from starcal_ros.estimation.tracker_errors import TrackerErrors
 
 # In sigma: finite differences leave 1e-10 of a derivative, first-order attitude errors 1e-8.
 EXACT = 2e-7
@@ -89,8 +91,8 @@ def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
     size = np.outer(sigma[:P], sigma[:P])[part]
     assert np.abs((found.covariance - covariance[:P, :P])[part] / size).max() < EXACT
     assert np.abs((found.of_images.ravel() - mean[P:]) / sigma[P:]).max() < EXACT
-    back = found.back
-    whole = found.image_covariance + back @ found.covariance @ back.transpose(0, 2, 1)
+    back = found.equations.back
+    whole = found.equations.covariance + back @ found.covariance @ back.transpose(0, 2, 1)
     for k in range(IMAGES):
         own = slice(P + OWN * k, P + OWN * k + OWN)
         size = np.outer(sigma[own], sigma[own])
@@ -310,7 +312,10 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
         (np.array([1, 3]), np.zeros(2, int)),
     ):
         half = rng.normal(size=(group.max() + 1, 2))
-        trackers.append((rows, (0, 1, 2), group, half @ half.T + 0.2 * np.eye(len(half)), 0.15))
+        covariance = half @ half.T + 0.2 * np.eye(len(half))
+        errors_of = TrackerErrors(1.0, 1.0, covariance, group, 1.0, 0.0, '', 0.15)
+        sigma_rad = given.problem.star_tracker_sigma_rad[rows[0], 0]
+        trackers.append(dataclasses.replace(errors_of, sigma_rad=sigma_rad, images=rows))
     several = np.bincount(star[used], minlength=50)[star] > 1
     total = cell_px**2 + place_px**2 * several
     share = np.sqrt(np.minimum(variance / total, 1.0))
@@ -340,12 +345,12 @@ def propagated(
     A = gain[:, :count] @ white
     parts = {name: A @ one @ A.T for name, one in V.items()}
     noise, slow, working = np.zeros((3, len(gain), len(gain)))
-    for images, axes, group, covariance, independent in weights.attitudes:
-        of_groups = covariance - independent * np.eye(len(covariance))
-        for axis in axes:
-            B = gain[:, count + 3 * images + axis]
-            noise += independent * B @ B.T
-            slow += B @ of_groups[np.ix_(group, group)] @ B.T
+    for one in weights.trackers:
+        of_groups = one.covariance - one.independent * np.eye(len(one.covariance))
+        for axis in one.axes:
+            B = gain[:, count + 3 * one.images + axis]
+            noise += one.independent * B @ B.T
+            slow += B @ of_groups[np.ix_(one.group, one.group)] @ B.T
             working += B @ B.T
     parts[TRACKER_NOISE], parts[TRACKER_SLOW] = noise, slow
     parts['independent'] -= working
@@ -426,6 +431,12 @@ def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance
     assert (of_field[seen] > 0.1 * other[seen]).any()
 
 
+def _exact(given: Small, covariance: Floats) -> TrackerErrors:
+    images, sigma_rad = np.arange(IMAGES), given.problem.star_tracker_sigma_rad[0, 0]
+    known = TrackerErrors(1.0, 0.0, covariance, images, 1.0, 0.0, '', 1.0)
+    return dataclasses.replace(known, sigma_rad=sigma_rad, images=images)
+
+
 @pytest.mark.usefixtures('known')
 def test_independent_errors_of_the_working_weights_change_nothing(given: Small) -> None:
     n = len(given.table)
@@ -434,7 +445,7 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
         (SharedError('alone', np.arange(n), np.ones(n), 0.0, False, 1.0),),
-        ((np.arange(IMAGES), (0, 1, 2), np.arange(IMAGES), np.eye(IMAGES), 1.0),),
+        (_exact(given, np.eye(IMAGES)),),
     )
     found = solved(given)
     after = widened(given, found, weights)
@@ -455,7 +466,7 @@ def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
         (),
-        ((np.arange(IMAGES), (0, 1, 2), np.arange(IMAGES), shared_all, 1.0),),
+        (_exact(plain, shared_all),),
     )
     found = solved(plain)
     after = widened(plain, found, weights)
