@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind import pattern_index, sky_fit
+from starcal_ros.identification.blind.pattern_index import PATTERN, Patterns, patterns_of
 from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, SkyFit, SourceImage, STATED
 from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
@@ -325,14 +326,14 @@ class _View:
         plane = self.plane[np.isfinite(self.plane[:, 0])]
         return _gain_map(plane, math.tan(self.image.half_diagonal_rad))
 
-    def patterns(self, before: int, sources: int) -> tuple[Indices, Floats]:
-        """Patterns (n, 4) of the ``sources`` brightest, one after row ``before``; `shapes`."""
+    def patterns(self, before: int, sources: int) -> Patterns:
+        """Patterns of the ``sources`` brightest, by their rows, one after row ``before``."""
         usable = np.flatnonzero(np.isfinite(self.directions[:sources, 0]))
-        every = list(itertools.combinations(usable.tolist(), 4))
-        chosen: Indices = np.array(every, np.int64).reshape(-1, 4)
-        chosen = chosen[chosen[:, 3] >= before]
-        order, shape = pattern_index.shapes(self.directions[chosen])
-        return np.take_along_axis(chosen, order, axis=1), shape
+        if len(usable) < 4:
+            return np.empty(0, PATTERN)
+        patterns = patterns_of(self.directions[usable].T[..., None], np.zeros(1, np.int64))
+        patterns['order'] = usable[patterns['order']]
+        return patterns[(patterns['order'] >= before).any(axis=1)]
 
 
 def _focal_scales(image: SourceImage) -> tuple[float, ...]:
@@ -351,7 +352,7 @@ def _tolerances(image: SourceImage) -> tuple[float, float]:
 
 
 def _look_up(
-    view: _View, catalog: StarCatalog, scale: int, patterns: tuple[Indices, Floats]
+    view: _View, catalog: StarCatalog, scale: int, patterns: Patterns
 ) -> tuple[list[_Candidate], list[_Candidate]]:
     """
     Candidates from `_View.patterns` and the index of one scale, the most likely first.
@@ -360,15 +361,18 @@ def _look_up(
     """
     index = pattern_index.pattern_index(catalog, scale)
     place_tolerance, size_tolerance = _tolerances(view.image)
-    sources, shape = patterns
-    fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
-    sources, shape = pattern_index.equivalent(sources[fits], shape[fits], place_tolerance)
-    query, quad = pattern_index.equal_shapes(index.grid, shape, place_tolerance, size_tolerance)
-    if len(quad) > _CANDIDATES:
-        few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
-        quad, query = quad[few], query[few]
-    growth = np.exp(shape[query, 4] - index.grid.shape[quad, 4])
-    stars, sources = index.quads[index.grid.rows[quad]].astype(np.int64), sources[query]
+    fits = patterns['size'] < math.log(2 * index.radius_rad) + size_tolerance
+    patterns = pattern_index.equivalent(patterns[fits], place_tolerance)
+    query, row = pattern_index.equal_patterns(
+        index.grid, patterns, place_tolerance, size_tolerance
+    )
+    if len(row) > _CANDIDATES:
+        few = np.random.default_rng(0).choice(len(row), _CANDIDATES, replace=False)
+        row, query = row[few], query[few]
+    growth = np.exp(
+        np.subtract(patterns['size'][query], index.grid.patterns['size'][row], dtype=float)
+    )
+    stars, sources = index.stars(row), patterns['order'][query].astype(np.int64)
     rotation = _rotations(catalog.direction_icrs[stars], view.plane[sources], growth)
     # Log-likelihood ratios of the sources to those by chance, and of the stars of a pattern alone.
     gain, own = _gains(view, catalog, growth, rotation) if len(growth) else (growth, 0.0)

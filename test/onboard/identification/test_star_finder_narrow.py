@@ -193,7 +193,7 @@ def test_random_points_are_no_stars_of_a_deep_catalog() -> None:
 def test_a_pattern_lies_within_its_disc(scale: int) -> None:
     catalog = sky_of(0.3)
     index = pattern_index(catalog, scale)
-    assert len(index.quads) > 100_000
-    places = catalog.direction_icrs[index.quads]
+    assert len(index.grid.patterns) > 100_000
+    places = catalog.direction_icrs[index.stars(np.arange(len(index.grid.patterns)))]
     apart = np.linalg.norm(places[:, :1] - places[:, 1:], axis=2)
     assert apart.max() <= 2 * 2 * math.sin(index.radius_rad / 2)
