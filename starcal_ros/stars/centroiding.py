@@ -306,7 +306,10 @@ def _without_neighbours(
     if not len(star):
         return stamps, parameters, done, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
-    separated = stamps.select(np.empty(0, np.intp))
+    noise2_dn2 = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape)
+    cleared = dataclasses.replace(
+        stamps, data_dn=stamps.data_dn.copy(), noise2_dn2=noise2_dn2.copy()
+    )
     parameters, done = parameters.copy(), done.copy()
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
@@ -327,23 +330,17 @@ def _without_neighbours(
         # These include stars that get back light which was subtracted before.
         touched[star[lit]] = True
         # Few of the stars: passes over the windows of all would cost as much as these fits.
-        again = stamps.select(np.flatnonzero(touched))
-        neighbours = np.zeros((len(again), stamps.width**2))
+        neighbours = np.zeros((np.count_nonzero(touched), stamps.width**2))
         np.add.at(neighbours, (np.cumsum(touched) - 1)[star[lit]], light[lit])
         # The light is subtracted, its photon noise stays.
-        separated = dataclasses.replace(
-            again,
-            data_dn=again.data_dn - neighbours.reshape(again.data_dn.shape),
-            noise2_dn2=again.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
+        cleared.flat_dn[touched] = stamps.flat_dn[touched] - neighbours
+        cleared.noise2_dn2[touched] = noise2_dn2[touched] + neighbours / (
+            noise.gain_e_per_dn * noise.background
         )
         parameters[touched], done[touched] = psf_fit.approach(
-            separated, parameters[touched], noise
+            cleared.select(np.flatnonzero(touched)), parameters[touched], noise
         )
-    every = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape)
-    data_dn, noise2_dn2 = stamps.data_dn.copy(), every.copy()
-    data_dn[touched], noise2_dn2[touched] = separated.data_dn, separated.noise2_dn2
-    stamps = dataclasses.replace(stamps, data_dn=data_dn, noise2_dn2=noise2_dn2)
-    return stamps, parameters, done, modelled
+    return cleared, parameters, done, modelled
 
 
 def _single_pixels(

@@ -91,14 +91,6 @@ class SkyMatch:
         return mirror(self.xy_px, self.camera.width) if self.mirrored else self.xy_px
 
 
-@dataclass(frozen=True)
-class NotFound:
-    """Reason why no stars were identified, and the log10 p-value of the best fit, if any."""
-
-    reason: str
-    log10_p_value: float = math.inf
-
-
 def find_in_any(
     rankings: Sequence[Floats],
     camera: CameraModel,
@@ -107,9 +99,9 @@ def find_in_any(
     rounds: Sequence[tuple[int, int]] = ROUNDS,
     deadline_s: float = math.inf,
     ranges: Ranges = STATED,
-) -> tuple[SkyMatch | NotFound, int]:
+) -> tuple[SkyMatch | None, int]:
     """
-    Identified stars of an image, or the reason why there are none; the row of their selection.
+    Identified stars of an image and the row of their selection; None if there are none.
 
     ``rankings`` are selections (n, 2) of its sources, brightest first.  ``camera`` is the prior,
     within ``ranges``: by default focal length within 25 %, principal point within 5 % of the
@@ -123,24 +115,19 @@ def find_in_any(
         if len(xy_px) >= _FEWEST_SOURCES
         for turned in mirrored
     ]
-    if not seen:
-        count = max(len(xy_px) for xy_px in rankings)
-        return NotFound(f'{count} star-like sources, at least {_FEWEST_SOURCES} are needed'), 0
     tried = math.log10(len(mirrored))
-    least = math.inf
     for before, sources in rounds:
         chosen = [one for one in seen if len(one.image.xy_px) > before]
         for one, candidates in _candidates(chosen, catalog, before, sources):
             for fit in _fits(one.image, catalog, candidates):
                 log10_p, radius_px = sky_fit.log10_p_value(one.image, catalog, fit)
                 log10_p += tried
-                least = min(least, log10_p)
                 if log10_p < MAX_LOG10_P_VALUE:
                     result = _result(one.image, catalog, fit, radius_px, log10_p, one.mirrored)
                     return result, one.ranking
             if time.thread_time() > deadline_s:
-                return NotFound('the search has reached its time limit', least), 0
-    return NotFound('no pattern of the sources matches the catalog beyond chance', least), 0
+                return None, 0
+    return None, 0
 
 
 @dataclass(frozen=True)
@@ -186,7 +173,7 @@ def confirm_sky(
     camera_from_icrf: Rotation,
     mirrored: bool = False,
     ranges: Ranges = STATED,
-) -> SkyMatch | NotFound:
+) -> SkyMatch | None:
     """Identified stars among sources (n, 2), given a rotation known to 10 % of the field."""
     image = _image(xy_px, camera, mirrored, ranges)
     stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
@@ -194,10 +181,10 @@ def confirm_sky(
     pairs = _shifted_alike(image, catalog, start)
     fit = sky_fit.refined(image, catalog, start, pairs) if len(pairs) >= 5 else None
     if fit is None:
-        return NotFound('the stars are not where they were expected')
+        return None
     log10_p, radius_px = sky_fit.log10_p_value(image, catalog, fit)
     if log10_p >= MAX_LOG10_P_VALUE:
-        return NotFound('the stars are not where they were expected', log10_p)
+        return None
     return _result(image, catalog, fit, radius_px, log10_p, mirrored)
 
 

@@ -32,7 +32,6 @@ from starcal_ros.identification.blind.search import (
     matched_again,
     mirror,
     mirrored_camera,
-    NotFound,
     SkyMatch,
 )
 from starcal_ros.identification.blind.sky_fit import (
@@ -81,7 +80,7 @@ def test_stars_are_those_drawn(frame: Frame, catalog: StarCatalog) -> None:
 @pytest.mark.slow
 def test_a_mirror_image_is_found_as_such(frame: Frame, catalog: StarCatalog) -> None:
     flipped = mirror(frame.xy_px, frame.prior.width)
-    assert isinstance(find_sky(flipped, frame.prior, catalog), NotFound)
+    assert find_sky(flipped, frame.prior, catalog) is None
     found = find_sky(flipped, frame.prior, catalog, try_mirrored=True)
     assert isinstance(found, SkyMatch) and found.mirrored
     assert {tuple(xy) for xy in found.xy_px.tolist()} <= {tuple(xy) for xy in flipped.tolist()}
@@ -102,12 +101,12 @@ def test_the_selection_of_sources_that_shows_stars_is_found(
 def test_random_points_are_no_stars(catalog: StarCatalog) -> None:
     points = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
     found = find_sky(points, camera(25), catalog)
-    assert isinstance(found, NotFound) and 'no pattern' in found.reason
+    assert found is None
 
 
 def test_four_sources_are_too_few(catalog: StarCatalog) -> None:
     found = find_sky(np.array([[1.0, 1], [50, 9], [700, 40], [99, 300]]), camera(25), catalog)
-    assert isinstance(found, NotFound) and 'at least 5' in found.reason
+    assert found is None
 
 
 def test_mirroring_twice_is_nothing() -> None:
@@ -263,7 +262,7 @@ def test_a_rotation_known_roughly_is_confirmed(catalog: StarCatalog, width_deg: 
     # Both fit the twenty stars drawn, from other starts; two may stand beside false sources.
     assert len(set(found.catalog_index) & set(searched.catalog_index)) >= 18
     elsewhere = Rotation.from_euler('y', 90.0, degrees=True) * frame.camera_from_icrf
-    assert isinstance(confirm_sky(frame.xy_px, frame.prior, catalog, elsewhere), NotFound)
+    assert confirm_sky(frame.xy_px, frame.prior, catalog, elsewhere) is None
 
 
 @pytest.mark.parametrize('width_deg', [8, 25, 55])
@@ -320,7 +319,7 @@ def test_bright_false_sources_do_not_hide_the_stars(catalog: StarCatalog) -> Non
 def test_a_catalog_too_small_for_a_pattern_identifies_nothing(catalog: StarCatalog) -> None:
     frame = next(frames(catalog, 20, 20, 10, 0.0, 1))
     few = catalog.select(np.arange(49))
-    assert isinstance(find_sky(frame.xy_px, frame.prior, few, try_mirrored=True), NotFound)
+    assert find_sky(frame.xy_px, frame.prior, few, try_mirrored=True) is None
 
 
 @pytest.mark.parametrize(
