@@ -40,6 +40,7 @@ _MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their 
 SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
 _NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
 _BRIGHT_SNR, _FEWEST_BRIGHT = 15.0, 5  # stars that show a common change of shape, or the PSF
+_SHOWN_SNR = 8.0  # of stars that show a common change of shape where too few are bright
 _MOST = 60  # the brightest stars that show the PSF; fainter ones add almost nothing
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
 _COMMON_CHANGE = 0.5 * MAX_SHAPE_CHANGE
@@ -258,7 +259,12 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     """Return True if most bright stars have another shape than the model: streaks, or defocus."""
     if measured.fit is None:
         return False
-    change = measured.fit.shape_change[measured.fit.snr > _BRIGHT_SNR]
+    snr = measured.fit.snr
+    # Few stars of a narrow field are bright, and light spread along streaks has more noise.
+    least_snr = (
+        _BRIGHT_SNR if np.count_nonzero(snr > _BRIGHT_SNR) >= _FEWEST_BRIGHT else _SHOWN_SNR
+    )
+    change = measured.fit.shape_change[snr > least_snr]
     if len(change) < _FEWEST_BRIGHT:
         return False
     return bool(np.abs(np.median(change, axis=0) - model.shape_median).max() > _COMMON_CHANGE)
