@@ -259,15 +259,13 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     """Return True if most bright stars have another shape than the model: streaks, or defocus."""
     if measured.fit is None:
         return False
-    snr = measured.fit.snr
     # Few stars of a narrow field are bright, and light spread along streaks has more noise.
-    least_snr = (
-        _BRIGHT_SNR if np.count_nonzero(snr > _BRIGHT_SNR) >= _FEWEST_BRIGHT else _SHOWN_SNR
-    )
-    change = measured.fit.shape_change[snr > least_snr]
-    if len(change) < _FEWEST_BRIGHT:
-        return False
-    return bool(np.abs(np.median(change, axis=0) - model.shape_median).max() > _COMMON_CHANGE)
+    for least_snr in (_BRIGHT_SNR, _SHOWN_SNR):
+        change = measured.fit.shape_change[measured.fit.snr > least_snr]
+        if len(change) >= _FEWEST_BRIGHT:
+            off = np.abs(np.median(change, axis=0) - model.shape_median)
+            return bool(off.max() > _COMMON_CHANGE)
+    return False
 
 
 def _without_neighbours(
@@ -312,10 +310,8 @@ def _without_neighbours(
     if not len(star):
         return stamps, parameters, done, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
-    noise2_dn2 = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape)
-    cleared = dataclasses.replace(
-        stamps, data_dn=stamps.data_dn.copy(), noise2_dn2=noise2_dn2.copy()
-    )
+    noise2_dn2 = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape).copy()
+    cleared = dataclasses.replace(stamps, data_dn=stamps.data_dn.copy(), noise2_dn2=noise2_dn2)
     parameters, done = parameters.copy(), done.copy()
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
@@ -340,9 +336,8 @@ def _without_neighbours(
         np.add.at(neighbours, (np.cumsum(touched) - 1)[star[lit]], light[lit])
         # The light is subtracted, its photon noise stays.
         cleared.flat_dn[touched] = stamps.flat_dn[touched] - neighbours
-        cleared.noise2_dn2[touched] = noise2_dn2[touched] + neighbours / (
-            noise.gain_e_per_dn * noise.background
-        )
+        photons_dn2 = neighbours / (noise.gain_e_per_dn * noise.background)
+        noise2_dn2[touched] = stamps.noise2_dn2[touched] + photons_dn2
         parameters[touched], done[touched] = psf_fit.approach(
             cleared.select(np.flatnonzero(touched)), parameters[touched], noise
         )

@@ -167,9 +167,8 @@ def patterns_of(stars: _Vectors, groups: Indices) -> Patterns:
     is_pattern = within[:, c] & within[:, d] & (apart2 <= longest2)
     kind, group = np.divmod(np.flatnonzero(is_pattern), len(groups))
     pair, of_pair = np.divmod(kind, len(c))
-    first = pair * other.shape[1]
     place_c, place_d = (
-        place.ravel().take((first + column.take(of_pair)) * len(groups) + group)
+        place.ravel().take((pair * other.shape[1] + column.take(of_pair)) * len(groups) + group)
         for column in (c, d)
     )
     # The exchange of A and B turns the frame about its middle by half a revolution.

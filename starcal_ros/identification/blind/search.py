@@ -115,13 +115,12 @@ def find_in_any(
         if len(xy_px) >= _FEWEST_SOURCES
         for turned in mirrored
     ]
-    tried = math.log10(len(mirrored))
     for before, sources in rounds:
         chosen = [one for one in seen if len(one.image.xy_px) > before]
         for one, candidates in _candidates(chosen, catalog, before, sources):
             for fit in _fits(one.image, catalog, candidates):
                 log10_p, radius_px = sky_fit.log10_p_value(one.image, catalog, fit)
-                log10_p += tried
+                log10_p += math.log10(len(mirrored))
                 if log10_p < MAX_LOG10_P_VALUE:
                     result = _result(one.image, catalog, fit, radius_px, log10_p, one.mirrored)
                     return result, one.ranking
@@ -183,9 +182,8 @@ def confirm_sky(
     if fit is None:
         return None
     log10_p, radius_px = sky_fit.log10_p_value(image, catalog, fit)
-    if log10_p >= MAX_LOG10_P_VALUE:
-        return None
-    return _result(image, catalog, fit, radius_px, log10_p, mirrored)
+    is_match = log10_p < MAX_LOG10_P_VALUE
+    return _result(image, catalog, fit, radius_px, log10_p, mirrored) if is_match else None
 
 
 def matched_again(
