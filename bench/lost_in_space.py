@@ -26,7 +26,7 @@ from bench.table import Table, timed
 from bench.trials import in_processes
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
-from starcal_ros.identification.blind.search import find_in_any, NotFound, SkyMatch
+from starcal_ros.identification.blind.search import find_in_any, SkyMatch
 from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
@@ -70,8 +70,8 @@ def run(quick: bool) -> Iterator[Table]:
 
 def find_sky(
     xy_px: Floats, prior: CameraModel, catalog: StarCatalog, try_mirrored: bool = False
-) -> SkyMatch | NotFound:
-    """Identified stars among sources (n, 2), or the reason why there are none."""
+) -> SkyMatch | None:
+    """Identified stars among sources (n, 2), or None."""
     return find_in_any([xy_px], prior, catalog, (False, True)[: 1 + try_mirrored])[0]
 
 

@@ -289,7 +289,7 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
     if sky.mirrored:
         camera = search.mirrored_camera(camera)
     other = search.confirm_sky(xy_px, camera, catalog, sky.camera_from_icrf, sky.mirrored)
-    if isinstance(other, SkyMatch) and (
+    if other and (
         len(other.xy_px) > _MORE * len(sky.xy_px) or other.residual_px < _CLOSER * sky.residual_px
     ):
         return other

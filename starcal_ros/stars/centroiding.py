@@ -40,6 +40,7 @@ _MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their 
 SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
 _NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
 _BRIGHT_SNR, _FEWEST_BRIGHT = 15.0, 5  # stars that show a common change of shape, or the PSF
+_SHOWN_SNR = 8.0  # of stars that show a common change of shape where too few are bright
 _MOST = 60  # the brightest stars that show the PSF; fainter ones add almost nothing
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
 _COMMON_CHANGE = 0.5 * MAX_SHAPE_CHANGE
@@ -259,10 +260,12 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     """Return True if most bright stars have another shape than the model: streaks, or defocus."""
     if measured.fit is None:
         return False
-    change = measured.fit.shape_change[measured.fit.snr > _BRIGHT_SNR]
-    if len(change) < _FEWEST_BRIGHT:
-        return False
-    return bool(np.abs(medians(change) - model.shape_median).max() > _COMMON_CHANGE)
+    # Few stars of a narrow field are bright, and light spread along streaks has more noise.
+    for least_snr in (_BRIGHT_SNR, _SHOWN_SNR):
+        change = measured.fit.shape_change[measured.fit.snr > least_snr]
+        if len(change) >= _FEWEST_BRIGHT:
+            return bool(np.abs(medians(change) - model.shape_median).max() > _COMMON_CHANGE)
+    return False
 
 
 def _without_neighbours(
@@ -307,7 +310,8 @@ def _without_neighbours(
     if not len(star):
         return stamps, parameters, done, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
-    separated = stamps.select(np.empty(0, np.intp))
+    noise2_dn2 = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape).copy()
+    cleared = dataclasses.replace(stamps, data_dn=stamps.data_dn.copy(), noise2_dn2=noise2_dn2)
     parameters, done = parameters.copy(), done.copy()
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
@@ -328,23 +332,16 @@ def _without_neighbours(
         # These include stars that get back light which was subtracted before.
         touched[star[lit]] = True
         # Few of the stars: passes over the windows of all would cost as much as these fits.
-        again = stamps.select(np.flatnonzero(touched))
-        neighbours = np.zeros((len(again), stamps.width**2))
+        neighbours = np.zeros((np.count_nonzero(touched), stamps.width**2))
         np.add.at(neighbours, (np.cumsum(touched) - 1)[star[lit]], light[lit])
         # The light is subtracted, its photon noise stays.
-        separated = dataclasses.replace(
-            again,
-            data_dn=again.data_dn - neighbours.reshape(again.data_dn.shape),
-            noise2_dn2=again.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
-        )
+        cleared.flat_dn[touched] = stamps.flat_dn[touched] - neighbours
+        photons_dn2 = neighbours / (noise.gain_e_per_dn * noise.background)
+        noise2_dn2[touched] = stamps.noise2_dn2[touched] + photons_dn2
         parameters[touched], done[touched] = psf_fit.approach(
-            separated, parameters[touched], noise
+            cleared.select(np.flatnonzero(touched)), parameters[touched], noise
         )
-    every = np.broadcast_to(stamps.noise2_dn2, stamps.flat_dn.shape)
-    data_dn, noise2_dn2 = stamps.data_dn.copy(), every.copy()
-    data_dn[touched], noise2_dn2[touched] = separated.data_dn, separated.noise2_dn2
-    stamps = dataclasses.replace(stamps, data_dn=data_dn, noise2_dn2=noise2_dn2)
-    return stamps, parameters, done, modelled
+    return cleared, parameters, done, modelled
 
 
 def _single_pixels(

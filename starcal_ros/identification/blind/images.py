@@ -70,7 +70,7 @@ class ImageSearch:
             sky = search.confirm_sky(
                 rankings[row], self.camera, self.catalog, rotation, mirrored, self.ranges[0]
             )
-            if isinstance(sky, SkyMatch):
+            if sky:
                 return self.take(sky, row)
         return None
 
@@ -95,7 +95,7 @@ class ImageSearch:
                 self.deadline_s,
                 ranges,
             )
-            if isinstance(sky, SkyMatch):
+            if sky:
                 return self.take(sky, rows[row])
         return None
 

@@ -2,19 +2,22 @@
 """
 Index of patterns of four catalog stars by their shape, which is free of scale and rotation.
 
-The shape of a pattern is that of Lang et al. 2010, AJ 139, 1782, section 2.1: in the tangent plane
-at its middle, the two stars farthest apart, A and B, span a frame with A at 0 and B at 1 + i; the
-positions of the other two, C and D, in it are four numbers.  The fifth number is the distance of A
-and B, which a camera measures as accurately as its focal length.
+The shape of a pattern follows Lang et al. 2010, AJ 139, 1782, section 2.1: the two stars farthest
+apart, A and B, span a frame, and the positions of the other two, C and D, in it are four numbers.
+The fifth number is the distance of A and B, which a camera measures as accurately as its focal
+length.  The frame is that of the chords: with unit vectors, C has the coordinates
+(C - M) . (B - A) / |B - A|^2 and A . (B x C) / |B - A|^2, M the middle of A and B.  They follow
+from the distances of pairs and the volumes of triples, which the patterns of a disc share.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import functools
 import itertools
 import math
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +27,18 @@ from scipy.spatial import cKDTree
 from starcal_ros.arrays import Floats, Indices, Singles
 from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
-_Array = TypeVar('_Array', Floats, Singles)
+PATTERN = np.dtype([
+    ('places', np.complex64, 2), ('size', np.float32), ('order', np.uint8, 4), ('group', np.int64)
+])  # fmt: skip
+"""
+A pattern of a group of stars, of 32 bytes, since NumPy copies other numbers at half the speed.
+
+``places`` of C and D; ``size`` natural logarithm of the distance of A and B, rad; ``order`` rows
+in the group of A, B, C and D: the mean of C and D is nearer to A along A to B, and so is C of the
+two; ``group`` number of the group.
+"""
+Patterns = NDArray[Any]
+_Vectors = NDArray[np.floating[Any]]
 _STEP = math.sqrt(2.0)
 _STANDARD_DEG = 1.6  # radius of the discs of scale 0
 _SMALLEST, _LARGEST = -10, 9  # scales: discs of 0.05 to 36 degrees of radius
@@ -33,22 +47,13 @@ _SPACING = 0.7
 # Stars per disc from scale 0 on, 7 below: at most about a million patterns.
 _STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)
 _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
-_AB = tuple(itertools.combinations(range(4), 2))
-_CD = tuple(itertools.combinations(range(4), 2))[::-1]
-# Orders of A, B, C, D: for each pair A and B as numbered, with C and D, then A and B, exchanged.
-_ORDERS = np.array(
-    [
-        (*ab[::turn], *cd[::swap])
-        for ab, cd in zip(_AB, _CD, strict=True)
-        for turn in (1, -1)
-        for swap in (1, -1)
-    ]
-)
-_AT_ONCE = 600  # discs, whose arrays fit into a cache
+# A, B, C, D as they are, then with C and D, A and B, and both exchanged.
+_ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
+_AT_ONCE = 20_000  # patterns of discs, whose arrays fit into a cache
 _MANY = 2000  # discs, from which a walk through two trees is faster than one search for each
 _CELL = 0.04  # about twice the tolerance: two cells along each place, and a table of a few MB
 # A and B are the farthest apart, and C is nearer to A: C and D lie in a lens of this corner.
-_LOW = (0.0, -0.88, 0.0, -0.88)
+_LOW = (-0.5, -0.88, -0.5, -0.88)
 _CELLS = (14, 45, 26, 45)
 
 
@@ -57,13 +62,18 @@ class PatternIndex:
     """
     Patterns within discs of one size wherever the catalog has stars enough.
 
-    ``quads`` (q, 4) rows of the catalog in the order A, B, C, D, sorted as ``grid`` has their
-    shapes (`shapes`); ``radius_rad`` radius of the discs.
+    ``radius_rad`` of the discs; ``members`` (d, k) rows of the catalog of the brightest stars of
+    each disc; ``grid`` has the patterns, whose groups are the discs.
     """
 
     radius_rad: float
-    quads: Indices
-    grid: ShapeGrid
+    members: Indices
+    grid: PatternGrid
+
+    def stars(self, rows: Indices) -> Indices:
+        """Rows (n, 4) of the catalog of A to D of patterns (n,) of the grid."""
+        patterns = self.grid.patterns[rows]
+        return np.asarray(self.members[patterns['group'][:, None], patterns['order']])
 
 
 def scales_for(half_diagonal_rad: float) -> list[int]:
@@ -83,7 +93,7 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     """
     Index of the patterns of the brightest stars of each disc of a scale.
 
-    It takes half a second and is kept in memory.  The catalog is sorted by magnitude.
+    It takes up to half a second and is kept in memory.  The catalog is sorted by magnitude.
     """
     radius_rad = _radius_rad(scale)
     of_disc = _STARS[max(scale, 0)]
@@ -93,30 +103,20 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
         centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
     else:
         centres = _occupied(stars, _SPACING * radius_rad)
-    members = brightest_within(direction_tree(stars), centres, radius_rad, of_disc)
+    tree = direction_tree(stars) if len(stars) < len(catalog.id) else catalog.tree
+    members = brightest_within(tree, centres, radius_rad, of_disc)
+    parts = _patterns_by_disc(stars.T.astype(np.float32), members)
+    return PatternIndex(radius_rad, members, pattern_grid(parts))
+
+
+def _patterns_by_disc(stars: Singles, members: Indices) -> Iterator[Patterns]:
+    """Patterns of stars (3, s) in discs of members (d, k), those of some discs at a time."""
     held = np.count_nonzero(members >= 0, axis=1)
-    xyz = stars.T.astype(np.float32)
     # Outside the region of a deep table nearly all discs are without a pattern.
-    parts = [
-        _patterns(xyz, part)
-        for count in range(4, of_disc + 1)
-        for part in _in_parts(members[held == count, :count])
-    ]
-    quads, shape = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return PatternIndex(radius_rad, quads, shape_grid(shape))
-
-
-def _in_parts(members: Indices) -> list[Indices]:
-    """Members (d, k) of discs in parts whose arrays fit into a cache."""
-    return np.array_split(members, len(members) // _AT_ONCE + 1)
-
-
-def _patterns(xyz: Singles, members: Indices) -> tuple[Indices, Singles]:
-    """Patterns (n, 4), A to D, of stars (3, s) in discs of members (d, k), and their shapes."""
-    rows = members.T.astype(np.int32)
-    chosen = np.array(list(itertools.combinations(range(len(rows)), 4))).T
-    order, shape = shapes(xyz.take(rows, axis=1)[:, chosen].reshape(3, 4, -1).T)
-    return np.take_along_axis(rows[chosen].reshape(4, -1).T, order, axis=1), shape
+    for count in range(4, members.shape[1] + 1):
+        discs = np.flatnonzero(held == count)
+        for part in np.array_split(discs, len(discs) * math.comb(count, 4) // _AT_ONCE + 1):
+            yield patterns_of(stars.take(members[part, :count].T, axis=1), part)
 
 
 def _occupied(stars: Floats, side_rad: float) -> Floats:
@@ -131,67 +131,79 @@ def _occupied(stars: Floats, side_rad: float) -> Floats:
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 
 
-def shapes(directions: _Array) -> tuple[Indices, _Array]:
+@functools.lru_cache
+def _rows_of(count: int) -> tuple[Indices, Indices, Indices, Indices, NDArray[np.uint8]]:
     """
-    Shapes of patterns of four directions (n, 4, 3).
+    Rows of the pairs and patterns of a number of stars.
 
-    Returns
-    -------
-    order : (n, 4)
-        Indices of A, B, C and D: the mean of C and D along A to B is below one half, and C is
-        nearer to A along it.
-    shape : (n, 5)
-        Positions of C and D in the frame of A and B, and the natural logarithm of the distance of
-        A and B, rad.
+    The stars (2, p) of each pair; the pair (k, k) of two stars; the other stars (p, k - 2) of each
+    pair; columns (2, m) in these of C and D; stars (p, m, 4, 4) in each order of `_ORDERS`.
     """
-    # One row an axis and a star: the rows of all catalog patterns take a third of a second.
-    xyz = directions.T
-    middle = xyz.sum(axis=1)
-    middle /= np.sqrt(_dot(middle, middle))
-    points = xyz / _dot(xyz, middle[:, None])  # in the tangent plane at the middle
-    longest = np.zeros(len(directions), np.int64)
-    length2 = np.zeros(len(directions), directions.dtype)
-    for k, (i, j) in enumerate(_AB):
-        apart = points[:, i] - points[:, j]
-        apart2 = _dot(apart, apart)
-        longest[apart2 > length2] = k
-        np.maximum(length2, apart2, out=length2)
-    at = _ORDERS[::4].T.take(longest, axis=1) * len(directions) + np.arange(len(directions))
-    a, b, c, d = points.reshape(3, -1).take(at, axis=1).transpose(1, 0, 2)
-    b, c, d = b - a, c - a, d - a
-    across = np.cross(middle, b, axis=0)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        places = np.stack([_dot(star, axis) / length2 for star in (c, d) for axis in (b, across)])
-    swap = places[0] + places[2] > 1.0
-    places = np.where(swap, np.array([[1], [0], [1], [0]], np.int8) - places, places)
-    later = places[0] > places[2]
-    places = np.where(later, places[[2, 3, 0, 1]], places)
-    size = 0.5 * np.log(np.maximum(length2, 1e-30))
-    return _ORDERS.take(4 * longest + 2 * swap + later, axis=0), np.vstack([places, size]).T
+    a, b = np.array(list(itertools.combinations(range(count), 2))).T
+    pair = np.zeros((count, count), np.int64)
+    pair[a, b] = pair[b, a] = np.arange(len(a))
+    stars = np.arange(count)
+    other = np.nonzero((stars != a[:, None]) & (stars != b[:, None]))[1].reshape(len(a), -1)
+    c, d = np.array(list(itertools.combinations(range(count - 2), 2))).T
+    four = np.broadcast_arrays(a[:, None], b[:, None], other[:, c], other[:, d])
+    orders = np.stack(four, axis=-1).astype(np.uint8)[..., _ORDERS]
+    return np.stack([a, b]), pair, other, np.stack([c, d]), orders
 
 
-def _dot(a: _Array, b: _Array) -> _Array:
-    """Sum of products over the first of three axes."""
+def patterns_of(stars: _Vectors, groups: Indices) -> Patterns:
+    """Patterns of all four of the k stars (3, k, g), unit vectors, of groups numbered (g,)."""
+    (a, b), pair_of, other, (c, d), orders = _rows_of(stars.shape[1])
+    ab = stars[:, b] - stars[:, a]
+    square = np.maximum(_dot(ab, ab), 1e-30)
+    normal = np.cross(stars[:, a], ab, axis=0)
+    # Over the pairs A and B, the other stars and the groups.
+    longest2 = square[:, None]
+    from_a2, from_b2 = square[pair_of[a[:, None], other]], square[pair_of[b[:, None], other]]
+    place = np.empty(from_a2.shape, np.complex64)
+    place.real = (from_a2 - from_b2) * (0.5 / longest2)
+    place.imag = _dot(normal[:, :, None], stars[:, other]) / longest2
+    within = np.maximum(from_a2, from_b2) <= longest2
+    apart2 = square[pair_of[other[:, c], other[:, d]]]
+    is_pattern = within[:, c] & within[:, d] & (apart2 <= longest2)
+    kind, group = np.divmod(np.flatnonzero(is_pattern), len(groups))
+    pair, of_pair = np.divmod(kind, len(c))
+    place_c, place_d = (
+        place.ravel().take((pair * other.shape[1] + column.take(of_pair)) * len(groups) + group)
+        for column in (c, d)
+    )
+    # The exchange of A and B turns the frame about its middle by half a revolution.
+    turned = place_c.real + place_d.real > 0.0
+    sign = np.where(turned, np.float32(-1.0), np.float32(1.0))
+    place_c, place_d = sign * place_c, sign * place_d
+    later = place_c.real > place_d.real
+    patterns = np.empty(len(kind), PATTERN)
+    patterns['places'][:, 0] = np.where(later, place_d, place_c)
+    patterns['places'][:, 1] = np.where(later, place_c, place_d)
+    patterns['size'] = 0.5 * np.log(square).ravel().take(pair * len(groups) + group)
+    patterns['order'] = orders.reshape(-1, 4).take(4 * kind + 2 * turned + later, axis=0)
+    patterns['group'] = groups.take(group)
+    return patterns
+
+
+def _dot(a: _Vectors, b: _Vectors) -> _Vectors:
+    """Products (...) of vectors (3, ...)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def equivalent(order: Indices, shape: Floats, tolerance: float) -> tuple[Indices, Floats]:
+def equivalent(patterns: Patterns, tolerance: float) -> Patterns:
     """
-    The patterns (n, 4), (n, 5) in each order in which the catalog may have them: (m, 4), (m, 5).
+    The patterns (n,) in each order in which the catalog may have them: (m,).
 
     An error of a place up to the tolerance may move a pattern across the border between two of
     the four orders.
     """
-    c = shape[:, 0] + 1j * shape[:, 1]
-    d = shape[:, 2] + 1j * shape[:, 3]
-    places = ((c, d), (d, c), (1.0 - c, 1.0 - d), (1.0 - d, 1.0 - c))
-    all_orders = np.concatenate([order[:, k] for k in _ORDERS[:4]])
-    found = np.concatenate(
-        [np.stack([p.real, p.imag, q.real, q.imag, shape[:, 4]], axis=-1) for p, q in places]
-    )
-    c_real, d_real = found[:, 0], found[:, 2]
-    near = (c_real <= d_real + 2 * tolerance) & (c_real + d_real <= 1.0 + 2 * tolerance)
-    return all_orders[near], found[near]
+    c, d = patterns['places'].T
+    every = np.tile(patterns, 4)
+    every['places'] = np.hstack([[c, d], [d, c], [-c, -d], [-d, -c]]).T
+    every['order'] = np.concatenate([patterns['order'][:, order] for order in _ORDERS])
+    along_c, along_d = every['places'].real.T
+    near = (along_c <= along_d + 2 * tolerance) & (along_c + along_d <= 2 * tolerance)
+    return np.asarray(every[near])
 
 
 def sphere_points(count: int) -> Floats:
@@ -207,13 +219,14 @@ def brightest_within(stars: cKDTree, centres: Floats, radius_rad: float, count: 
     """Rows (p, count) of the brightest of sorted stars about centres (p, 3); -1: none."""
     chord = 2 * math.sin(radius_rad / 2)
     if len(centres) > _MANY:
-        pairs = direction_tree(centres).sparse_distance_matrix(stars, chord, output_type='ndarray')
-        of_centre, star = np.divmod(np.sort(pairs['i'] * stars.n + pairs['j']), stars.n)
+        tree = direction_tree(centres)
+        near = tree.sparse_distance_matrix(stars, chord, output_type='coo_matrix').tocsr()
+        first, star = near.indptr, near.indices
     else:
         inside = stars.query_ball_point(centres, chord, return_sorted=True)
-        of_centre = np.repeat(np.arange(len(inside)), [len(rows) for rows in inside])
+        first = np.cumsum([0, *(len(rows) for rows in inside)])
         star = np.fromiter(itertools.chain.from_iterable(inside), np.int64)
-    first = np.searchsorted(of_centre, np.arange(len(centres)))
+    of_centre = np.repeat(np.arange(len(centres)), np.diff(first))
     rank = np.arange(len(star)) - first[of_centre]
     rows = np.full((len(centres), count), -1, np.int64)
     few = rank < count
@@ -222,36 +235,46 @@ def brightest_within(stars: cKDTree, centres: Floats, radius_rad: float, count: 
 
 
 @dataclass(frozen=True)
-class ShapeGrid:
+class PatternGrid:
     """
-    Shapes (q, 5) sorted by cell.
+    Patterns (q,) sorted by the cell of their places.
 
-    ``rows`` (q,) of the shapes as given; ``first`` (m + 1,): row of the first shape of each of
-    the m cells, the last place counting fastest.
+    ``first`` (m + 1,): row of the first pattern of each of the m cells, the last coordinate
+    counting fastest.
     """
 
-    rows: NDArray[np.int32]
-    shape: Singles
+    patterns: Patterns
     first: NDArray[np.int32]
 
 
-def shape_grid(shape: Floats | Singles) -> ShapeGrid:
-    """Shapes (q, 5) in the order of a grid."""
-    cell = np.zeros(len(shape), np.int32)
-    for place, low, cells in zip(shape.T, _LOW, _CELLS, strict=False):
-        cell = cell * np.int32(cells) + ((place - low) / _CELL).astype(np.int32)
+def pattern_grid(parts: Iterable[Patterns]) -> PatternGrid:
+    """Patterns (q,), given in parts, in the order of a grid."""
+    every, cells = [], []
+    for patterns in parts:
+        cell: NDArray[np.int32] = np.zeros(len(patterns), np.int32)
+        for place, low, side in zip(_coordinates(patterns).T, _LOW, _CELLS, strict=True):
+            cell = cell * np.int32(side) + ((place - low) / _CELL).astype(np.int32)
+        every.append(patterns)
+        cells.append(cell)
+    cell = np.concatenate(cells)
     # The rows of a sparse matrix are sorted by counting.
     of_cell = (np.ones(len(cell), np.int8), (cell, np.arange(len(cell), dtype=np.int32)))
     by_cell = coo_array(of_cell, shape=(math.prod(_CELLS), max(len(cell), 1))).tocsr()
-    return ShapeGrid(by_cell.indices, shape.take(by_cell.indices, axis=0), by_cell.indptr)
+    return PatternGrid(np.concatenate(every).take(by_cell.indices), by_cell.indptr)
 
 
-def equal_shapes(
-    grid: ShapeGrid, shape: Floats, place_tolerance: float, size_tolerance: float
+def _coordinates(patterns: Patterns) -> Singles:
+    """Coordinates (n, 4) of C and D."""
+    return np.asarray(patterns['places'].view(np.float32))
+
+
+def equal_patterns(
+    grid: PatternGrid, patterns: Patterns, place_tolerance: float, size_tolerance: float
 ) -> tuple[Indices, Indices]:
-    """Pairs of rows, of given shapes (n, 5) and of those of a grid, equal within tolerances."""
-    lowest = np.floor((shape[:, :4] - place_tolerance - _LOW) / _CELL).astype(np.int64)
-    highest = np.floor((shape[:, :4] + place_tolerance - _LOW) / _CELL).astype(np.int64)
+    """Pairs of rows, of given patterns (n,) and of those of a grid, equal within tolerances."""
+    places = _coordinates(patterns).astype(np.float64)
+    lowest = np.floor((places - place_tolerance - _LOW) / _CELL).astype(np.int64)
+    highest = np.floor((places + place_tolerance - _LOW) / _CELL).astype(np.int64)
     lowest, highest = np.maximum(lowest, 0), np.minimum(highest, np.array(_CELLS) - 1)
     within = np.flatnonzero((lowest <= highest).all(axis=1))
     lowest, highest = lowest[within], highest[within]
@@ -266,10 +289,10 @@ def equal_shapes(
         end = start + span[3, there] + 1
         pairs.append(_rows_between(within[there], grid.first[start], grid.first[end]))
     query, row = np.concatenate(pairs, axis=1)
-    off = np.abs(grid.shape[row] - shape[query]).T
-    equal = off[4] <= size_tolerance
-    for place in off[:4]:
-        equal &= place <= place_tolerance
+    given, kept = patterns[query], grid.patterns[row]
+    equal = np.abs(kept['size'] - given['size']) <= size_tolerance
+    for off in np.abs(_coordinates(kept) - _coordinates(given)).T:
+        equal &= off <= place_tolerance
     return query[equal], row[equal]
 
 

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind import pattern_index, sky_fit
+from starcal_ros.identification.blind.pattern_index import PATTERN, Patterns, patterns_of
 from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, SkyFit, SourceImage, STATED
 from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
@@ -90,14 +91,6 @@ class SkyMatch:
         return mirror(self.xy_px, self.camera.width) if self.mirrored else self.xy_px
 
 
-@dataclass(frozen=True)
-class NotFound:
-    """Reason why no stars were identified, and the log10 p-value of the best fit, if any."""
-
-    reason: str
-    log10_p_value: float = math.inf
-
-
 def find_in_any(
     rankings: Sequence[Floats],
     camera: CameraModel,
@@ -106,9 +99,9 @@ def find_in_any(
     rounds: Sequence[tuple[int, int]] = ROUNDS,
     deadline_s: float = math.inf,
     ranges: Ranges = STATED,
-) -> tuple[SkyMatch | NotFound, int]:
+) -> tuple[SkyMatch | None, int]:
     """
-    Identified stars of an image, or the reason why there are none; the row of their selection.
+    Identified stars of an image and the row of their selection; None if there are none.
 
     ``rankings`` are selections (n, 2) of its sources, brightest first.  ``camera`` is the prior,
     within ``ranges``: by default focal length within 25 %, principal point within 5 % of the
@@ -122,24 +115,18 @@ def find_in_any(
         if len(xy_px) >= _FEWEST_SOURCES
         for turned in mirrored
     ]
-    if not seen:
-        count = max(len(xy_px) for xy_px in rankings)
-        return NotFound(f'{count} star-like sources, at least {_FEWEST_SOURCES} are needed'), 0
-    tried = math.log10(len(mirrored))
-    least = math.inf
     for before, sources in rounds:
         chosen = [one for one in seen if len(one.image.xy_px) > before]
         for one, candidates in _candidates(chosen, catalog, before, sources):
             for fit in _fits(one.image, catalog, candidates):
                 log10_p, radius_px = sky_fit.log10_p_value(one.image, catalog, fit)
-                log10_p += tried
-                least = min(least, log10_p)
+                log10_p += math.log10(len(mirrored))
                 if log10_p < MAX_LOG10_P_VALUE:
                     result = _result(one.image, catalog, fit, radius_px, log10_p, one.mirrored)
                     return result, one.ranking
             if time.thread_time() > deadline_s:
-                return NotFound('the search has reached its time limit', least), 0
-    return NotFound('no pattern of the sources matches the catalog beyond chance', least), 0
+                return None, 0
+    return None, 0
 
 
 @dataclass(frozen=True)
@@ -185,7 +172,7 @@ def confirm_sky(
     camera_from_icrf: Rotation,
     mirrored: bool = False,
     ranges: Ranges = STATED,
-) -> SkyMatch | NotFound:
+) -> SkyMatch | None:
     """Identified stars among sources (n, 2), given a rotation known to 10 % of the field."""
     image = _image(xy_px, camera, mirrored, ranges)
     stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
@@ -193,11 +180,10 @@ def confirm_sky(
     pairs = _shifted_alike(image, catalog, start)
     fit = sky_fit.refined(image, catalog, start, pairs) if len(pairs) >= 5 else None
     if fit is None:
-        return NotFound('the stars are not where they were expected')
+        return None
     log10_p, radius_px = sky_fit.log10_p_value(image, catalog, fit)
-    if log10_p >= MAX_LOG10_P_VALUE:
-        return NotFound('the stars are not where they were expected', log10_p)
-    return _result(image, catalog, fit, radius_px, log10_p, mirrored)
+    is_match = log10_p < MAX_LOG10_P_VALUE
+    return _result(image, catalog, fit, radius_px, log10_p, mirrored) if is_match else None
 
 
 def matched_again(
@@ -325,14 +311,14 @@ class _View:
         plane = self.plane[np.isfinite(self.plane[:, 0])]
         return _gain_map(plane, math.tan(self.image.half_diagonal_rad))
 
-    def patterns(self, before: int, sources: int) -> tuple[Indices, Floats]:
-        """Patterns (n, 4) of the ``sources`` brightest, one after row ``before``; `shapes`."""
+    def patterns(self, before: int, sources: int) -> Patterns:
+        """Patterns of the ``sources`` brightest, by their rows, one after row ``before``."""
         usable = np.flatnonzero(np.isfinite(self.directions[:sources, 0]))
-        every = list(itertools.combinations(usable.tolist(), 4))
-        chosen: Indices = np.array(every, np.int64).reshape(-1, 4)
-        chosen = chosen[chosen[:, 3] >= before]
-        order, shape = pattern_index.shapes(self.directions[chosen])
-        return np.take_along_axis(chosen, order, axis=1), shape
+        if len(usable) < 4:
+            return np.empty(0, PATTERN)
+        patterns = patterns_of(self.directions[usable].T[..., None], np.zeros(1, np.int64))
+        patterns['order'] = usable[patterns['order']]
+        return patterns[(patterns['order'] >= before).any(axis=1)]
 
 
 def _focal_scales(image: SourceImage) -> tuple[float, ...]:
@@ -351,7 +337,7 @@ def _tolerances(image: SourceImage) -> tuple[float, float]:
 
 
 def _look_up(
-    view: _View, catalog: StarCatalog, scale: int, patterns: tuple[Indices, Floats]
+    view: _View, catalog: StarCatalog, scale: int, patterns: Patterns
 ) -> tuple[list[_Candidate], list[_Candidate]]:
     """
     Candidates from `_View.patterns` and the index of one scale, the most likely first.
@@ -360,15 +346,18 @@ def _look_up(
     """
     index = pattern_index.pattern_index(catalog, scale)
     place_tolerance, size_tolerance = _tolerances(view.image)
-    sources, shape = patterns
-    fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
-    sources, shape = pattern_index.equivalent(sources[fits], shape[fits], place_tolerance)
-    query, quad = pattern_index.equal_shapes(index.grid, shape, place_tolerance, size_tolerance)
-    if len(quad) > _CANDIDATES:
-        few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
-        quad, query = quad[few], query[few]
-    growth = np.exp(shape[query, 4] - index.grid.shape[quad, 4])
-    stars, sources = index.quads[index.grid.rows[quad]].astype(np.int64), sources[query]
+    fits = patterns['size'] < math.log(2 * index.radius_rad) + size_tolerance
+    patterns = pattern_index.equivalent(patterns[fits], place_tolerance)
+    query, row = pattern_index.equal_patterns(
+        index.grid, patterns, place_tolerance, size_tolerance
+    )
+    if len(row) > _CANDIDATES:
+        few = np.random.default_rng(0).choice(len(row), _CANDIDATES, replace=False)
+        row, query = row[few], query[few]
+    growth = np.exp(
+        np.subtract(patterns['size'][query], index.grid.patterns['size'][row], dtype=float)
+    )
+    stars, sources = index.stars(row), patterns['order'][query].astype(np.int64)
     rotation = _rotations(catalog.direction_icrs[stars], view.plane[sources], growth)
     # Log-likelihood ratios of the sources to those by chance, and of the stars of a pattern alone.
     gain, own = _gains(view, catalog, growth, rotation) if len(growth) else (growth, 0.0)

@@ -120,10 +120,11 @@ def refined(
         if abs(math.log(fx / float(prior.parameters[0]))) > 1.3 * image.ranges.focal:
             return None
     for _ in range(2):
-        pairs = match(image, catalog, fit, 4.5, _MOST_STARS, _MOST_STARS)
-        if len(pairs) < 5:
+        stars, xy_px = predicted(catalog, fit, _MOST_STARS)
+        rank, source, _ = mutual(image, xy_px, 4.5, _MOST_STARS)
+        if len(rank) < 5:
             return None
-        fit = _step(image, catalog, fit, pairs, 1.0)
+        fit = _step(image, catalog, fit, np.stack([stars[rank], source], axis=-1), 1.0)
     return fit
 
 
@@ -149,20 +150,6 @@ def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: i
 def _evenly(image: SourceImage, radius_px: float, sources: int) -> float:
     """Probability that one of a number of evenly spread sources lies within a radius."""
     return min(1.0, min(sources, len(image.xy_px)) * math.pi * radius_px**2 / image.area_px2)
-
-
-def match(
-    image: SourceImage,
-    catalog: StarCatalog,
-    fit: SkyFit,
-    radius_px: float,
-    most_stars: int,
-    most_sources: int,
-) -> Indices:
-    """Pairs (k, 2) of catalog row and source that are mutually nearest within a radius."""
-    stars, xy_px = predicted(catalog, fit, most_stars)
-    rank, source, _ = mutual(image, xy_px, radius_px, most_sources)
-    return np.stack([stars[rank], source], axis=-1)
 
 
 def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Indices, Floats]:

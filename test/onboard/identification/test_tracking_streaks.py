@@ -9,6 +9,8 @@ import functools
 import numpy as np
 import pytest
 
+from bench import narrow
+from bench.frames import load_set_up, observed, render_frame
 from starcal_ground.simulation.rendering import render
 from starcal_ground.simulation.scenario import Detector, scenario, Scene, scene
 from starcal_ros.errors import ImageRefused
@@ -83,6 +85,16 @@ def test_streaks_are_measured_at_their_middle(turn_rad: np.ndarray, tracked: boo
     assert 0.85 < np.sqrt(np.mean(error**2)) < 1.15
     # A bent path is no bias: the mean of some 100 stars is good to 0.1 sigma per axis.
     assert np.abs(error.mean(axis=0)).max() < 0.35
+
+
+def test_few_bright_stars_show_the_streaks_of_a_tracked_image() -> None:
+    """Measured as sharp stars, most were refused as elongated."""
+    given = narrow.scenario_of(5.0, 1, 6.0)
+    set_up = load_set_up(given, prior_alignment_sigma_deg=0.01, magnitude_limit=9.0)
+    frames = (render_frame(given, index) for index in range(2))
+    image = observed(frames, set_up).images[1]
+    # Four stars are brighter than 15 sigma, twelve than 8.  As sharp ones: 8 used, 11 elongated.
+    assert len(image) > 20 and image.refused_stars.get('elongated', 0) < 3
 
 
 @pytest.mark.parametrize('length_px', [14.0, 25.0])
