@@ -47,6 +47,7 @@ _GROUPS = 20  # of stars by magnitude
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
 _SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
 _AT_ONCE = 32  # candidates: their rows take some 10 MB
+_TOLD = 1e-3  # of what is known of a direction: a mean image that adds less says nothing of it
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,9 @@ class Prospect:
     """
     Information that c candidate images add to an estimate.
 
-    ``root`` (P, r) of the covariance of the shared unknowns; ``information`` (c, r, r) of each
-    image in its columns: the covariance after images k, l is
-    ``root (1 + information[k] + information[l])^-1 root'``.
+    ``root`` (P, r) of the covariance of the shared unknowns; ``information`` (c, q, q) of each
+    image in its first q columns, the others are those that images say nothing of: the covariance
+    after images k, l is ``root (1 + information[k] + information[l])^-1 root'``.
     """
 
     root: Floats
@@ -129,20 +130,26 @@ class Prospect:
         One that was chosen before comes back only if the others leave more than `_HELPS` of the
         sigma: a slow error of the star tracker may be the same in one attitude.
         """
-        before = np.eye(self.root.shape[1]) + self.information[list(chosen)].sum(axis=0)
-        seen = self.root.T @ squares @ self.root
+        before = np.eye(self.information.shape[1]) + self.information[list(chosen)].sum(axis=0)
+        shown, hidden = self._squares(squares)
         variance = np.full(len(self.information), np.inf)
         for k in np.flatnonzero(allowed):
-            variance[k] = _variance(before + self.information[k], seen)
+            variance[k] = hidden + _variance(before + self.information[k], shown)
         variance[list(chosen)] *= (1.0 + _HELPS) ** 2
         return int(np.argmin(variance))
 
     def variances(self, chosen: Sequence[int], squares: Floats) -> Floats:
         """Return the variance (n + 1,) now and after each of n chosen candidates."""
-        none = np.eye(self.root.shape[1])
+        none = np.eye(self.information.shape[1])
         added = np.cumsum(self.information[list(chosen)], axis=0)
-        seen = self.root.T @ squares @ self.root
-        return np.array([_variance(one, seen) for one in (none, *(none + one for one in added))])
+        shown, hidden = self._squares(squares)
+        after = (none, *(none + one for one in added))
+        return np.array([hidden + _variance(one, shown) for one in after])
+
+    def _squares(self, squares: Floats) -> tuple[Floats, float]:
+        """Squares (q, q) in the columns that images change, and the variance of the others."""
+        changed, others = np.split(self.root, [self.information.shape[1]], axis=1)
+        return changed.T @ squares @ changed, float(np.einsum('pr,pr', others, squares @ others))
 
 
 def forecast(
@@ -181,11 +188,14 @@ def prospect(
     values, vectors = np.linalg.eigh(covariance / np.outer(size, size).clip(1e-300))
     known = values > _ROUNDING * len(values)
     root = size[:, None] * vectors[:, known] * np.sqrt(values[known])
-    information = np.zeros((len(candidates), root.shape[1], root.shape[1]))
-    for first in range(0, len(candidates), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        information[part] = _information(estimate, candidates[part], options, root)
-    return Prospect(root, information)
+    parts = [candidates[k : k + _AT_ONCE] for k in range(0, len(candidates), _AT_ONCE)]
+    total = sum(_information(estimate, part, options, root).sum(axis=0) for part in parts)
+    values, vectors = np.linalg.eigh(total / len(candidates))
+    root = root @ vectors[:, ::-1]
+    count = int(np.sum(values > _TOLD))
+    changed = root[:, : max(count, 1)]
+    information = [_information(estimate, part, options, changed) for part in parts]
+    return Prospect(root, np.concatenate(information))
 
 
 def _information(
