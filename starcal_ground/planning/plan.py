@@ -14,7 +14,7 @@ nothing at random, never rises with an image, and does not depend on the order o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.assessment.budget import mean_squares
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
@@ -189,22 +189,29 @@ def prospect(
     known = values > _ROUNDING * len(values)
     root = size[:, None] * vectors[:, known] * np.sqrt(values[known])
     parts = [candidates[k : k + _AT_ONCE] for k in range(0, len(candidates), _AT_ONCE)]
-    total = sum(_information(estimate, part, options, root).sum(axis=0) for part in parts)
-    values, vectors = np.linalg.eigh(total / len(candidates))
+    total = np.zeros((len(root), len(root)))
+    for part in parts:
+        for _, place, rows in _rows(estimate, part, options):
+            total[np.ix_(place, place)] += np.tensordot(rows, rows, ((0, 1), (0, 1)))
+    values, vectors = np.linalg.eigh(root.T @ total @ root / len(candidates))
     root = root @ vectors[:, ::-1]
-    count = int(np.sum(values > _TOLD))
-    changed = root[:, : max(count, 1)]
-    information = [_information(estimate, part, options, changed) for part in parts]
-    return Prospect(root, np.concatenate(information))
+    changed = root[:, : max(int(np.sum(values > _TOLD)), 1)]
+    information = np.zeros((len(candidates), *changed.shape[1:] * 2))
+    for k, part in enumerate(parts):
+        for image, place, rows in _rows(estimate, part, options):
+            seen = rows @ changed[place]
+            information[k * _AT_ONCE + image] = seen.transpose(0, 2, 1) @ seen
+    return Prospect(root, information)
 
 
-def _information(
-    estimate: Estimate,
-    candidates: Sequence[StarObservations],
-    options: CalibrationOptions,
-    root: Floats,
-) -> Floats:
-    """Return the information (c, r, r) of candidates in the columns of a root (P, r)."""
+def _rows(
+    estimate: Estimate, candidates: Sequence[StarObservations], options: CalibrationOptions
+) -> Iterator[tuple[Indices, list[int], Floats]]:
+    """
+    Yield equations of candidates in the shared unknowns: images (k,), places (u,), rows (k, n, u).
+
+    The squares of rows are the information of an image, its own unknowns eliminated.
+    """
     problem, state = _as_estimated(estimate, candidates, options)
     camera = estimate.geometry.camera
     # The columns of what is in the list.
@@ -218,7 +225,6 @@ def _information(
     linear = Linearisation(problem, state, layout, measurements, table.measured_px)
     _, J = whitened_attitude_errors(problem, state)
     turning, turns = tracker_turns(layout)
-    information = np.zeros((len(candidates), root.shape[1], root.shape[1]))
     for chunk, by_shared, by_own, _ in star_rows(linear):
         _, stars, b = by_own.shape
         # Of the star tracker, and of the prior of the shape.
@@ -231,9 +237,7 @@ def _information(
             1.0 / estimate.posterior.shapes.sigma_px
         )
         Q = np.linalg.qr(own)[0]
-        left = (shared - Q @ (Q.transpose(0, 2, 1) @ shared)) @ root[place]
-        information[chunk.image] = left.transpose(0, 2, 1) @ left
-    return information
+        yield chunk.image, place, shared - Q @ (Q.transpose(0, 2, 1) @ shared)
 
 
 def _as_estimated(
