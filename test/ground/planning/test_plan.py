@@ -87,8 +87,8 @@ def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
     same, pair, back = sigmas(here, here, here), sigmas(here, there), sigmas(there, here)
     for each in (same, pair):
         assert (np.diff(each) < 0).all()
-    assert same[1] == sigmas(here)[1]
-    assert pair == pytest.approx(back, rel=1e-9)  # rounding
+    assert same[1] == pytest.approx(sigmas(here)[1], rel=1e-9)  # rounding of the directions
+    assert pair == pytest.approx(back, rel=1e-9)
 
 
 def test_a_pointing_comes_back_only_where_no_other_helps_as_much(
