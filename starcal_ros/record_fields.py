@@ -407,7 +407,8 @@ def _tuple(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> 
     assert kind.item is not None  # tuples have one
     items = value.tolist() if hasattr(value, 'tolist') else value  # NumPy and array.array
     if not isinstance(items, (list, tuple)):
-        raise _refused(path, value, 'a list')
+        is_number = isinstance(value, (int, float))
+        raise _refused(path, value, f'a list, such as [{value}]' if is_number else 'a list')
     _check_count(kind, len(items), path)
     check_shape((len(items),), kind.dimensions, path, sizes)
     item = kind.item

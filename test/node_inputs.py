@@ -28,16 +28,14 @@ def in_this_process(kind: Any, folder: Path, is_active: bool = True) -> Iterator
     """A configured node with the parameter file of a bag, in this process."""
     import rclpy
 
-    rclpy.init(args=['--ros-args', *parameters(folder)])
-    node = kind()
-    try:
+    with contextlib.ExitStack() as stack:
+        rclpy.init(args=['--ros-args', *parameters(folder)])
+        stack.callback(rclpy.try_shutdown)
+        node = kind()
+        stack.callback(node.destroy_node)
         node.trigger_configure()
+        stack.callback(node.cleanup)
         if is_active:
             node.trigger_activate()
+            stack.callback(node.deactivate)
         yield node
-    finally:
-        if is_active:
-            node.deactivate()
-        node.cleanup()
-        node.destroy_node()
-        rclpy.try_shutdown()

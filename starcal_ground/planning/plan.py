@@ -47,7 +47,7 @@ _GROUPS = 20  # of stars by magnitude
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
 _SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
 _AT_ONCE = 32  # candidates: their rows take some 10 MB
-_TOLD = 1e-3  # of what is known of a direction: a mean image that adds less says nothing of it
+_TOLD = 0.05  # of what is known of a direction: where all candidates add less, none is planned
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Prospect:
     Information that c candidate images add to an estimate.
 
     ``root`` (P, r) of the covariance of the shared unknowns; ``information`` (c, q, q) of each
-    image in its first q columns, the others are those that images say nothing of: the covariance
+    image in its first q columns, the others are those that images hardly change: the covariance
     after images k, l is ``root (1 + information[k] + information[l])^-1 root'``.
     """
 
@@ -193,7 +193,7 @@ def prospect(
     for part in parts:
         for _, place, rows in _rows(estimate, part, options):
             total[np.ix_(place, place)] += np.tensordot(rows, rows, ((0, 1), (0, 1)))
-    values, vectors = np.linalg.eigh(root.T @ total @ root / len(candidates))
+    values, vectors = np.linalg.eigh(root.T @ total @ root)
     root = root @ vectors[:, ::-1]
     changed = root[:, : max(int(np.sum(values > _TOLD)), 1)]
     information = np.zeros((len(candidates), *changed.shape[1:] * 2))

@@ -206,8 +206,13 @@ def _reason(check: GateCheck) -> str:
 
 def _solver(calibration: Calibration) -> GateCheck:
     passed = calibration.termination == 'converged'
-    note = '' if passed else f'the solver did not converge ({calibration.termination})'
-    return GateCheck('solver converged', '', math.nan, math.nan, '', passed, note)
+    note = (
+        f'the solver did not converge ({calibration.termination}); check lens_model and the prior'
+        ' camera, and that all images are of one camera'
+    )
+    return GateCheck(
+        'solver converged', '', math.nan, math.nan, '', passed, '' if passed else note
+    )
 
 
 def _numbers(calibration: Calibration) -> GateCheck:
@@ -591,7 +596,8 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'correct the velocity so; on the ground state the site',
+    'assumed velocity': 'correct the velocity so; on the ground state the site; if neither,'
+    ' the images are warped one by one (resampled, or the air)',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',

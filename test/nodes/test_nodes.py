@@ -100,8 +100,8 @@ def test_nodes_and_tool_give_the_same_calibration(
         start_node(name, ros=(*parameters(tiny_bag), *REMAPS))
     pictures = client.collect(Image, 'annotated_image', 5)
     answers: list[Any] = client.collect(StarObservations, 'observations')
-    # The player waits for the observer, but the calibrator must not miss the first image.
-    client.until_listened()
+    # The player waits for the observer; calibrator and client must not miss the first image.
+    client.until_listened(listeners=2)
     play(start_node, tiny_bag)
     client.until_images(json.loads((tiny_bag / 'truth.json').read_text())['images'])
     client.until(lambda: pictures and len(answers) == 10)

@@ -50,7 +50,7 @@ _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
 _TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
-MOST_SILENT = 5  # files in turn that a store does not give; the others wait for the next run
+MOST_SILENT = 5  # files in turn that a store does not give, before it is asked if it answers
 _CONNECT_S = 10.0
 _AHEAD = 8  # tasks submitted ahead for each thread of a cluster: cancelling 100,000 is slow
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
@@ -355,7 +355,8 @@ def update(
 
     A task that ends its worker process, also alone, becomes the row of a failure; the others go
     on.  A file that cannot be reached has no row, so the next run tries it again.  The run ends
-    early, and the next one continues, once a store has not given 5 files in turn.
+    early, and the next one continues, once a store has not given 5 files in turn and does not say
+    whether the last one exists.
     The calibration of a bag is written beside the table before its row, and each row is on disk
     before the next, so a run that was stopped starts where it stopped.
     Raises OptionError when no scheduler answers at the address.
@@ -378,7 +379,9 @@ def update(
             done.count(table, task, answer)
             on_row()
             if done.silent == MOST_SILENT:
-                return done
+                if not places.is_answered(task.url):
+                    return done
+                done.silent = 0  # by these files only
     # A file that was repaired or removed is no longer among the tasks.
     table.forget(failures)
     return done

@@ -105,6 +105,17 @@ def exists(place: str) -> bool:
         return bool(fs.exists(path, **_within(fs, ANSWER_S)))
 
 
+def is_answered(url: str) -> bool:
+    """Return True if a store says now whether it has a file."""
+    try:
+        with _remote(url) as (fs, path):
+            fs.invalidate_cache()
+            fs.exists(path, **_within(fs, ANSWER_S))
+    except OSError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
 def fetched(url: str, files: Sequence[str], size_bytes: int) -> Iterator[Path]:
     """

@@ -378,7 +378,8 @@ def distinct(rows: Sequence[Row]) -> list[Row]:
     """
     first: dict[object, Row] = {}
     for row in rows:
-        first.setdefault((row.first_ns, row.last_ns, row.values), row)
+        key = row.first_ns, row.last_ns, row.values, row.star_tracker_from_camera_xyzw
+        first.setdefault(key, row)
     return list(first.values())
 
 

@@ -250,10 +250,11 @@ class Table:
             }
 
     def forget(self, stamps: Iterable[str]) -> None:
-        """Remove the rows of some stamps."""
+        """Remove the failures of some stamps."""
         with self.transaction():
             self._db.executemany(
-                'DELETE FROM calibration WHERE stamp = ?', zip(stamps, strict=True)
+                "DELETE FROM calibration WHERE stamp = ? AND kind = 'failed'",
+                zip(stamps, strict=True),
             )
 
     def names(self) -> list[tuple[str, str]]:

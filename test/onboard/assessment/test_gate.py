@@ -429,8 +429,11 @@ def test_large_counts_are_written_out() -> None:
 def test_a_search_that_did_not_converge_is_refused() -> None:
     for termination in ('no_descent', 'iteration_limit'):
         found = dataclasses.replace(GOOD, termination=termination)
-        expected = (f'the solver did not converge ({termination})',)
-        assert reasons(found, GateOptions()) == expected
+        (reason,) = reasons(found, GateOptions())
+        assert reason == (
+            f'the solver did not converge ({termination}); check lens_model and the prior camera,'
+            ' and that all images are of one camera'
+        )
 
 
 def test_every_reason_is_given() -> None:

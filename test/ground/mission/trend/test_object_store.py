@@ -216,15 +216,22 @@ def test_a_bag_that_cannot_be_fetched_fails_and_passes(
 def test_a_store_that_falls_silent_ends_the_run(
     store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
-    """Files in turn, so that one that is given starts the count again."""
-    monkeypatch.setattr(fleet, 'MOST_SILENT', 2)
+    """Files that a store does not give, where it gives others, hold up no run."""
+    monkeypatch.setattr(fleet, 'MOST_SILENT', 1)
+    compute = fleet.compute
+
+    def while_silent(task: fleet.Task) -> fleet.Answer:
+        store.faults = {'': -1}  # every request
+        return compute(task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fleet, 'compute', while_silent)
+        assert trend(tmp_path) == 3
+    said = capsys.readouterr()
+    assert '0 new, 0 known, 1 failed' in said.out
     store.faults = {'GET /archive/fleet/0/.*mcap': -1}
     assert trend(tmp_path) == 0
     assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
-    monkeypatch.setattr(fleet, 'MOST_SILENT', 1)
-    assert trend(tmp_path) == 3
-    said = capsys.readouterr()
-    assert '0 new, 0 known, 1 failed' in said.out
     assert 'the last 1 files cannot be read; run' in said.err and said.err.count('\n') == 1
     store.faults = {}
     assert trend(tmp_path) == 0
