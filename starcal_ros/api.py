@@ -98,8 +98,8 @@ def observations_of(
         Angular rate at that time about the axes of the star tracker, and its 1-sigma; NaN if not
         known.  A time of read-out or an offset of the stamps is estimated only with a rate.
     velocity_sigma_m_s : float
-        1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: of an
-        orbit about the Earth.
+        1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: not
+        known.
 
     Returns
     -------

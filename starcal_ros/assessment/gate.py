@@ -596,8 +596,7 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'correct the velocity so; on the ground state the site; if neither,'
-    ' the images are warped one by one (resampled, or the air)',
+    'assumed velocity': 'correct the velocity so; on the ground state the site',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',

@@ -97,6 +97,8 @@ class CameraModel(Record):
             )
         if self.width < 1 or self.height < 1:
             raise ValueError(f'image size: {self.width} x {self.height} is not an image')
+        if max(self.width, self.height) > MAX_SIDE_PX:
+            raise ValueError(f'image size: {self.width} x {self.height} is over {MAX_SIDE_PX} px')
         if parameters[0] <= 0 or parameters[2] <= 0:
             raise ValueError(f'fx, fy: {parameters[0]}, {parameters[2]} are not positive')
         parameters.setflags(write=False)
@@ -162,8 +164,6 @@ def check_plausible(camera: CameraModel) -> None:
     Raises ValueError naming the parameter, its value and the likely cause.
     """
     width, height = camera.width, camera.height
-    if max(width, height) > MAX_SIDE_PX:
-        raise ValueError(f'image size: {width} x {height} is over {MAX_SIDE_PX} px')
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     side_px = max(width, height)
     if camera.model == 'equidistant':

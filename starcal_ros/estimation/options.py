@@ -75,8 +75,8 @@ class CalibrationOptions:
         -1.0,
         '1-sigma uncertainty of each component of the observer velocity, m/s; -1: 10 with a'
         ' velocity input, 20000 (an orbit about the Earth or the Sun) without one or with one'
-        ' under 11200, which may be about the Earth, 0 on the ground; 8000 in an orbit about the'
-        ' Earth',
+        ' under 11200, which may be about the Earth (state 10 if not), 0 on the ground; 8000 in an'
+        ' orbit about the Earth',
         low=-1.0,
         high=3e5,
     )

@@ -322,7 +322,7 @@ def _first_with_same_attitude(
 def _after_image(
     track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
-    """Track with the stamp and the hot pixels of an image that has the alignment of the track."""
+    """Track with the stamp and the hot pixels of an image, by the alignment of the track."""
     hot = learn_hot_pixels(
         track.hot or setup.hot,
         exposure.image.pixels,

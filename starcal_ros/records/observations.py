@@ -195,7 +195,8 @@ class StarObservations(Record):
         1-sigma of that about the axes of that frame; NaN if unknown.
     velocity_sigma_m_s : float
         1-sigma of each component of the observer's velocity in ``direction_icrf``; 0 for a site on
-        the ground, NaN if no velocity was given and that of the Earth was used.
+        the ground, NaN if not known: none was given and that of the Earth was used, or one that
+        may be about the Earth.
     zenith_icrf : (3,)
         Zenith of the refraction in ``direction_icrf`` if it was found from the stars; NaN in space
         and for a known site.

@@ -349,9 +349,16 @@ class Executor(MultiThreadedExecutor):
     _sigint_gc: Any = None
     _due: tuple[Any, ...] = ()  # their callbacks may not have begun
 
-    def _make_handler(self, entity: Any, *arguments: Any) -> Any:
+    def _make_handler(self, entity: Any, node: Any, take: Callable[[Any], Any]) -> Any:
+        def taking(due: Any) -> Any:
+            # After an error here, rclpy would never free the group.
+            try:
+                return take(due)
+            except Exception as error:
+                return functools.partial(_raise, error)
+
         self._due = (*(other for other in self._due if other._executor_event), entity)
-        return super()._make_handler(entity, *arguments)
+        return super()._make_handler(entity, node, taking)
 
     def can_execute(self, entity: Any) -> bool:
         """
@@ -370,6 +377,10 @@ class Executor(MultiThreadedExecutor):
         triggers.
         """
         self._executor.shutdown(wait=True, cancel_futures=True)
+
+
+async def _raise(error: Exception) -> None:
+    raise error
 
 
 def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | None) -> int:

@@ -93,7 +93,8 @@ EARTH = Velocity()
 """Velocity of the Earth, used where that of the observer is unknown."""
 # The last sample of telemetry is up to a second old, in which an orbital velocity changes by this.
 GIVEN_SIGMA_M_S = 10.0
-# An orbit about the Earth is slower than this about the Earth, and none is about the barycentre.
+# In an orbit about the Earth a velocity is less than this about the Earth, and more about the
+# barycentre.
 _ESCAPE_M_S = 11.2e3
 
 

@@ -44,6 +44,7 @@ _SHOWN_SNR = 8.0  # of stars that show a common change of shape where too few ar
 _MOST = 60  # the brightest stars that show the PSF; fainter ones add almost nothing
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
 _COMMON_CHANGE = 0.5 * MAX_SHAPE_CHANGE
+_OF_MEDIAN = 1.25  # 1-sigma of a median over that of a mean
 _IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away shows another source
 
 
@@ -262,9 +263,12 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
         return False
     # Few stars of a narrow field are bright, and light spread along streaks has more noise.
     for least_snr in (_BRIGHT_SNR, _SHOWN_SNR):
-        change = measured.fit.shape_change[measured.fit.snr > least_snr]
+        shown = measured.fit.snr > least_snr
+        change = measured.fit.shape_change[shown]
         if len(change) >= _FEWEST_BRIGHT:
-            return bool(np.abs(medians(change) - model.shape_median).max() > _COMMON_CHANGE)
+            noise = _OF_MEDIAN * medians(measured.fit.shape_sigma[shown]) / math.sqrt(len(change))
+            departure = np.abs(medians(change) - model.shape_median)
+            return bool((departure > np.maximum(_COMMON_CHANGE, 4.0 * noise)).any())
     return False
 
 

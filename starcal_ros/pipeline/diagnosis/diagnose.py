@@ -37,6 +37,7 @@ CAUSES = (
     'focal_length', 'clock', 'axes', 'smear', 'no_stars', 'not_linear', 'unknown',
 )  # fmt: skip
 IMAGES_OF_AN_ALIGNMENT = 3
+_MOST_ATTITUDES = 20_000  # half an hour at 10 Hz: they are sent to another process
 _FEW_SOURCES = 10  # in an image that nothing identifies: hot pixels are sources too
 
 _NO_PARAMETER = 'no parameter mends this: '
@@ -73,9 +74,10 @@ class WireAttitudes:
 
 
 def wire_attitudes(history: AttitudeHistory, direction: str) -> WireAttitudes:
-    """The valid attitudes of a history as received; ``direction`` is `attitude_direction`."""
+    """The last valid attitudes as received; ``direction`` is `attitude_direction`."""
     time_ns, xyzw = history.samples()
-    return WireAttitudes(time_ns, with_direction(xyzw, direction))
+    last = slice(-_MOST_ATTITUDES, None)
+    return WireAttitudes(time_ns[last], with_direction(xyzw[last], direction))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from starcal_ground.simulation.rendering import expose, star_electrons
 from starcal_ground.simulation.scenario import Detector
 from starcal_ros.records import StarRefusal
 from starcal_ros.stars import psf_fit
-from starcal_ros.stars.centroiding import Centroids, measure_stars
+from starcal_ros.stars.centroiding import Centroids, measure_stars, shape_changed
 from starcal_ros.stars.detection import detect, measure_background, sample_mesh
 from starcal_ros.stars.image_model import (
     CentroidOptions,
@@ -530,6 +530,18 @@ def test_without_enough_bright_stars_the_width_is_not_known() -> None:
     assert model.psf_sigma_px == 0.0
     found = measure_stars(pixels, xy, model, PSF)
     assert (found.refusal == StarRefusal.NONE).all() and np.abs(found.xy_px - xy).max() < 0.2
+
+
+def test_the_noise_of_few_faint_stars_is_no_change_of_their_shape() -> None:
+    """Their median scatters by more than the change that bright stars show."""
+    xy = star_grid(14)
+    model = modelled(exposed(14, xy, unlike_fluxes(14, len(xy)), QUIET))
+    faint = exposed(15, xy, np.full(len(xy), 500.0), QUIET)
+    groups = np.array_split(xy, len(xy) // 8)
+    images = [measure_stars(faint, group, model, PSF) for group in groups]
+    snr = np.concatenate([image.snr for image in images])
+    assert len(images) > 50 and 8.0 < np.median(snr) < 15.0
+    assert not any(shape_changed(image, model) for image in images)
 
 
 def test_the_fit_itself_is_exact_on_its_own_model() -> None:
