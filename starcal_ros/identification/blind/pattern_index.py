@@ -6,8 +6,8 @@ The shape of a pattern follows Lang et al. 2010, AJ 139, 1782, section 2.1: the 
 apart, A and B, span a frame, and the positions of the other two, C and D, in it are four numbers.
 The fifth number is the distance of A and B, which a camera measures as accurately as its focal
 length.  The frame is that of the chords: with unit vectors and M the middle of A and B, C has the
-coordinates ``(C - M) . (B - A) / |B - A|^2`` and ``A . (B x C) / |B - A|^2``.  They follow from the
-distances of pairs and the volumes of triples, which the patterns of a disc share.
+coordinates ``(C - M) . (B - A) / |B - A|^2`` and ``A . (B x C) / |B - A|^2``.  They follow from
+the distances of pairs and the volumes of triples, which the patterns of a disc share.
 """
 
 from __future__ import annotations
