@@ -47,7 +47,7 @@ _GROUPS = 20  # of stars by magnitude
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
 _SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
 _AT_ONCE = 32  # candidates: their rows take some 10 MB
-_TOLD = 0.05  # of what is known of a direction: where all candidates add less, none is planned
+_TOLD = 1e-3  # of what is known of a direction: where each candidate adds less, none counts
 
 
 @dataclass(frozen=True)
@@ -193,9 +193,13 @@ def prospect(
     for part in parts:
         for _, place, rows in _rows(estimate, part, options):
             total[np.ix_(place, place)] += np.tensordot(rows, rows, ((0, 1), (0, 1)))
-    values, vectors = np.linalg.eigh(root.T @ total @ root)
-    root = root @ vectors[:, ::-1]
-    changed = root[:, : max(int(np.sum(values > _TOLD)), 1)]
+    root = root @ np.linalg.eigh(root.T @ total @ root)[1]
+    told = np.zeros(root.shape[1])
+    for part in parts:
+        for _, place, rows in _rows(estimate, part, options):
+            told = np.maximum(told, np.square(rows @ root[place]).sum(axis=1).max(axis=0))
+    root = root[:, np.argsort(-told)]
+    changed = root[:, : max(int(np.sum(told > _TOLD)), 1)]
     information = np.zeros((len(candidates), *changed.shape[1:] * 2))
     for k, part in enumerate(parts):
         for image, place, rows in _rows(estimate, part, options):
