@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import gc
 import hashlib
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 import re
 import threading
 import urllib.parse
+import warnings
 from xml.sax.saxutils import escape
 
 from mission_files import TINY  # type: ignore[import-not-found]
@@ -138,6 +140,10 @@ def server(few_images: Path) -> Iterator[Store]:
     made.shutdown()
     made.server_close()
     s3fs.S3FileSystem.clear_instance_cache()
+    # Clients of requests that were never answered warn when they are collected, in any later test.
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        gc.collect()
 
 
 @pytest.fixture
