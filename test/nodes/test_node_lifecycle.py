@@ -318,6 +318,28 @@ def test_no_event_ends_a_wait_while_a_message_waits_for_a_thread(client: Client)
         node.destroy_node()
 
 
+def test_an_error_while_a_message_is_taken_frees_its_group(client: Client) -> None:
+    """As where a subscription is destroyed meanwhile: others of the group are called again."""
+    context = client.node.context
+    executor, node = Executor(2, context=context), rclpy.create_node('fails', context=context)
+    subscription: Any = node.create_subscription(Empty, 'fails', print, 1)
+    other = node.create_subscription(Empty, 'others', print, 1)
+
+    def fails(_entity: object) -> None:
+        raise RuntimeError('it was destroyed')
+
+    try:
+        task = executor._make_handler(subscription, node, fails)
+        assert not executor.can_execute(other)
+        task()
+        with pytest.raises(RuntimeError, match='it was destroyed'):
+            task.result()
+        assert executor.can_execute(subscription) and executor.can_execute(other)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+
+
 ARENAS_OF_A_NODE = """
 import ctypes, sys, threading, types
 from starcal_ros import entry_points

@@ -182,6 +182,8 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
         (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
         (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
+        # Before the field over the detector takes gigabytes.
+        (lambda c: c['image'].update(height=2_000_000), 'image size: .* is over 65536 px'),
         # No message can hold it, so that a calibrator could not publish it.
         (lambda c: c.update(iterations=2**32), 'iterations: 4294967296 is not within 0 to '),
         (lambda c: c.update(images_used=2**70), 'images_used: .* is not within 64 bit'),
