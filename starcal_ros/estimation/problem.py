@@ -280,11 +280,11 @@ def geometry_at(
 
 def supported_terms(ensemble: Ensemble, order: int, with_rate: bool) -> tuple[int, bool, str]:
     """Return order and rate of thermal terms, or none and why temperatures determine none."""
+    if not (order or with_rate):
+        return 0, False, ''
     temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
     note = ''
-    if not (order or with_rate):
-        pass
-    elif unknown := np.count_nonzero(~np.isfinite(temperatures_degc)):
+    if unknown := np.count_nonzero(~np.isfinite(temperatures_degc)):
         note = f'{unknown} of {len(temperatures_degc)} images have no temperature'
     elif (spread := float(temperatures_degc.std())) < FEWEST_SPREAD_K:
         note = f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
