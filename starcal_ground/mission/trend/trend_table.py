@@ -208,8 +208,12 @@ class Table:
             if os.path.lexists(self.path):
                 with regular_file(self.path):
                     pass
-            self._db = sqlite3.connect(self.path, timeout=_WAIT_S, isolation_level=None)
-            weakref.finalize(self, self._db.close)  # Python 3.13 warns of one that is left open
+            # Python 3.13 warns of a connection that is left open. The collector closes it in
+            # whichever thread it runs; SQLite itself takes turns.
+            self._db = sqlite3.connect(
+                self.path, timeout=_WAIT_S, isolation_level=None, check_same_thread=False
+            )
+            weakref.finalize(self, self._db.close)
             with self.transaction():
                 if not self._schema():
                     for statement in _SCHEMA:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import dataclasses
+import gc
 import math
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 from typing import Any
 
 from export_calibrations import calibration  # type: ignore[import-not-found]
@@ -50,6 +52,15 @@ def test_rows_come_back_to_the_last_bit_in_order_of_time(tmp_path: Path) -> None
     rows = [row('a', 3), row('b', 9), row('c', 10, temperature_degc=math.nan)]
     table_of(tmp_path, *rows[::-1])
     assert str(Table(tmp_path).rows()) == str(rows)  # NaN differs from itself
+
+
+def test_a_table_may_be_dropped_in_another_thread(tmp_path: Path) -> None:
+    tables = [table_of(tmp_path, row('a'))]
+    thread = threading.Thread(target=tables.clear)
+    thread.start()
+    thread.join()
+    gc.collect()
+    assert [one.stamp for one in Table(tmp_path).rows()] == ['a']
 
 
 def test_parquet_has_the_columns_of_the_table(tmp_path: Path) -> None:
