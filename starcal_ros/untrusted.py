@@ -115,12 +115,12 @@ def read_archive(
 def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
     """A regular file, open to read; never waits.  Raises OSError, or ValueError in one line."""
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
-    try:
-        number = os.open(path, flags)
-    except ValueError as error:  # of a name with NUL or half a surrogate pair
-        raise ValueError('not the name of a file') from error
-    with os.fdopen(number, 'rb') as file:
-        if not stat.S_ISREG(os.fstat(number).st_mode):
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(open(path, 'rb', opener=lambda at, _: os.open(at, flags)))
+        except ValueError as error:  # of a name with NUL or half a surrogate pair
+            raise ValueError('not the name of a file') from error
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise ValueError('not a regular file')
         yield file
 

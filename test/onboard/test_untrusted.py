@@ -144,6 +144,8 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path: Path) -> None:
             read_text(tmp_path / name, 4)
     with pytest.raises(IsADirectoryError):
         read_text(tmp_path, 4)
+    still_open = map(os.path.realpath, Path('/proc/self/fd').iterdir())
+    assert not {str(tmp_path), str(pipe)} & {*still_open}
 
 
 def test_an_archive_is_inflated_as_far_as_it_is_asked_for(tmp_path: Path) -> None:
