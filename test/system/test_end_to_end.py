@@ -291,10 +291,10 @@ def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None
     psutil = pytest.importorskip('psutil')
     command = [sys.executable, '-m', 'starcal_ground.cli.main', 'demo', '-o', str(tmp_path)]
     tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while not (tmp_path / 'bag_player.log').exists():
+    # The log of the last is there before its process is.
+    while len(children := psutil.Process(tool.pid).children(recursive=True)) < 3:
+        assert tool.poll() is None
         time.sleep(0.05)
-    children = psutil.Process(tool.pid).children(recursive=True)
-    assert len(children) == 3
     tool.send_signal(signal.SIGTERM)
     _, err = tool.communicate(timeout=60)
     assert (tool.returncode, err) == (130, 'starcal: interrupted\n')
