@@ -24,7 +24,7 @@ TIMED = ImageOptions(times={'a.fits': 1, 'a.fits.gz': 1})
 
 @pytest.fixture
 def guard() -> Iterator[Guard]:
-    with Guard(processor_s=1.5, wall_s=20.0) as made:
+    with Guard(processor_s=1.5, wall_s=200.0) as made:
         yield made
 
 
@@ -52,18 +52,17 @@ def test_a_small_tiled_image_may_not_take_gigabytes(tmp_path: Path, guard: Guard
     assert '\n' not in str(error.value)
 
 
-def test_a_tiled_image_of_ordinary_size_is_read(tmp_path: Path, guard: Guard) -> None:
+def test_a_tiled_image_of_ordinary_size_is_read(tmp_path: Path) -> None:
     write_tiled(tmp_path / 'a.fits', 600)
-    found = guard.call(tmp_path / 'a.fits', look, tmp_path / 'a.fits', TIMED)
+    with Guard() as guard:  # astropy is imported in its time
+        found = guard.call(tmp_path / 'a.fits', look, tmp_path / 'a.fits', TIMED)
     assert (found.width, found.height, found.high) == (600, 600, 0.0)
 
 
 def test_a_header_without_end_may_not_take_minutes(tmp_path: Path, guard: Guard) -> None:
     path = tmp_path / 'a.fits.gz'
-    with gzip.open(path, 'wb', 1) as file:
-        file.write(b'SIMPLE  =                    T'.ljust(80))
-        for _ in range(100):
-            file.write(b' ' * 2**24)
+    start = gzip.compress(b'SIMPLE  =                    T'.ljust(80))
+    path.write_bytes(start + 100 * gzip.compress(b' ' * 2**24, 1))
     with pytest.raises(IngestError, match=r'a\.fits\.gz: takes more than 1.5 s of processor time'):
         guard.call(path, look, path, TIMED)
 
@@ -86,11 +85,10 @@ def test_a_meta_kernel_may_not_wait_for_a_pipe(tmp_path: Path) -> None:
     before = Path.cwd()
     os.chdir(tmp_path)  # texts of kernels are at most 80 characters long
     try:
-        with Guard(wall_s=1.0) as guard:
-            with pytest.raises(IngestError, match='^pipe: not a regular file'):
-                guard.call(kernel, sources.attitudes, [kernel], 'ST1', [10**18])
-            with pytest.raises(IngestError, match='takes more than 1 s .* name a pipe'):
-                guard.call('pipe', os.open, tmp_path / 'pipe', os.O_RDONLY)
+        with Guard() as guard, pytest.raises(IngestError, match='^pipe: not a regular file'):
+            guard.call(kernel, sources.attitudes, [kernel], 'ST1', [10**18])
+        with Guard(wall_s=1.0) as guard, pytest.raises(IngestError, match='than 1 s .* a pipe'):
+            guard.call('pipe', os.open, tmp_path / 'pipe', os.O_RDONLY)
     finally:
         os.chdir(before)
 
