@@ -11,7 +11,6 @@ from pathlib import Path
 import re
 import threading
 import urllib.parse
-import warnings
 from xml.sax.saxutils import escape
 
 from mission_files import TINY  # type: ignore[import-not-found]
@@ -22,7 +21,8 @@ from starcal_ground.mission.trend import fleet, places
 from starcal_ground.mission.trend.trend_table import Table
 
 s3fs = pytest.importorskip('s3fs')  # of requirements/dev.txt; not in the oldest versions
-pytestmark = pytest.mark.slow
+# What was never answered warns when it is collected, which is in the test itself.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings('ignore::ResourceWarning')]
 
 _FLEET = 's3://archive/fleet'
 _ANSWER_S = 3.0  # a sound answer takes milliseconds
@@ -135,24 +135,23 @@ def server(few_images: Path) -> Iterator[Store]:
         settings = {'ACCESS_KEY_ID': 'a', 'SECRET_ACCESS_KEY': 'b', 'ENDPOINT_URL': made.url}
         for name, value in {**settings, 'DEFAULT_REGION': 'us-east-1'}.items():
             patch.setenv(f'AWS_{name}', value)
+        places.exists(_FLEET)  # the client starts before its time is short
         yield made
     made.is_closing.set()
     made.shutdown()
     made.server_close()
     s3fs.S3FileSystem.clear_instance_cache()
-    # Clients of requests that were never answered warn when they are collected, in any later test.
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        gc.collect()
+    gc.collect()
 
 
 @pytest.fixture
-def store(server: Store, monkeypatch: pytest.MonkeyPatch) -> Store:
+def store(server: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     server.reset()
     monkeypatch.setattr(places, 'ANSWER_S', _ANSWER_S)
     monkeypatch.setattr(places, 'LIST_S', _ANSWER_S)
     monkeypatch.setattr(places, '_SLOWEST', 2**30)
-    return server
+    yield server
+    gc.collect()
 
 
 def trend(folder: Path, *more: str, root: str = _FLEET) -> int:
