@@ -5,18 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import os
-from pathlib import Path
 import subprocess
 import sys
 import threading
+from types import FrameType
 
+import attacks  # type: ignore[import-not-found]
 import pytest
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import threadpool_info, threadpool_limits, ThreadpoolController
 
+import starcal_ros
 from starcal_ros.processes import one_blas_thread
 from studies.workers import run_each
-
-TINY = Path(__file__).parents[2] / 'bags/tiny'
 
 
 def blas_threads(_: int = 0) -> int:
@@ -91,32 +91,23 @@ def test_a_library_that_is_loaded_later_has_one_thread_too() -> None:
     assert done.stdout.split()[1:] == ['1'], done.stdout + done.stderr
 
 
-# Other threads than the one that calls spend processor time only where BLAS has given them work.
-ON_ITS_THREAD = """
-import sys, time
-from pathlib import Path
-import starcal_ros
-from starcal_ros import api
-from starcal_ros.pipeline import topics
-from starcal_ros.pipeline.setup import read_setup
-bag, params = map(Path, sys.argv[1:])
-setup = read_setup(params)
-records = list(topics.read([bag], topics.choose_topics([bag], topics.Topics(), setup), setup))
-before = time.process_time() - time.thread_time()
-found = starcal_ros.calibrate(records, setup.prior)
-print(found.images_used, time.process_time() - time.thread_time() - before)
-"""
+def test_all_of_a_calibration_from_python_is_on_one_thread() -> None:
+    libraries = ThreadpoolController().select(user_api='blas').lib_controllers
+    numbers: set[int] = set()
 
+    def look(frame: FrameType, event: str, _: object) -> None:
+        if event == 'call' and '/linalg/' in frame.f_code.co_filename and frame.f_back:
+            room = os.path.dirname(frame.f_back.f_code.co_filename)
+            numbers.update(
+                library.get_num_threads()
+                for library in libraries
+                if room.endswith(('estimation', 'assessment'))
+            )
 
-@pytest.mark.slow
-def test_a_calibration_from_python_takes_the_processor_time_of_one_thread() -> None:
-    environment = {**os.environ, 'OPENBLAS_NUM_THREADS': '4'}
-    done = subprocess.run(
-        [sys.executable, '-c', ON_ITS_THREAD, TINY, TINY / 'params.yaml'],
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    images, others_s = done.stdout.split()
-    assert int(images) == 10 and float(others_s) < 0.2, others_s
+    records, prior = attacks.observations(), attacks.setup().prior
+    sys.setprofile(look)
+    try:
+        calibration = starcal_ros.calibrate(records, prior)
+    finally:
+        sys.setprofile(None)
+    assert (calibration.images_used, numbers) == (10, {1})
