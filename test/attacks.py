@@ -8,14 +8,12 @@ Hostile values for the tests of files from outside, and the files that they chan
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import contextlib
 import functools
 import hashlib
 import json
 import os
 from pathlib import Path
 import re
-import time
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, settings
@@ -29,8 +27,6 @@ from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
 BAG = Path(__file__).parents[1] / 'bags' / 'tiny'
-# A case that takes longer counts as a hang; processor time, since the machine may be busy.
-LONGEST_S = 60.0
 
 
 def many(count: int) -> int:
@@ -48,14 +44,6 @@ def drawn(count: int) -> Callable[[Any], Any]:
         phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
-
-
-@contextlib.contextmanager
-def in_time() -> Iterator[None]:
-    """Fail if the block takes more than `LONGEST_S` of processor time."""
-    start_s = time.process_time()
-    yield
-    assert time.process_time() - start_s < LONGEST_S
 
 
 @functools.cache

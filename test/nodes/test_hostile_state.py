@@ -13,16 +13,7 @@ import shutil
 import tempfile
 import time
 
-from attacks import (  # type: ignore[import-not-found]
-    calibration,
-    CHANGES,
-    digests,
-    drawn,
-    in_time,
-    observations,
-    setup,
-    with_changes,
-)
+from attacks import calibration, CHANGES, digests, drawn, observations, setup, with_changes  # type: ignore[import-not-found]
 from hypothesis import given
 import pytest
 
@@ -72,7 +63,7 @@ def restarted(folder: Path, key_file: object = '') -> CalibratorState:
     """A calibrator's state after a restart, closed again."""
     state = CalibratorState(time.time_ns)
     options = CalibratorOptions(state_dir=str(folder), state_key_file=str(key_file))
-    with in_time(), contextlib.suppress(StarcalError):  # then the node does not start
+    with contextlib.suppress(StarcalError):  # then the node does not start
         state.open(setup(), options)
     state.close()
     return state

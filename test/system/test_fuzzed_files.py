@@ -13,7 +13,7 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from attacks import drawn, in_time, spoilt_text  # type: ignore[import-not-found]
+from attacks import drawn, spoilt_text  # type: ignore[import-not-found]
 from hypothesis import given
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ pytestmark = pytest.mark.slow
 def read_or_refused() -> Iterator[None]:
     """A `StarcalError` of one line may leave the block, no other exception."""
     refusal = ''
-    with in_time(), np.errstate(all='ignore'):
+    with np.errstate(all='ignore'):
         try:
             yield
         except StarcalError as error:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 import random
 
-from attacks import in_time, many  # type: ignore[import-not-found]
+from attacks import many  # type: ignore[import-not-found]
 from mcap.writer import Writer
 import pytest
 
@@ -41,9 +41,8 @@ def write_bag(
 
 
 def inspect(path: Path) -> None:
-    """The tool reads the bag or refuses it, in time."""
-    with in_time():
-        assert main.main(['inspect', str(path)]) in (0, 2, 3)
+    """The tool reads the bag or refuses it."""
+    assert main.main(['inspect', str(path)]) in (0, 2, 3)
 
 
 def nested(count: int, suffix: str = '', fields: int = 1) -> str:
