@@ -16,7 +16,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import Phase, settings
 from hypothesis import strategies as st
 
 from starcal_ground.products import write_observations, write_products
@@ -35,15 +35,8 @@ def many(count: int) -> int:
 
 
 def drawn(count: int) -> Callable[[Any], Any]:
-    """Return the hypothesis settings of a test with `many` reproducible cases."""
-    return settings(
-        max_examples=many(count),
-        derandomize=True,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    """Return the hypothesis settings of a test with `many` cases."""
+    return settings(max_examples=many(count), phases=[Phase.generate])
 
 
 @functools.cache

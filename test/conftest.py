@@ -22,10 +22,21 @@ import time
 from typing import Any
 
 from forked_process import ForkedChild, ForkedNode, ForkedProcess  # type: ignore[import-not-found]
+import hypothesis
 import pytest
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+# The same cases in each run; by default, a busy machine makes them fail for their time.
+hypothesis.settings.register_profile(
+    'any machine',
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=list(hypothesis.HealthCheck),
+)
+hypothesis.settings.load_profile('any machine')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
 SLOW_S = 5.0  # of processor time: more than a test of one second takes on most machines

@@ -177,7 +177,7 @@ class Flight:
         """Return what a new report says; True if none comes."""
         mine = self._names['star_observer']
         self._health.pop(mine, None)
-        self._client.holds(lambda: mine in self._health, 10.0)
+        self._client.holds(lambda: mine in self._health)
         return self._said(mine, 'images_waiting', '', '1') != '0'
 
     def _calibrator_is_ready(self) -> bool:
@@ -193,7 +193,7 @@ class Flight:
             return False
         self.lost['calibrator'] += max(0, self.reported - self._status[0].images)
         if self._known:
-            client.holds(lambda: self._latched, 10.0)
+            client.holds(lambda: self._latched)
             newest = self._latched[0].number if self._latched else 0
             self.wrong['calibrator'] += newest < max(self._known)
         return True

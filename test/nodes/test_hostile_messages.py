@@ -301,7 +301,6 @@ def test_calls_to_a_node_that_is_deactivated_are_answered(
     assert filled.process.poll() is None
 
 
-@pytest.mark.timeout(300)  # a transport that stops is waited for
 def test_kill_9_loses_no_image_that_was_saved(tmp_path: Path) -> None:
     """Kills at random during images and solves, and of nodes that start."""
     choose = random.Random(2)

@@ -119,7 +119,7 @@ documents = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=200, derandomize=True, deadline=None)
+@settings(max_examples=200)
 @given(documents)
 def test_what_the_libraries_write_comes_back(value: object) -> None:
     assert yaml_value(yaml.safe_dump(value)) == value

@@ -140,7 +140,7 @@ def test_a_gap_filled_at_the_end_of_the_recording(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, derandomize=True, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_no_order_of_recording_changes_a_frame_unreported(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -368,7 +368,7 @@ def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) 
 
 
 @pytest.mark.slow
-@settings(max_examples=250, derandomize=True, deadline=None)
+@settings(max_examples=250)
 @given(data=st.data())
 def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> None:
     """
