@@ -229,12 +229,15 @@ def test_an_error_of_reading_reaches_the_caller(tmp_path: Path) -> None:
         list(read_frames([file], TOPICS, OPTIONS))
 
 
+# An image at a time is read ahead: whether all that may be in memory is there already after
+# fifteen images, or later, depends on the threads.
 MEMORY = """
 import resource, sys
-from starcal_ros.formats.bag.frames import read_frames
+from starcal_ros.formats.bag import frames
 from starcal_ros.formats.bag.reader import Topics
+frames._BATCH_BYTES = 1
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-for k, frame in enumerate(read_frames([sys.argv[1]], Topics('/image', '/attitude'))):
+for k, frame in enumerate(frames.read_frames([sys.argv[1]], Topics('/image', '/attitude'))):
     if k == 15:
         early = peak()
 print(k, peak() - early)
