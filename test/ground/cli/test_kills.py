@@ -41,7 +41,12 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import read_calibration, write_atomically
 
 SLOWEST_S = 300.0
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(600),
+    # Python 3.12 warns of the threads of a worker of pytest, which run on in the parent alone.
+    pytest.mark.filterwarnings('ignore:.* use of fork:DeprecationWarning'),
+]
 
 
 @dataclass(frozen=True)
