@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from astropy.io import fits
-from astropy.time import Time
 import cv2
 import erfa
 import numpy as np
+from offline_time import Time  # type: ignore[import-not-found]
 import spiceypy
 import yaml
 

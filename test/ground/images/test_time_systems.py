@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from astropy.time import Time
+from offline_time import Time  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ground.images.time_systems import from_mjd, from_text, system_of, SYSTEMS
