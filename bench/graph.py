@@ -21,7 +21,7 @@ from starcal_ground.cli.node_processes import free_domain
 from starcal_ros.ros.node import make_message
 
 PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
-START_S = 60.0  # a node starts in 2 s; much slower on a busy machine
+START_S = 240.0  # a node starts in 2 s; much slower on a busy machine
 
 
 def own_domain() -> None:

@@ -38,7 +38,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile('any machine')
 
-START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
+START_S = 240.0  # a node starts in 2 s; much slower on two busy cores
 SLOW_S = 5.0  # of processor time: more than a test of one second takes on most machines
 FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
@@ -364,8 +364,8 @@ class Client:
         self,
         kind: Any,
         name: str,
-        timeout_s: float = 60.0,
-        again_s: float = 20.0,
+        timeout_s: float = START_S,
+        again_s: float = 40.0,
         **fields: Any,
     ) -> Any:
         """
@@ -381,7 +381,7 @@ class Client:
             self.node.destroy_client(client)
 
     def ask(
-        self, service: Any, request: Any, timeout_s: float = 60.0, again_s: float = 20.0
+        self, service: Any, request: Any, timeout_s: float = START_S, again_s: float = 40.0
     ) -> Any:
         """Call a service that is ready; without an answer after some time, call it once more."""
         asked = [service.call_async(request)]

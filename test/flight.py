@@ -19,7 +19,7 @@ _FIRST_NS = 1_778_829_600_000_000_000
 _STEP_NS = 1_000_000_000
 _AROUND_NS = (-200_000_000, -20_000_000, 20_000_000, 200_000_000)
 _IN_FLIGHT = 4
-_ANSWER_S = 60.0
+_ANSWER_S = 120.0
 # Centroids depend on the prediction by much less than their noise of 0.05 px.
 _SAME_PX = 0.5
 

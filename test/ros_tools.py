@@ -35,7 +35,7 @@ class Hidden:
 
 sys.meta_path.insert(0, Hidden())
 """
-RUN_S = 100.0  # a command of ros2 takes 2 s; busy cores make that much of it
+RUN_S = 240.0  # a command of ros2 takes 2 s; busy cores make that much of it
 
 
 def find_tools(folder: Path) -> Path:

@@ -67,7 +67,7 @@ def driver(kept: Path, ends_by: signal.Signals) -> Iterator[None]:
         yield
     finally:
         process.send_signal(ends_by)
-        assert process.wait(60) == (0 if ends_by == signal.SIGTERM else -ends_by)
+        assert process.wait() == (0 if ends_by == signal.SIGTERM else -ends_by)
 
 
 def until_told(client: Client, outcome: str, level: bytes) -> None:

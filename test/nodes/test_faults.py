@@ -52,7 +52,7 @@ def test_a_bag_plays_again_by_its_clock(
         values = [int(v.value) for s in told for v in s.values if v.key == 'restarts']
         return max(values, default=0)
 
-    client.until(lambda: restarts() >= 1, 60.0)
+    client.until(lambda: restarts() >= 1)
     images = len(list(reader.read_images([tiny_bag], IMAGES)))
     client.until(lambda: status and status[-1].images == images)
     stamps = [raw.log_time_ns for raw in reader.read_raw([tiny_bag])]

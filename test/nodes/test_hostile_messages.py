@@ -46,7 +46,7 @@ from starcal_ros.formats.messages.record_messages import (
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
 
-pytestmark = [pytest.mark.nodes, pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.nodes, pytest.mark.slow]
 
 # Fields that may be NaN or infinite by the interface document.
 MAY_BE_INFINITE = frozenset(

@@ -78,7 +78,7 @@ def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_
             sent += 1
         else:
             attitudes.publish(message)
-    client.until(lambda: len(observations) == sent, 60.0)
+    client.until(lambda: len(observations) == sent)
     assert [o.refusal for o in observations] == [''] * sent
     for one in observations:
         n = len(one.catalog_id)

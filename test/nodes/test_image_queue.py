@@ -50,7 +50,7 @@ def test_an_image_waits_until_it_is_ready() -> None:
     assert not taken
     ready.set()
     queue.wake()
-    thread.join(10.0)
+    thread.join(240.0)
     assert [w.time_ns for w in taken] == [1]
 
 
@@ -67,7 +67,7 @@ def test_close_ends_the_waiting() -> None:
     thread = threading.Thread(target=lambda: found.append(queue.take()))
     thread.start()
     queue.close()
-    thread.join(10.0)
+    thread.join(240.0)
     assert found == [None]
 
 
@@ -97,7 +97,7 @@ def test_calls_are_made_by_the_thread_that_takes_before_the_next_image() -> None
     put(queue, 1)
     queue.call(queue.close)  # while the lock of the queue is free
     thread.start()
-    thread.join(10.0)
+    thread.join(240.0)
     assert made == [thread, thread]
     queue.call(lambda: made.append('too late'))
     assert queue.take() is None and len(made) == 2

@@ -102,7 +102,7 @@ def test_a_signal_ends_it_without_a_traceback(
                 client.until(lambda: name in client.node.get_node_names())
             for _ in range(2 if after == 'both' else 1):
                 monitor.send_signal(number)
-            said = monitor.communicate(timeout=60.0)[1]
+            said = monitor.communicate()[1]
         finally:
             monitor.kill()
     assert monitor.returncode == 0 and 'Traceback' not in said, said
@@ -110,7 +110,7 @@ def test_a_signal_ends_it_without_a_traceback(
 
 def until_ros(pid: int) -> None:
     """Wait until a process handles SIGTERM, which Python does not by itself: `main` is reached."""
-    deadline_s = time.monotonic() + 60.0
+    deadline_s = time.monotonic() + 240.0
     while time.monotonic() < deadline_s:
         fields = dict(
             line.split(':', 1) for line in Path(f'/proc/{pid}/status').read_text().splitlines()
@@ -126,7 +126,7 @@ def until_ros(pid: int) -> None:
 def test_a_bad_remap_is_answered_without_a_traceback(client_name: str, remap: str) -> None:
     """The last line is ours, after those that rcl logs."""
     command = [*CLIENT, f'starcal_ground.ros.{client_name}', *REMAP, remap]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60.0)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and 'Traceback' not in done.stderr, done.stderr
     last = done.stderr.splitlines()[-1]
     assert last.startswith(f'{client_name.removesuffix("_client")}') and remap in last

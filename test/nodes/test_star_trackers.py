@@ -75,7 +75,7 @@ def test_one_takes_over_from_another(
         start_node(name, ros=('--params-file', str(params)))
     client.until_listened()
     player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0'))
-    assert player.wait(120.0) == 0, player.said()
+    assert player.wait() == 0, player.said()
     client.until_images(len(images()))
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert answer.success, answer.message

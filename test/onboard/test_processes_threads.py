@@ -48,15 +48,15 @@ def test_overlapping_blocks_of_two_threads_restore_the_number() -> None:
     def first() -> None:
         with one_blas_thread():
             first_began.set()
-            second_began.wait(60)
+            second_began.wait(240)
         first_ended.set()
 
     thread = threading.Thread(target=first)
     thread.start()
-    first_began.wait(60)
+    first_began.wait(240)
     with one_blas_thread():
         second_began.set()
-        first_ended.wait(60)
+        first_ended.wait(240)
         assert blas_threads() == 1
     thread.join()
     assert blas_threads() == 2

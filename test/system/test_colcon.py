@@ -31,13 +31,12 @@ BUILT = (
 )
 TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README.md', 'LICENSE')
 INSTALLED = ('launch', 'config', 'bags/tiny')
-NODE_ANSWERS_WITHIN_S = 30.0
-NODE_STOPS_WITHIN_S = 15.0
+NODE_ANSWERS_WITHIN_S = 240.0
+NODE_STOPS_WITHIN_S = 240.0
 
 pytestmark = [
     pytest.mark.packaging,
     pytest.mark.slow,
-    pytest.mark.timeout(900),  # colcon takes 40 s on two free cores, minutes on busy ones
 ]
 
 # The messages in use, not only the Python files that wrap them, must be those of the workspace.

@@ -37,7 +37,7 @@ from starcal_ros.pipeline.setup import (
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
 OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
-RUN_S = 60.0
+RUN_S = 240.0
 
 
 def run(*command: str | Path) -> subprocess.CompletedProcess[str]:

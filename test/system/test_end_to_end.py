@@ -296,7 +296,7 @@ def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None
         assert tool.poll() is None
         time.sleep(0.05)
     tool.send_signal(signal.SIGTERM)
-    _, err = tool.communicate(timeout=60)
+    _, err = tool.communicate()
     assert (tool.returncode, err) == (130, 'starcal: interrupted\n')
     assert not any(child.is_running() for child in children)
 

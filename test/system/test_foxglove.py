@@ -113,7 +113,7 @@ def made_by(name: str, folder: Path, *events: dict[str, Any]) -> Any:
     (folder / 'run.mjs').write_text(_RUN)
     done = subprocess.run(
         [NODE, 'run.mjs', json.dumps(events)],
-        cwd=folder, capture_output=True, text=True, timeout=60,
+        cwd=folder, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -37,7 +37,7 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_ca
 from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive
 
-pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes of 2 s and more
+pytestmark = pytest.mark.nodes
 
 ROOT = Path(__file__).parents[2]
 TINY = ROOT / 'bags' / 'tiny'

@@ -43,7 +43,6 @@ from starcal_ros.formats.products.product_files import read_calibration, write_a
 SLOWEST_S = 300.0
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(600),
     # Python 3.12 warns of the threads of a worker of pytest, which run on in the parent alone.
     pytest.mark.filterwarnings('ignore:.* use of fork:DeprecationWarning'),
 ]

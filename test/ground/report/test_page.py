@@ -318,7 +318,7 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
             f'--blink-settings=preferredColorScheme={0 if dark else 1}',
             '--dump-dom', frame.as_uri(),
         ],
-        capture_output=True, text=True, timeout=60, check=True, stdin=subprocess.DEVNULL,
+        capture_output=True, text=True, check=True, stdin=subprocess.DEVNULL,
     )  # fmt: skip
     found = re.search(r'data-measured="([^"]*)"', done.stdout)
     assert found is not None, done.stderr[-2000:]

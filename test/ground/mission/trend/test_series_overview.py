@@ -98,7 +98,7 @@ def test_a_browser_searches_and_sorts_the_cameras(tmp_path: Path) -> None:
     line = [BROWSER, '--headless', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage']
     done = subprocess.run(
         [*line, f'--user-data-dir={tmp_path / "profile"}', '--dump-dom', used.as_uri()],
-        capture_output=True, text=True, timeout=60, check=True, stdin=subprocess.DEVNULL,
+        capture_output=True, text=True, check=True, stdin=subprocess.DEVNULL,
     )  # fmt: skip
     assert 'data-shown="sat1,sat10,sat2;sat2,sat10,sat1;sat1,sat10"' in done.stdout
 

@@ -323,7 +323,7 @@ def test_a_chunk_is_decompressed_while_the_one_before_it_is_in_use(
     monkeypatch.setattr(bag_reader, '_data_of', recorded)
     messages = bag_reader.read_messages(small_chunks, None, pytest.fail)
     next(messages)
-    assert started.acquire(timeout=60.0) and started.acquire(timeout=60.0)
+    assert started.acquire(timeout=240.0) and started.acquire(timeout=240.0)
     assert len(threads) == 2 and threading.current_thread() not in threads
     messages.close()  # type: ignore[attr-defined]
 
