@@ -160,8 +160,7 @@ def from_stars(
             ' clouds, no lights; fields under 3 degrees need their focal length and a catalog of'
             ' their region (starcal catalog)'
         )
-    finder, rotation = first
-    matches, other_focal_px = _of_one_lens(_all_matches(rich, finder, rotation))
+    matches, other_focal_px = _of_one_lens(_all_matches(rich, *first))
     if len(matches) < min_images:
         raise NotFromStars(
             f'{len(matches)} of {len(seen)} images match the sky, {min_images} are needed:'
@@ -170,7 +169,7 @@ def from_stars(
     sources = {one.time_ns: one.rankings[0] for one in rich}
     camera, rotations = _common_camera(matches, sources, catalog)
     stated_px = math.nan if prior is None else float(prior.parameters[0])
-    (mirrored,) = finder.mirrored
+    (mirrored,) = first[0].mirrored
     return FromStars(
         camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies), stated_px
     )
@@ -214,8 +213,7 @@ def count_of_stars(pixels: Pixels) -> int:
 
 
 def _count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
-    ascending = np.sort(pixels[::8, ::8], axis=None)
-    low, middle, high = (float(ascending[int(part * len(ascending))]) for part in (0.1, 0.5, 0.9))
+    low, middle, high = np.percentile(pixels[::8, ::8], [10, 50, 90])
     brightest = sources.peak_dn[:_BRIGHTEST]
     # By day and by lamps the peaks are hardly above the rest of the picture.
     if not len(brightest) or np.median(brightest) - middle < _LEAST_CONTRAST * (high - low):

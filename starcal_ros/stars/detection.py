@@ -266,11 +266,9 @@ def detect(
     (hot pixels, cosmic rays) are left out by their sharpness.  Positions are good to about 0.2 px.
     """
     height, width = pixels.shape
-    level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
     # Converted first: a subtraction that converts takes four times as long.
     image = pixels.astype(np.float32)
-    np.subtract(image, level, out=image)
-    del level  # a large image
+    np.subtract(image, cv2.resize(background.level_mesh, (width, height)), out=image)
     filtered: Singles = np.asarray(
         cv2.GaussianBlur(image, _FILTER_PX, _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
         np.float32,
@@ -461,8 +459,6 @@ def detectable_count(pixels: Pixels, xy_px: Floats, background: Background, min_
     first of the dark groups at the end are not counted.
     """
     height, width = pixels.shape
-    if len(xy_px) <= _GROUP:
-        return len(xy_px)
     inner = np.array([width, height]) - 1 - _RADIUS_PX
     count = len(xy_px)
     # In most images the last group is not dark, and no other is looked at.

@@ -57,13 +57,6 @@ class PsfFit:
     derivatives: Floats
     noise_covariance: Floats
 
-    @property
-    def freedom(self) -> Floats:
-        """Expected squared residuals (n, p) over the variance of the pixel: 1 minus leverage."""
-        moved = self.noise_covariance @ self.derivatives
-        leverage = np.einsum('nkp,nkp->np', moved, self.derivatives)
-        return np.asarray(np.maximum(1.0 - leverage, 0.05))
-
 
 def select(fit: PsfFit, stars: NDArray[np.intp] | Mask) -> PsfFit:
     """Return the fits of some stars, by row number or mask."""
@@ -201,8 +194,7 @@ def _nearer(
     stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise
 ) -> tuple[Floats, Floats, Floats]:
     """Parameters (n, 4) after a step towards the fit, the step, and normal matrices (n, 4, 4)."""
-    rows, _, _ = _whitened_rows(parameters, stamps, pixel_noise, 4)
-    normal, gradient = _normal(rows, parameters)
+    normal, gradient = _normal(_whitened_rows(parameters, stamps, pixel_noise, 4)[0], parameters)
     step = np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :, 0], np.float64)
     step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
     half_px = stamps.width / 2
@@ -389,7 +381,9 @@ def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums
     signal = np.maximum(fit.signal_dn, 0.0)
     flux = np.maximum(fit.parameters[:, 2, None], 0.0)
     variance = expected.variance(signal, noise_dn[:, None], flux)
-    squared = fit.residual_dn**2 / fit.freedom
+    moved = fit.noise_covariance @ fit.derivatives
+    leverage = np.einsum('nkp,nkp->np', moved, fit.derivatives)
+    squared = fit.residual_dn**2 / np.maximum(1.0 - leverage, 0.05)
     # The comparison is false for NaN, an excluded pixel.
     keep = squared < 25.0 * variance
     weight = keep / variance
