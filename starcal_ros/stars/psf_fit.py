@@ -223,11 +223,8 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
         last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
         residual[spoilt] = _residual(parameters[spoilt], last[spoilt], rows[spoilt])
-    # Only the columns of the moments of the 7 x 7 inverse are needed: by its blocks.
-    of_shape = np.empty((len(normal), 7, 3))
-    moved = covariance @ normal[:, :4, 4:]
-    of_shape[:, 4:] = np.linalg.inv(normal[:, 4:, 4:] - normal[:, 4:, :4] @ moved)
-    np.matmul(-moved, of_shape[:, 4:], out=of_shape[:, :4])
+    # Only the columns of the moments of the 7 x 7 inverse are needed.
+    of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
     shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
     shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
     noise_covariance = covariance
