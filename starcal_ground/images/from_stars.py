@@ -112,7 +112,7 @@ class FromStars:
 @dataclass(frozen=True)
 class _Sources:
     """
-    Sources of an image: the compact ones, without glare, and all by their light.
+    Sources of an image by their light: all, and the compact ones, without glare.
 
     ``stars`` counts those that may be stars; 0 in a picture of anything but the night sky.
     """
@@ -150,9 +150,9 @@ def from_stars(
         )
     half_px = 0.5 * math.hypot(*size)
     usual = (_usual(size, half_px, model, math.radians(deg)) for model, deg in _HALF_FIELDS_DEG)
-    finder = None if prior is None else _first_match(rich, [prior], catalog)
-    finder = finder or _first_match(rich, list(usual), catalog)
-    if finder is None:
+    first = None if prior is None else _first_match(rich, [prior], catalog)
+    first = first or _first_match(rich, list(usual), catalog)
+    if first is None:
         given = f'{float(prior.parameters[0]):.0f} px or ' if prior is not None else ''
         raise NotFromStars(
             f'the stars of {len(seen)} images match no part of the sky of the catalog, with'
@@ -160,16 +160,16 @@ def from_stars(
             ' clouds, no lights; fields under 3 degrees need their focal length and a catalog of'
             ' their region (starcal catalog)'
         )
-    matches, other_focal_px = _of_one_lens(_all_matches(rich, finder))
+    matches, other_focal_px = _of_one_lens(_all_matches(rich, *first))
     if len(matches) < min_images:
         raise NotFromStars(
             f'{len(matches)} of {len(seen)} images match the sky, {min_images} are needed:'
             f' {ADVICE}; no clouds, no lights, no frames of anything else'
         )
-    sources = {one.time_ns: one.rankings[-1] for one in rich}
+    sources = {one.time_ns: one.rankings[0] for one in rich}
     camera, rotations = _common_camera(matches, sources, catalog)
     stated_px = math.nan if prior is None else float(prior.parameters[0])
-    (mirrored,) = finder.mirrored
+    (mirrored,) = first[0].mirrored
     return FromStars(
         camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies), stated_px
     )
@@ -203,7 +203,7 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], 
         middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
         compact = sources.xy_px[sources.wide_px <= middle_px]
         stars = _count_of_stars(image.pixels, sources)
-        seen.append(_Sources(image.time_ns, (compact, sources.xy_px), stars))
+        seen.append(_Sources(image.time_ns, (sources.xy_px, compact), stars))
     return seen, size, copies
 
 
@@ -256,8 +256,8 @@ def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -
 
 def _first_match(
     seen: Sequence[_Sources], cameras: Sequence[CameraModel], catalog: StarCatalog
-) -> ImageSearch | None:
-    """The search that one of the cameras has identified an image for."""
+) -> tuple[ImageSearch, Rotation] | None:
+    """The search that one of the cameras has identified an image for, and its rotation."""
     deadline_s = time.thread_time() + _SEARCH_S
     ordered = sorted(seen, key=lambda one: -one.stars)
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
@@ -268,7 +268,7 @@ def _first_match(
                 better = _of_better_lens(sky, one.rankings[finder.ranking], catalog)
                 found = ImageSearch(camera, catalog)
                 found.take(better, finder.ranking)
-                return found
+                return found, better.camera_from_icrf
             if finder.is_over():
                 return None
     return None
@@ -296,13 +296,14 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
     return sky
 
 
-def _all_matches(seen: Sequence[_Sources], finder: ImageSearch) -> dict[int, SkyMatch]:
-    """The images that the camera of the first match identifies, by stamp."""
+def _all_matches(
+    seen: Sequence[_Sources], finder: ImageSearch, rotation: Rotation
+) -> dict[int, SkyMatch]:
+    """The images that the camera of the first match, of this rotation, identifies, by stamp."""
     matches: dict[int, SkyMatch] = {}
-    before: list[Rotation] = []
     for one in seen:
-        if sky := finder.guess(one.rankings, before) or finder.look_up(one.rankings):
-            matches[one.time_ns], before = sky, [sky.camera_from_icrf]
+        if sky := finder.guess(one.rankings, [rotation]) or finder.look_up(one.rankings):
+            matches[one.time_ns], rotation = sky, sky.camera_from_icrf
     return matches
 
 

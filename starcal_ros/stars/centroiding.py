@@ -174,8 +174,10 @@ def _measure_by_psf(
 
 def _first_reason(*reasons: tuple[Mask, StarRefusal]) -> NDArray[np.uint8]:
     """Codes (n,) of the first of the reasons whose mask (n,) holds; 0 without any."""
-    masks, codes = zip(*reasons, strict=True)
-    return np.select(masks, codes, StarRefusal.NONE).astype(np.uint8)
+    codes = np.zeros(len(reasons[0][0]), np.uint8)
+    for mask, code in reversed(reasons):
+        codes[mask] = code
+    return codes
 
 
 def _brightest_beside(
@@ -241,12 +243,13 @@ def _windows(
 
 def _slopes(background: detection.Background, centre: Indices, radius: int) -> Floats:
     """Slope of the background in windows about pixels (n, 2), DN, zero in their middles."""
-    reach = np.arange(-radius, radius + 1).astype(np.float64)
-    down, across = (
-        detection.sample_mesh(slope, background.shape, centre)[:, None, None]
+    side = 2 * radius + 1
+    slopes = [
+        detection.sample_mesh(slope, background.shape, centre)
         for slope in detection.mesh_slope(background.level_mesh, background.shape)
-    )
-    return np.asarray(down * reach[:, None] + across * reach)
+    ]
+    places = np.indices((side, side), np.float64).reshape(2, -1) - radius
+    return np.asarray((np.stack(slopes, axis=-1) @ places).reshape(-1, side, side))
 
 
 def _misshapen(fit: psf_fit.PsfFit, model: ImageModel) -> Mask:

@@ -130,9 +130,11 @@ def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> Mas
         return hot_pixel
     row = centre[:, 1, None] + np.arange(-radius, radius + 1)
     first = row * width + centre[:, 0, None] - radius
-    low, high = np.searchsorted(hot, first), np.searchsorted(hot, first + side)
-    star, line = np.nonzero(high > low)
-    low, high, first = low[star, line], high[star, line], first[star, line]
+    low = np.searchsorted(hot, first)
+    beyond = hot.take(low, mode='clip') - first
+    star, line = np.nonzero((beyond >= 0) & (beyond < side))
+    low, first = low[star, line], first[star, line]
+    high = np.searchsorted(hot, first + side)
     for k in range(int((high - low).max(initial=0))):
         more = low + k < high
         hot_pixel[star[more], line[more], hot[low[more] + k] - first[more]] = True

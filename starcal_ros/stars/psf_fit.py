@@ -9,7 +9,6 @@ mean of such Gaussians along a line, by Gauss-Legendre quadrature.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 import math
 
@@ -43,8 +42,8 @@ class PsfFit:
     ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
     those of the PSF as a fraction of its variance, and its 1-sigma.
     ``signal_dn`` and ``residual_dn`` (n, p): light of the star in each pixel of its stamp, and
-    residual of the fit, NaN for excluded pixels; ``freedom`` (n, p): expected squared residual
-    over the variance of the pixel, 1 minus its leverage.
+    residual of the fit, NaN for excluded pixels.  ``derivatives`` (n, 4, p) by the parameters,
+    over the noise of each pixel, and ``noise_covariance`` (n, 4, 4), without the error of the PSF.
     """
 
     parameters: Floats
@@ -55,7 +54,8 @@ class PsfFit:
     shape_sigma: Floats
     signal_dn: Floats
     residual_dn: Floats
-    freedom: Floats
+    derivatives: Floats
+    noise_covariance: Floats
 
 
 def select(fit: PsfFit, stars: NDArray[np.intp] | Mask) -> PsfFit:
@@ -194,7 +194,7 @@ def _nearer(
     stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise
 ) -> tuple[Floats, Floats, Floats]:
     """Parameters (n, 4) after a step towards the fit, the step, and normal matrices (n, 4, 4)."""
-    normal, gradient = _normal(_whitened_rows(parameters, stamps, pixel_noise, 4)[0])
+    normal, gradient = _normal(_whitened_rows(parameters, stamps, pixel_noise, 4)[0], parameters)
     step = np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :, 0], np.float64)
     step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
     half_px = stamps.width / 2
@@ -211,23 +211,23 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     """
     # Second moments: one linear step from the solution, in units of the PSF variance.
     rows, light, root_weight = _whitened_rows(parameters, stamps, pixel_noise, 7)
-    normal, gradient = _normal(rows)
+    normal, gradient = _normal(rows, parameters)
     covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
     last = (covariance @ gradient[:, :4, None])[:, :, 0]
     last[:, :2].clip(-0.5, 0.5, out=last[:, :2])
-    residual = _after(last, rows)
+    residual = _residual(parameters, last, rows)
     spoilt, pixel = _single_misfits(residual, light, parameters, stamps)
     if len(spoilt):
         root_weight[spoilt, pixel], rows[spoilt, :, pixel] = 0.0, 0.0
-        normal[spoilt], gradient[spoilt] = _normal(rows[spoilt])
+        normal[spoilt], gradient[spoilt] = _normal(rows[spoilt], parameters[spoilt])
         covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
         last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
-        residual[spoilt] = _after(last[spoilt], rows[spoilt])
+        residual[spoilt] = _residual(parameters[spoilt], last[spoilt], rows[spoilt])
     # Only the columns of the moments of the 7 x 7 inverse are needed.
     of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
     shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
     shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
-    leverage = np.einsum('nkp,nkp->np', covariance @ rows[:, :4], rows[:, :4])
+    noise_covariance = covariance
     parameters = parameters + last
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
     misfit = residual
@@ -250,13 +250,16 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         shape_sigma=np.sqrt(shape_variance),
         signal_dn=light,
         residual_dn=residual_dn,
-        freedom=np.maximum(1.0 - leverage, 0.05),
+        derivatives=rows[:, :4],
+        noise_covariance=noise_covariance,
     )
 
 
-def _after(step: Floats, rows: Floats) -> Floats:
-    """Residuals (n, p) of the rows after a step (n, 4), to first order."""
-    return np.asarray(rows[:, -1] - (step[:, None, :] @ rows[:, :4])[:, 0])
+def _residual(parameters: Floats, step: Floats, rows: Floats) -> Floats:
+    """Residuals (n, p) over the noise after a step (n, 4) from the parameters, to first order."""
+    modelled = step.copy()
+    modelled[:, 2:] += parameters[:, 2:]
+    return np.asarray(rows[:, -1] - (modelled[:, None, :] @ rows[:, :4])[:, 0])
 
 
 def _single_misfits(
@@ -375,7 +378,9 @@ def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums
     signal = np.maximum(fit.signal_dn, 0.0)
     flux = np.maximum(fit.parameters[:, 2, None], 0.0)
     variance = expected.variance(signal, noise_dn[:, None], flux)
-    squared = fit.residual_dn**2 / fit.freedom
+    moved = fit.noise_covariance @ fit.derivatives
+    leverage = np.einsum('nkp,nkp->np', moved, fit.derivatives)
+    squared = fit.residual_dn**2 / np.maximum(1.0 - leverage, 0.05)
     # The comparison is false for NaN, an excluded pixel.
     keep = squared < 25.0 * variance
     weight = keep / variance
@@ -463,7 +468,7 @@ def _whitened_rows(
     parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Derivatives of stamps by x, y, flux, background, and as the last row their residual.
+    Derivatives of stamps by x, y, flux, background, and as the last row their pixels.
 
     The rows (n, count + 1, p) are divided by the noise of each pixel, and 0 for pixels that are
     left out.  A count of 7 adds, after the background, derivatives by the second moments xx, yy,
@@ -471,35 +476,29 @@ def _whitened_rows(
     inverse (n, p) of that noise.
     """
     n, width, sigma_px = len(stamps), stamps.width, stamps.sigma_px
-    flux, level = parameters[:, 2, None], parameters[:, 3]
+    flux = parameters[:, 2, None]
     (px, px1, px2), (py, py1, py2) = _profiles(
         parameters[:, :2], sigma_px, stamps.streak_px, width, count == 7
     )
-    px1 = flux[:, None] * px1
     rows = np.empty((n, count + 1, width * width))
-    multiply: Callable[..., object] = np.multiply
-    # Profiles are spread over the stamp first: products of long rows take a third of the time.
-    by_row: Callable[[Floats], Floats] = _in_each_row
-    by_column: Callable[[Floats], Floats] = _in_each_column
-    if stamps.streak_px is not None:
-        multiply, by_row, by_column = _over_nodes, np.asarray, np.asarray
-    px, px1, py, py1 = by_row(px), by_row(px1), by_column(py), by_column(py1)
-    multiply(py, px1, out=rows[:, 0])
-    multiply(py, px, out=rows[:, 2])
-    px = px * (flux if px.ndim == 2 else flux[:, None])
-    multiply(py1, px, out=rows[:, 1])
+
+    def spread(row: int, of_rows: Floats, of_columns: Floats) -> None:
+        """Write the sum over the nodes of products of profiles (n, nodes, w) to a row."""
+        square = rows[:, row].reshape(n, width, width)
+        np.matmul(of_rows.transpose(0, 2, 1), of_columns, out=square)
+
+    spread(2, py, px)
+    px, px1 = flux[:, None] * px, flux[:, None] * px1
+    spread(0, py, px1)
+    spread(1, py1, px)
     rows[:, 3] = 1.0
     if count == 7:
-        half_variance = 0.5 * sigma_px[:, None, None] ** 2
-        multiply(py, by_row(flux[:, None] * half_variance * px2), out=rows[:, 4])
-        multiply(by_column(half_variance * py2), px, out=rows[:, 5])
-        multiply(py1, px1, out=rows[:, 6])
-        rows[:, 6] *= 2.0 * half_variance[:, 0]
-    residual = rows[:, count]
-    np.multiply(rows[:, 2], -flux, out=residual)
-    residual += stamps.flat_dn
-    residual -= level[:, None]
-    light = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
+        variance = sigma_px[:, None, None] ** 2
+        spread(4, py, 0.5 * variance * flux[:, None] * px2)
+        spread(5, 0.5 * variance * py2, px)
+        spread(6, py1, variance * px1)
+    rows[:, count] = stamps.flat_dn
+    light = np.maximum(flux, 0.0) * rows[:, 2]
     root_weight = light / pixel_noise.gain_e_per_dn
     root_weight += pixel_noise.background * stamps.noise2_dn2
     np.sqrt(root_weight, out=root_weight)
@@ -509,35 +508,17 @@ def _whitened_rows(
     return rows, light, root_weight
 
 
-def _over_nodes(of_rows: Floats, of_columns: Floats, out: Floats) -> None:
-    """Write the light (n, w * w) of profiles (n, nodes, w) of rows and columns to ``out``."""
-    n, _, width = of_rows.shape
-    np.matmul(of_rows.transpose(0, 2, 1), of_columns, out=out.reshape(n, width, width))
-
-
-def _in_each_row(of_columns: Floats) -> Floats:
-    """Values (n, 1, w) of columns, spread over the pixels (n, w * w) of a stamp."""
-    n, _, width = of_columns.shape
-    spread = np.empty((n, width, width))
-    spread[:] = of_columns
-    return spread.reshape(n, width * width)
-
-
-def _in_each_column(of_rows: Floats) -> Floats:
-    """Values (n, 1, w) of rows, spread over the pixels (n, w * w) of a stamp."""
-    return of_rows[:, 0].repeat(of_rows.shape[2], axis=1)
-
-
-def _normal(rows: Floats) -> tuple[Floats, Floats]:
+def _normal(rows: Floats, parameters: Floats) -> tuple[Floats, Floats]:
     """
-    Normal matrices (n, k, k) and gradients (n, k) of many small least-squares problems.
+    Normal matrices (n, k, k) and gradients (n, k) at parameters (n, 4) of small least squares.
 
-    ``rows`` (n, k + 1, p) are the whitened derivatives and residual.  A small addition to the
-    diagonal keeps a stamp without light solvable.
+    ``rows`` (n, k + 1, p) are whitened derivatives and pixels, which are linear in flux and
+    background.  A small addition to the diagonal keeps a stamp without light solvable.
     """
     k = rows.shape[1] - 1
     product = rows[:, :k] @ rows.transpose(0, 2, 1)
     normal, gradient = product[:, :, :k], product[:, :, k]
+    gradient -= (product[:, :, 2:4] @ parameters[:, 2:, None])[:, :, 0]
     diagonal = np.einsum('nii->ni', normal)
     diagonal += 1e-9 * diagonal + 1e-12
     return normal, gradient
