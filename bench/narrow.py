@@ -50,7 +50,7 @@ from studies.trials import map_bound_px, rms
 SIZE, IMAGES, SEEDS = (800, 640), 14, 10
 FIELDS_DEG = (0.3, 0.5, 1.0, 2.5, 5.0)  # of the width
 WIDE_DEG = (10.0, 20.0, 40.0, 70.0, 110.0)
-TRAIL_PX, TRAILED_DEG = 6.0, (0.5, 5.0, 20.0)
+TRAIL_PX, TRAILED_DEG = 6.0, (*FIELDS_DEG[1:], 20.0)
 _STARS, _STARS_OF_WIDE = 20, 200  # in a mean image
 _CENTRE_SIGMA_PX = 0.03 * SIZE[0]  # prior of the principal point
 _REGION_RAD = math.radians(5.0)

@@ -202,17 +202,13 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], 
         # The structure of a corona is wide along both axes, as few stars are.
         middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
         compact = sources.xy_px[sources.wide_px <= middle_px]
-        stars = _count_of_stars(image.pixels, sources)
+        stars = count_of_stars(image.pixels, sources)
         seen.append(_Sources(image.time_ns, (sources.xy_px, compact), stars))
     return seen, size, copies
 
 
-def count_of_stars(pixels: Pixels) -> int:
+def count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
     """Number of sources of an image that may be stars; 0 of anything but the night sky."""
-    return _count_of_stars(pixels, bright_sources(pixels))
-
-
-def _count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
     low, middle, high = np.percentile(pixels[::8, ::8], [10, 50, 90])
     brightest = sources.peak_dn[:_BRIGHTEST]
     # By day and by lamps the peaks are hardly above the rest of the picture.

@@ -26,6 +26,7 @@ from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.identification.blind.bright_sources import bright_sources
 from starcal_ros.identification.blind.images import FEWEST_SOURCES
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.diagnosis.bags import refusals
@@ -142,7 +143,10 @@ def _shows_stars(group: Sequence[image_files.Photograph]) -> bool:
     """True if one of a few images of a group, from its first to its last, shows stars."""
     few = [group[k * (len(group) - 1) // (_FEW - 1)] for k in range(min(_FEW, len(group)))]
     images = _images(few, image_files.Refusals())
-    return any(by_stars.count_of_stars(image.pixels) >= FEWEST_SOURCES for image in images)
+    return any(
+        by_stars.count_of_stars(image.pixels, bright_sources(image.pixels)) >= FEWEST_SOURCES
+        for image in images
+    )
 
 
 def from_photographs(
@@ -151,11 +155,18 @@ def from_photographs(
     """
     Set-up of a calibration of photographs, whose bags are written into a folder.
 
-    Raises NotFromStars when the stars give no camera.
+    The search starts at their stated focal length, if any.  Raises NotFromStars when the stars
+    give no camera.
     """
     from starcal_ground.bag_writer import BagWriter  # bags with attitudes are read without mcap
 
-    stars, notes = camera_of_photographs(photographs, values)
+    first, damaged = photographs[0], image_files.Refusals()
+    focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
+    hint = by_stars.ideal_camera((first.width, first.height), focal_px) if focal_px < 1e9 else None
+    try:
+        stars = _found(_images(photographs, damaged), values, hint)
+    except NotFromStars as error:
+        raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
         for image in _images(photographs, image_files.Refusals()):
@@ -168,26 +179,7 @@ def from_photographs(
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
     undated = sum(not one.dated for one in photographs)
     times_of = f'of the file: {undated} of {len(photographs)} images state none' * bool(undated)
-    return _set_up(stars, [bag], stated, folder, is_located, Topics(), notes, times_of)
-
-
-def camera_of_photographs(
-    photographs: Sequence[image_files.Photograph], values: Mapping[str, object]
-) -> tuple[by_stars.FromStars, list[str]]:
-    """
-    Camera and rotations of photographs, and notes on files that turned out to be damaged.
-
-    The search starts at their stated focal length, if any.  Raises NotFromStars when the stars
-    give no camera.
-    """
-    first = photographs[0]
-    focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
-    hint = by_stars.ideal_camera((first.width, first.height), focal_px) if focal_px < 1e9 else None
-    refusals = image_files.Refusals()
-    try:
-        return _found(_images(photographs, refusals), values, hint), refusals.lines()
-    except NotFromStars as error:
-        raise NotFromStars('; '.join([str(error), *refusals.lines()])) from error
+    return _set_up(stars, [bag], stated, folder, is_located, Topics(), damaged.lines(), times_of)
 
 
 def _images(

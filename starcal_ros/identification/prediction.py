@@ -76,7 +76,6 @@ def predict(
     boresight_icrf = icrf_from_camera.apply([0.0, 0.0, 1.0])
     radius_rad = field_radius_rad(camera, margin_px)
     index = cone(catalog, boresight_icrf, radius_rad, magnitude_limit)
-    index = index[np.argsort(catalog.magnitude[index], kind='stable')]
     index, direction_icrf = visible(catalog, index, time_ns, velocity_m_s, site)
     direction_camera = icrf_from_camera.inv().apply(direction_icrf)
     xy_px = project(camera, direction_camera)

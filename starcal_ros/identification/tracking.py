@@ -136,13 +136,8 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
     direction_camera = direction_icrf @ icrf_from_camera
     # Outside the field the distortion polynomial may fold back into the image.
     near = direction_camera[:, 2] > np.cos(before.field_radius_rad + 2e-3)
-    index, direction_icrf, direction_camera = (
-        index[near],
-        direction_icrf[near],
-        direction_camera[near],
-    )
     xy_px = project(camera, direction_camera)
-    return Prediction(index, direction_icrf, direction_camera, xy_px, camera)
+    return Prediction(index, direction_icrf, direction_camera, xy_px, camera).select(near)
 
 
 def _find_rotation(

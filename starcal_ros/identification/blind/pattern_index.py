@@ -77,8 +77,8 @@ class PatternIndex:
 
 
 def scales_for(half_diagonal_rad: float) -> list[int]:
-    """Numbers of the scales whose discs are half to a whole field wide, smallest first."""
-    scales = range(_SMALLEST, _LARGEST + 1)
+    """Numbers of the scales whose discs are half to a whole field wide, largest first."""
+    scales = range(_LARGEST, _SMALLEST - 1, -1)
     fitting = [k for k in scales if 0.48 <= _radius_rad(k) / half_diagonal_rad < 0.97]
     return fitting or [_SMALLEST if half_diagonal_rad < _radius_rad(0) else _LARGEST]
 
@@ -103,7 +103,7 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
         centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
     else:
         centres = _occupied(stars, _SPACING * radius_rad)
-    tree = direction_tree(stars) if len(stars) < len(catalog.id) else catalog.tree
+    tree = tree_of_brightest(catalog, len(stars))
     members = brightest_within(tree, centres, radius_rad, of_disc)
     parts = _patterns_by_disc(stars.T.astype(np.float32), members)
     return PatternIndex(radius_rad, members, pattern_grid(parts))
@@ -213,6 +213,13 @@ def sphere_points(count: int) -> Floats:
     longitude = k * math.pi * (3.0 - math.sqrt(5.0))
     r = np.sqrt(1.0 - z * z)
     return np.stack([r * np.cos(longitude), r * np.sin(longitude), z], axis=-1)
+
+
+def tree_of_brightest(catalog: StarCatalog, count: int) -> cKDTree:
+    """Search tree of the brightest stars of a catalog."""
+    if count >= len(catalog.id):
+        return catalog.tree
+    return direction_tree(catalog.direction_icrs[:count])
 
 
 def brightest_within(stars: cKDTree, centres: Floats, radius_rad: float, count: int) -> Indices:

@@ -11,9 +11,9 @@ almost certain before all others; the first one with a significant p-value is ac
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+import dataclasses
 from dataclasses import dataclass
 import functools
-import itertools
 import math
 import time
 from typing import NamedTuple
@@ -43,8 +43,7 @@ _AGAIN_PX = 3.0  # radius of matching with a better camera
 _KEPT = 32  # number of best candidates of a look-up
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
 _TESTED = 16  # brightest predictions used to test a candidate
-_TABLED = 5000  # most points whose stars are kept in memory: for discs of 9 degrees and more
-_NARROW_RAD = math.radians(1.0)  # smaller discs are searched about each candidate itself
+_TABLED_RAD = math.radians(9.0)  # smaller discs are searched about each candidate itself
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
@@ -109,33 +108,24 @@ def find_in_any(
     are the ways that each is tried, ``rounds`` a part of `ROUNDS`.  The search ends when the
     processor time of the thread reaches ``deadline_s``.
     """
-    seen = [
-        _Seen(_image(xy_px, camera, turned, ranges), turned, k)
+    views = [
+        _View(_image(xy_px, camera, turned, ranges), turned, k)
         for k, xy_px in enumerate(rankings)
         if len(xy_px) >= _FEWEST_SOURCES
         for turned in mirrored
     ]
     for before, sources in rounds:
-        chosen = [one for one in seen if len(one.image.xy_px) > before]
-        for one, candidates in _candidates(chosen, catalog, before, sources):
-            for fit in _fits(one.image, catalog, candidates):
-                log10_p, radius_px = sky_fit.log10_p_value(one.image, catalog, fit)
+        chosen = [view for view in views if len(view.image.xy_px) > before]
+        for view, candidates in _candidates(chosen, catalog, before, sources):
+            for fit in _fits(view.image, catalog, candidates):
+                log10_p, radius_px = sky_fit.log10_p_value(view.image, catalog, fit)
                 log10_p += math.log10(len(mirrored))
                 if log10_p < MAX_LOG10_P_VALUE:
-                    result = _result(one.image, catalog, fit, radius_px, log10_p, one.mirrored)
-                    return result, one.ranking
+                    result = _result(view.image, catalog, fit, radius_px, log10_p, view.mirrored)
+                    return result, view.ranking
             if time.thread_time() > deadline_s:
                 return None, 0
     return None, 0
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """A selection of the sources of an image, as given or mirrored left to right."""
-
-    image: SourceImage
-    mirrored: bool
-    ranking: int
 
 
 def _image(xy_px: Floats, camera: CameraModel, mirrored: bool, ranges: Ranges) -> SourceImage:
@@ -146,22 +136,26 @@ def _image(xy_px: Floats, camera: CameraModel, mirrored: bool, ranges: Ranges) -
 
 
 def _candidates(
-    seen: Sequence[_Seen], catalog: StarCatalog, before: int, sources: int
-) -> Iterator[tuple[_Seen, list[_Candidate]]]:
+    views: Sequence[_View], catalog: StarCatalog, before: int, sources: int
+) -> Iterator[tuple[_View, list[_Candidate]]]:
     """
     Candidates of all look-ups: first the almost certain ones of each, then the others.
 
-    To refine a false candidate costs half as much as a look-up, and there may be 32 of them.
+    To refine a false candidate costs half as much as a look-up, and there may be 32 of them; of a
+    camera that is known there are few, and they cost less than the index of another scale.
     """
     others = []
-    scales = _focal_scales(seen[0].image) if seen else ()
-    for focal_scale, one in itertools.product(scales, seen):
-        view = _View(one.image, focal_scale)
-        patterns = view.patterns(before, sources)
-        for scale in pattern_index.scales_for(one.image.half_diagonal_rad / focal_scale):
-            certain, other = _look_up(view, catalog, scale, patterns)
-            yield one, certain
-            others.append((one, other))
+    for focal_scale in _focal_scales(views[0].image) if views else ():
+        scaled = [dataclasses.replace(view, focal_scale=focal_scale) for view in views]
+        patterns = [view.patterns(before, sources) for view in scaled]
+        for scale in pattern_index.scales_for(views[0].image.half_diagonal_rad / focal_scale):
+            for view, of_view in zip(scaled, patterns, strict=True):
+                certain, other = _look_up(view, catalog, scale, of_view)
+                yield view, certain
+                others.append((view, other))
+            if views[0].image.ranges.focal < _KNOWN:
+                yield from others
+                others = []
     yield from others
 
 
@@ -288,10 +282,16 @@ class _Candidate(NamedTuple):
 
 @dataclass(frozen=True)
 class _View:
-    """An image with the focal length of its prior camera scaled."""
+    """
+    A selection of the sources of an image, as given or mirrored left to right.
+
+    The focal length of its prior camera is scaled.
+    """
 
     image: SourceImage
-    focal_scale: float
+    mirrored: bool
+    ranking: int
+    focal_scale: float = 1.0
 
     @functools.cached_property
     def directions(self) -> Floats:
@@ -434,37 +434,30 @@ def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
     return gain.reshape(u.shape), low, cell
 
 
-@functools.lru_cache(maxsize=8)
-def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
-    """Search trees of points all over the sky and of the stars that discs of a radius need."""
-    radius_rad = math.radians(radius_deg)
-    points = pattern_index.sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    # The emptiest discs hold half of the mean number, which is still most of the stars tested.
-    enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
-    stars = catalog.direction_icrs[:enough]
-    return direction_tree(points), direction_tree(stars)
-
-
 def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
-    if radius_rad < _NARROW_RAD:  # few candidates: their patterns hold the sizes of others
-        return pattern_index.brightest_within(catalog.tree, axes, radius_rad, count)
-    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
-    point = points.query(axes)[1]
-    if points.n <= _TABLED:
-        return np.asarray(_bright_everywhere(catalog, radius_rad, count)[point])
-    point, place = np.unique(point, return_inverse=True)
-    found = pattern_index.brightest_within(stars, points.data[point], _widened(radius_rad), count)
-    return np.asarray(found[place.ravel()])
+    if radius_rad < _TABLED_RAD:
+        stars = _bright_stars(catalog, math.ceil(math.degrees(radius_rad)))
+        return pattern_index.brightest_within(stars, axes, radius_rad, count)
+    points, rows = _bright_everywhere(catalog, radius_rad, count)
+    return np.asarray(rows[points.query(axes)[1]])
 
 
 @functools.lru_cache(maxsize=8)
-def _bright_everywhere(catalog: StarCatalog, radius_rad: float, count: int) -> Indices:
-    """Rows (p, count) of `_bright_about` for all points of `_bright_stars`."""
-    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
-    return pattern_index.brightest_within(stars, points.data, _widened(radius_rad), count)
+def _bright_stars(catalog: StarCatalog, radius_deg: int) -> cKDTree:
+    """Search tree of the stars that discs of a radius need."""
+    # The emptiest discs hold half of the mean number, which is still most of the stars tested.
+    sky_by_disc = 2.0 / (1.0 - math.cos(math.radians(radius_deg)))
+    return pattern_index.tree_of_brightest(catalog, int(5 * _TESTED * sky_by_disc))
 
 
-def _widened(radius_rad: float) -> float:
-    """Radius about the nearest point that holds the disc about an axis."""
-    return min(1.25 * radius_rad, math.pi)
+@functools.lru_cache(maxsize=8)
+def _bright_everywhere(
+    catalog: StarCatalog, radius_rad: float, count: int
+) -> tuple[cKDTree, Indices]:
+    """Search tree of points all over the sky, and rows (p, count) of `_bright_about` for them."""
+    points = pattern_index.sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
+    stars = _bright_stars(catalog, math.ceil(math.degrees(radius_rad)))
+    # It holds the disc about each axis that is nearest to the point.
+    wider_rad = min(1.25 * radius_rad, math.pi)
+    return direction_tree(points), pattern_index.brightest_within(stars, points, wider_rad, count)

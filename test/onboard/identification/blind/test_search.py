@@ -285,6 +285,17 @@ def test_a_camera_that_identified_another_image_is_searched_near_its_focal_lengt
         assert apart * fx < 20.0  # px; the principal point is fitted too
 
 
+@pytest.mark.parametrize(('width_deg', 'stars', 'false'), [(8, 6, 6), (15, 6, 6), (25, 20, 10)])
+def test_an_image_of_a_known_camera_needs_the_index_of_one_scale(
+    catalog: StarCatalog, width_deg: float, stars: int, false: int
+) -> None:
+    """Few stars make no candidate almost certain; an index takes as long as many images."""
+    frame = next(frames(catalog, width_deg, stars, false, 0.0, 1))
+    before, fresh = pattern_index.cache_info().misses, dataclasses.replace(catalog)
+    sky, _ = find_in_any([frame.xy_px], frame.prior, fresh, ranges=FOUND)
+    assert isinstance(sky, SkyMatch) and pattern_index.cache_info().misses == before + 1
+
+
 @pytest.mark.parametrize('mirrored', [False, True])
 def test_a_better_camera_matches_the_stars_that_one_image_left_out(
     catalog: StarCatalog, mirrored: bool
