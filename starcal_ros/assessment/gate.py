@@ -355,7 +355,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         check = limit_check(
             options,
             'max_held_term_sigma',
-            f'distance of {term.name} from its assumed value',
+            term.name if _is_change(term) else f'distance of {term.name} from its assumed value',
             term.significance,
             'sigma',
         )
@@ -364,8 +364,15 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         yield dataclasses.replace(check, note=note)
 
 
+def _is_change(term: HeldTerm) -> bool:
+    """Return True for what changes between images, which no option assumes."""
+    return term.name in REMEDIES
+
+
 def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
+    if _is_change(term):
+        return f'{significant(term.estimated, 3)} px in a corner', REMEDIES[term.name]
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
     is_departure = kind in ('assumed velocity', 'assumed stamp', 'assumed mounting')
