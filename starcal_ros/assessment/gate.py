@@ -135,16 +135,6 @@ def limit_check(
     return GateCheck(name, option, float(found), limit, unit, bool(passed), note)
 
 
-def _worse(*checks: GateCheck) -> GateCheck:
-    """Return the check with the larger share of its limit: limits on one question are one row."""
-
-    def share(check: GateCheck) -> float:
-        part = check.found / max(check.limit, 1e-300)
-        return math.inf if math.isnan(part) else part
-
-    return max(checks, key=share)
-
-
 def judge(
     calibration: Calibration,
     prior: CameraGeometry,
@@ -287,7 +277,7 @@ def _changes(
         centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
     rotation_rad, left_px = movement(before, calibration.geometry)
     lens = 'the prior camera or its lens model does not match this lens (lens_model)'
-    return _worse(
+    checks = (
         limit_check(
             options,
             'max_change_px',
@@ -308,6 +298,8 @@ def _changes(
             centre_deg,
         ),
     )
+    # Limits on one question are one row: that of the larger share.
+    return max(checks, key=lambda check: check.found / max(check.limit, 1e-300))
 
 
 def star_tracker_gate(
