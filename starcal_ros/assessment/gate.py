@@ -344,10 +344,11 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         _STEP_P_VALUE,
     )
     for term in found.held:
+        name = term.name
         check = limit_check(
             options,
             'max_held_term_sigma',
-            term.name if _is_change(term) else f'distance of {term.name} from its assumed value',
+            name if name in REMEDIES else f'distance of {name} from its assumed value',
             term.significance,
             'sigma',
         )
@@ -356,14 +357,9 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         yield dataclasses.replace(check, note=note)
 
 
-def _is_change(term: HeldTerm) -> bool:
-    """Return True for what changes between images, which no option assumes."""
-    return term.name in REMEDIES
-
-
 def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
-    if _is_change(term):
+    if term.name in REMEDIES:  # what changes between images: no option assumes it
         return f'{significant(term.estimated, 3)} px in a corner', REMEDIES[term.name]
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)

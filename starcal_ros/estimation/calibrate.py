@@ -115,10 +115,8 @@ class Estimate:
     geometry : CameraGeometry
     covariance : (p + 3, p + 3)
         Covariance of the p camera parameters and the alignment angles.
-    joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
-        The same with the coefficients of the field, those of u, then those of v.
-    pixel_sigma_px : float
-        1-sigma per axis of structure finer than the field: it is part of any line of sight.
+    map_covariance : MapCovariance
+        The same with the coefficients of the field: that of lines of sight.
     information : (k, k)
         On the estimated camera parameters, focal terms, alignment and its rate, the images
         eliminated; ``information_names`` are their names.
@@ -159,8 +157,7 @@ class Estimate:
 
     geometry: CameraGeometry
     covariance: Floats
-    joint_covariance: Floats
-    pixel_sigma_px: float
+    map_covariance: MapCovariance
     information: Floats
     information_names: tuple[str, ...]
     shared_covariance: Floats
@@ -184,11 +181,6 @@ class Estimate:
     termination: str
     thermal: TemperatureTerms | None
     star_trackers: tuple[StarTrackerAlignment, ...]
-
-    @property
-    def map_covariance(self) -> MapCovariance:
-        """Covariance of lines of sight."""
-        return MapCovariance(self.joint_covariance, self.pixel_sigma_px)
 
 
 def estimate_calibration(
@@ -461,8 +453,9 @@ def _result(
     return Estimate(
         geometry=geometry,
         covariance=covariance[np.ix_(basic, basic)],
-        joint_covariance=covariance[np.ix_(joint, joint)],
-        pixel_sigma_px=math.sqrt(pixel_variance_px2(judged.errors)),
+        map_covariance=MapCovariance(
+            covariance[np.ix_(joint, joint)], math.sqrt(pixel_variance_px2(judged.errors))
+        ),
         information=found.equations.information[np.ix_(asked, asked)],
         information_names=tuple(layout.labels[k] for k in asked),
         shared_covariance=covariance[np.ix_(shared, shared)],
