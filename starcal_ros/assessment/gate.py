@@ -324,7 +324,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     """Contradictions between the stars and the model with its priors, each with the remedy."""
     if found is None:
         return
-    variation = limit_check(
+    yield limit_check(
         options,
         'max_image_variation_px',
         'change of the camera from image to image in a corner',
@@ -332,7 +332,6 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'px',
         REMEDIES['change from image to image'],
     )
-    yield variation
     step = found.step
     yield _significant(
         options,
@@ -346,8 +345,6 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     )
     for term in found.held:
         name = term.name
-        if name in REMEDIES and not variation.passed:
-            continue  # one reason for the changes of the images
         check = limit_check(
             options,
             'max_held_term_sigma',
@@ -374,6 +371,11 @@ def of_held(term: HeldTerm) -> tuple[str, str]:
     )
 
 
+def _group(part: ResidualBin) -> str:
+    first = 1 if part.by == 'image' else 0  # images are numbered from 1 on the report
+    return f'{part.by} {part.low + first:.4g} to {part.high + first:.4g}'
+
+
 def _predicted(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
     """The part of the data with the largest ratio of residuals to their predicted sigma."""
     bins = found.predictions if found else ()
@@ -385,12 +387,10 @@ def _predicted(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         return part.normalised - _PART_SIGMAS * part.sigma
 
     worst = max(bins, key=excess)
-    first = 1 if worst.by == 'image' else 0  # images are numbered from 1 on the report
-    part = f'{worst.by} {worst.low + first:.4g} to {worst.high + first:.4g}'
     check = limit_check(
         options,
         'max_cross_validated_residual',
-        f'residual over predicted sigma at {part}',
+        f'residual over predicted sigma at {_group(worst)}',
         worst.normalised,
     )
     passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual

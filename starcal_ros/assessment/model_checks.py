@@ -103,12 +103,12 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     field and the shapes of the images, and hardly its own.  Free unknowns also fit what is of the
     lens: more than `_CLEAR_SIGMA` counts only where the data are likelier without the prior, too.
     They also fit what changes from image to image: where that alone makes the data likelier than a
-    free unknown alone, it comes first, with the significance of what it explains.
+    free unknown alone, it comes first.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms: list[HeldTerm] = []
-    images_differ = found.shapes.amplitudes.likelihood_ratio > _CLEAR_SIGMA**2
-    change_sigma = 0.0
+    of_images = found.shapes.amplitudes.likelihood_ratio
+    change: tuple[HeldTerm, ...] = ()
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
         cross = found.equations.information[k]
@@ -144,16 +144,14 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             if 1 <= head < len(estimate.star_trackers):
                 frame = estimate.star_trackers[head].frame
                 name, unit = f'mounting of {frame} {name[-1]}_deg', math.degrees(1.0)
-            terms.append(HeldTerm(name, prior, prior + unit * off, unit * math.sqrt(apart2)))
-            significance = terms[-1].significance
-            if images_differ and significance > max(_CLEAR_SIGMA, change_sigma):
+            term = HeldTerm(name, prior, prior + unit * off, unit * math.sqrt(apart2))
+            terms.append(term)
+            if term.significance > _CLEAR_SIGMA and of_images > _CLEAR_SIGMA**2 and not change:
                 alone = without_prior(estimate.sums, estimate.linear, entry.name, are_alike=True)
                 if alone[2] < found.log_evidence:
-                    change_sigma = significance
-    if not change_sigma:
-        return tuple(terms)
-    size_px = _image_variation_px(estimate)
-    return (HeldTerm(_CHANGE, 0.0, size_px, size_px / change_sigma), *terms)
+                    size_px = _image_variation_px(estimate)
+                    change = (HeldTerm(_CHANGE, 0.0, size_px, size_px / math.sqrt(of_images)),)
+    return (*change, *terms)
 
 
 def detector_step(estimate: Estimate) -> DetectorStep:
