@@ -135,6 +135,16 @@ def limit_check(
     return GateCheck(name, option, float(found), limit, unit, bool(passed), note)
 
 
+def _worse(*checks: GateCheck) -> GateCheck:
+    """Return the check with the larger share of its limit: limits on one question are one row."""
+
+    def share(check: GateCheck) -> float:
+        part = check.found / max(check.limit, 1e-300)
+        return math.inf if math.isnan(part) else part
+
+    return max(checks, key=share)
+
+
 def judge(
     calibration: Calibration,
     prior: CameraGeometry,
@@ -277,7 +287,7 @@ def _changes(
         centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
     rotation_rad, left_px = movement(before, calibration.geometry)
     lens = 'the prior camera or its lens model does not match this lens (lens_model)'
-    checks = (
+    return _worse(
         limit_check(
             options,
             'max_change_px',
@@ -298,8 +308,6 @@ def _changes(
             centre_deg,
         ),
     )
-    # Limits on one question are one row: that of the larger share.
-    return max(checks, key=lambda check: check.found / max(check.limit, 1e-300))
 
 
 def star_tracker_gate(
@@ -344,11 +352,10 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         _STEP_P_VALUE,
     )
     for term in found.held:
-        name = term.name
         check = limit_check(
             options,
             'max_held_term_sigma',
-            name if name in REMEDIES else f'distance of {name} from its assumed value',
+            f'distance of {term.name} from its assumed value',
             term.significance,
             'sigma',
         )
@@ -359,8 +366,6 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
 
 def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
-    if term.name in REMEDIES:  # what changes between images: no option assumes it
-        return f'{significant(term.estimated, 3)} px in a corner', REMEDIES[term.name]
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
     is_departure = kind in ('assumed velocity', 'assumed stamp', 'assumed mounting')

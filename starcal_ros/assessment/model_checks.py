@@ -24,7 +24,6 @@ from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
 
 _STATED = ('camera', 'mountings', 'velocity', 'readout', 'stamps')  # entries with a prior
 _CLEAR_SIGMA = 5.0  # from a prior; as a ratio of evidence e^12.5
-_CHANGE = 'change from image to image'
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for
 _STRIP = 1 / 24  # of the width: a quarter of the shortest wave of the field
@@ -58,7 +57,9 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
             'px',
             found.term.likelihood_ratio,
         ),
-        Amplitude(_CHANGE, shape, 'px', found.shapes.amplitudes.likelihood_ratio),
+        Amplitude(
+            'change from image to image', shape, 'px', found.shapes.amplitudes.likelihood_ratio
+        ),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)
             for error in estimate.weights.errors
@@ -102,13 +103,9 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     estimate without the prior: what contradicts a narrow prior moves other unknowns, first the
     field and the shapes of the images, and hardly its own.  Free unknowns also fit what is of the
     lens: more than `_CLEAR_SIGMA` counts only where the data are likelier without the prior, too.
-    They also fit what changes from image to image: where that alone makes the data likelier than a
-    free unknown alone, it comes first.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
-    terms: list[HeldTerm] = []
-    of_images = found.shapes.amplitudes.likelihood_ratio
-    change: tuple[HeldTerm, ...] = ()
+    terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
         cross = found.equations.information[k]
@@ -144,14 +141,8 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             if 1 <= head < len(estimate.star_trackers):
                 frame = estimate.star_trackers[head].frame
                 name, unit = f'mounting of {frame} {name[-1]}_deg', math.degrees(1.0)
-            term = HeldTerm(name, prior, prior + unit * off, unit * math.sqrt(apart2))
-            terms.append(term)
-            if term.significance > _CLEAR_SIGMA and of_images > _CLEAR_SIGMA**2 and not change:
-                alone = without_prior(estimate.sums, estimate.linear, entry.name, are_alike=True)
-                if alone[2] < found.log_evidence:
-                    size_px = _image_variation_px(estimate)
-                    change = (HeldTerm(_CHANGE, 0.0, size_px, size_px / math.sqrt(of_images)),)
-    return (*change, *terms)
+            terms.append(HeldTerm(name, prior, prior + unit * off, unit * math.sqrt(apart2)))
+    return tuple(terms)
 
 
 def detector_step(estimate: Estimate) -> DetectorStep:

@@ -133,7 +133,6 @@ def posterior(
     linear: Linearisation,
     before: Floats | float = LEAST_SHAPE_PX,
     near: Posterior | None = None,
-    are_alike: bool = False,
 ) -> Posterior:
     """
     Return the posterior from sums at a state.
@@ -144,8 +143,6 @@ def posterior(
         Amplitudes px of the shapes of the images to begin with.
     near : Posterior, optional
         At a state near this one: the search of amplitudes begins with its own.
-    are_alike : bool
-        True if the images have one shape, whatever they show.
     """
     layout = linear.layout
     before = np.broadcast_to(before, len(layout['shape']))
@@ -155,7 +152,7 @@ def posterior(
     base, field_px = solver.likely(start, near.field if near else None)
     none = Amplitudes(np.full(len(before), NO_AMPLITUDE), 0.0)
     found, last = Shapes(before, none, None), start
-    if len(sums.blocks) > 1 and not are_alike:
+    if len(sums.blocks) > 1:
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shapes.amplitudes if near else None)
         last = eliminated(normal, layout, found.sigma_px)
@@ -183,13 +180,12 @@ def posterior(
 
 
 def without_prior(
-    sums: StarSums, linear: Linearisation, name: str, are_alike: bool = False
+    sums: StarSums, linear: Linearisation, name: str
 ) -> tuple[Floats, Floats, float]:
     """
     Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
 
-    The amplitudes are found again: field and shapes may hide that a prior is wrong; ``are_alike``
-    is that of `posterior`.  The variance
+    The amplitudes are found again: field and shapes may hide that a prior is wrong.  The variance
     is that of the working weights; infinite where stars show less than what is possible at all.
     """
     wide = Layout(
@@ -201,7 +197,7 @@ def without_prior(
     linear = dataclasses.replace(linear, layout=wide)
     at = wide.of([name])
     try:
-        found = posterior(sums, linear, are_alike=are_alike)
+        found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
         return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 from functools import partial
 from typing import Any
@@ -15,12 +14,11 @@ from random_pointings import displaced, estimated, HEIGHT, honesty, of_random_po
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import GateOptions, model_gate, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
-from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
+from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks, StarObservations
+from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks
 from studies import worlds
 
 CORNER_PX = float(np.hypot(WIDTH, HEIGHT)) / 2.0
@@ -177,67 +175,6 @@ def test_a_focal_length_that_breathes_is_estimated_image_by_image() -> None:
     np.testing.assert_allclose(
         found.residual_px[found.kept].std(), still.residual_px[still.kept].std(), rtol=0.02
     )
-
-
-def warped(image: StarObservations, rng: np.random.Generator) -> StarObservations:
-    """The image through hot air: waves of 0.1 px that are its own."""
-    at = (image.measured_px - [WIDTH / 2, HEIGHT / 2]) / (WIDTH / 2)
-    waves = [
-        np.outer(np.sin(at @ (4.0 * rng.normal(size=2)) + rng.uniform(0.0, 6.3)), axis)
-        for axis in rng.normal(size=(3, 2)) / np.sqrt(3.0)
-    ]
-    return dataclasses.replace(image, measured_px=image.measured_px + 0.1 * sum(waves))
-
-
-def flattened(image: StarObservations, rng: np.random.Generator) -> StarObservations:
-    """The image through the air over a site, 45 degrees from a zenith of its own."""
-    e = image.direction_icrf
-    middle = e.mean(axis=0) / np.linalg.norm(e.mean(axis=0))
-    across = np.cross(middle, rng.normal(size=3))
-    zenith = middle + across / np.linalg.norm(across)
-    cosine = (e @ zenith)[:, None]
-    return towards(image, 58.0 * ARCSECOND_RAD * zenith / cosine)
-
-
-def off_course(image: StarObservations, rng: np.random.Generator) -> StarObservations:
-    """The image from a spacecraft that is 37 km/s faster than given."""
-    del rng
-    return towards(image, np.array([3e4, -2e4, 1e4]) / SPEED_OF_LIGHT_M_S)
-
-
-def towards(image: StarObservations, v: Floats) -> StarObservations:
-    e = (
-        image.direction_icrf
-        + v
-        - image.direction_icrf * (image.direction_icrf * v).sum(axis=1)[:, None]
-    )
-    return dataclasses.replace(image, direction_icrf=e / np.linalg.norm(e, axis=1, keepdims=True))
-
-
-@pytest.mark.parametrize(
-    ('departure', 'first'),
-    [
-        (warped, 'change from image to image'),
-        (flattened, 'change from image to image'),
-        (off_course, 'velocity_x_m_s'),
-    ],
-)
-def test_the_departure_that_the_data_show_best_comes_first(
-    departure: Callable[[StarObservations, np.random.Generator], StarObservations], first: str
-) -> None:
-    """Each alone contradicts the velocity by more than the limit, and has images that differ."""
-    given = of_random_pointings(7, images=6)
-    bright = dataclasses.replace(given.detector, zero_point_electrons=3e6)
-    given = dataclasses.replace(given, detector=bright, magnitude_limit=9.0)
-    rng = np.random.default_rng(7)
-    images = tuple(departure(image, rng) for image in true_observations(given).images)
-    checks = model_checks(estimated(given, Ensemble(images)))
-    over = [term for term in checks.held if term.significance > LIMIT_SIGMA]
-    assert over[0].name == first
-    assert any(term.name.startswith('velocity') for term in over)
-    assert amplitude(checks, 'change from image to image').likelihood_ratio > 100.0
-    reasons = reasons_of(model_gate(checks, GateOptions()))
-    assert reasons[0].startswith(('change', 'distance')) and max(map(len, reasons)) <= 200
 
 
 def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
