@@ -81,7 +81,7 @@ def target(estimate: Estimate, name: str) -> Target:
     layout = estimate.linear.layout
     if name in (MAP, LINE_OF_SIGHT):
         (of_map, of_pointing), of_pixel = mean_squares(estimate)
-        unresolved = of_pixel * estimate.pixel_sigma_px**2
+        unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
         squares = of_map if name == MAP else of_pointing
         return Target(f'{name}_arcsec', squares, unresolved, ARCSECOND_RAD)
     if name not in layout.labels:

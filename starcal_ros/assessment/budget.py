@@ -79,11 +79,11 @@ def sigma_budget(
     assert errors is not None
     seen, of_pixel = _seen(estimate)
     in_root = seen.turned(errors.root)
-    unresolved = of_pixel * estimate.pixel_sigma_px**2
+    unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
     rows = _rows(estimate)
     part = np.ix_(rows, rows)
     of_rows = seen.turned(np.eye(len(errors.root))[:, rows])
-    covariance = estimate.joint_covariance
+    covariance = estimate.map_covariance.matrix
     held = of_rows.variances(covariance - estimate.posterior.covariance[part])
     shapes = _known_shapes(estimate, errors)
     common = common_shape(estimate.linear.layout, estimate.posterior.shapes.common_px2)
@@ -164,9 +164,8 @@ def _to_state(
         return 'shutter (and readout_s)', 'global, or rolling with a known readout_s', 0.0
     if cause == 'refraction':
         return 'latitude_deg and longitude_deg', 'known', 0.0
-    for name, option in _SIGMAS.items():
-        if cause == name:
-            return option, significant(0.1 * getattr(options, option), 2), 0.01
+    if option := _SIGMAS.get(cause):
+        return option, significant(0.1 * getattr(options, option), 2), 0.01
     return '', '', 1.0
 
 

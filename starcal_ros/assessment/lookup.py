@@ -57,22 +57,15 @@ def line_of_sight_table(
     camera: CameraModel, covariance: MapCovariance, pixels: Floats
 ) -> LineOfSightTable:
     """Return the lines of sight of pixels (n, 2)."""
-    parts = [pixels[k : k + CHUNK] for k in range(0, len(pixels), CHUNK)]
-    found = [_table(camera, covariance, part) for part in parts]
-    return LineOfSightTable(
-        pixels, *(np.concatenate(column) for column in zip(*found, strict=True))
-    )
-
-
-def _table(
-    camera: CameraModel, covariance: MapCovariance, pixels: Floats
-) -> tuple[Floats, Floats, Floats]:
-    derivatives = Derivatives.at(camera, pixels)
-    shape, full = (
-        sigma_arcsec(derivatives.covariance_rad2(covariance, J))
-        for J in (derivatives.of_shape(camera), derivatives.J)
-    )
-    return derivatives.directions, shape, full
+    columns: list[tuple[Floats, ...]] = []
+    for first in range(0, len(pixels), CHUNK):
+        derivatives = Derivatives.at(camera, pixels[first : first + CHUNK])
+        sigmas = (
+            sigma_arcsec(derivatives.covariance_rad2(covariance, J))
+            for J in (derivatives.of_shape(camera), derivatives.J)
+        )
+        columns.append((derivatives.directions, *sigmas))
+    return LineOfSightTable(pixels, *map(np.concatenate, zip(*columns, strict=True)))
 
 
 def sigma_arcsec(covariance_rad2: Floats) -> Floats:

@@ -17,7 +17,7 @@ from starcal_ros.estimation.equations import information_of_images, stars_alone,
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.outliers import FEWEST_STARS
-from starcal_ros.estimation.problem import image_blocks, Problem, State, supported_terms
+from starcal_ros.estimation.problem import Problem, State, supported_terms
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
@@ -123,8 +123,8 @@ def _at_the_prior(
     table = star_table(ensemble.images)
     enough = np.array([len(image) >= FEWEST_STARS for image in ensemble.images])
     measurements = arrange(table, enough[table.image], table.covariance_px2)
-    cost, blocks = image_blocks(problem, state, measurements)
-    sums = stars_alone(blocks, problem, unknowns_in_state(problem, state))
+    layout = unknowns_in_state(problem, state)
+    cost, sums = stars_alone(problem, state, layout, measurements)
     return problem, state, sums, math.isfinite(cost)
 
 

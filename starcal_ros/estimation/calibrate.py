@@ -115,10 +115,8 @@ class Estimate:
     geometry : CameraGeometry
     covariance : (p + 3, p + 3)
         Covariance of the p camera parameters and the alignment angles.
-    joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
-        The same with the coefficients of the field, those of u, then those of v.
-    pixel_sigma_px : float
-        1-sigma per axis of structure finer than the field: it is part of any line of sight.
+    map_covariance : MapCovariance
+        The same with the coefficients of the field: that of lines of sight.
     information : (k, k)
         On the estimated camera parameters, focal terms, alignment and its rate, the images
         eliminated; ``information_names`` are their names.
@@ -159,8 +157,7 @@ class Estimate:
 
     geometry: CameraGeometry
     covariance: Floats
-    joint_covariance: Floats
-    pixel_sigma_px: float
+    map_covariance: MapCovariance
     information: Floats
     information_names: tuple[str, ...]
     shared_covariance: Floats
@@ -184,11 +181,6 @@ class Estimate:
     termination: str
     thermal: TemperatureTerms | None
     star_trackers: tuple[StarTrackerAlignment, ...]
-
-    @property
-    def map_covariance(self) -> MapCovariance:
-        """Covariance of lines of sight."""
-        return MapCovariance(self.joint_covariance, self.pixel_sigma_px)
 
 
 def estimate_calibration(
@@ -220,8 +212,7 @@ def estimate_calibration(
         prior,
         options,
         measured_rates(ensemble.images, stated_rad),
-        np.array([image.velocity_sigma_m_s for image in ensemble.images]),
-        _refraction(ensemble),
+        _assumed(ensemble, options),
         observation_groups(table.measured_px, table.star, prior.camera.width),
     )
     try:
@@ -312,13 +303,13 @@ def _round(
     """Return a share of a step from a state of residuals (n, 2), with the weights judged."""
     table, camera = data.table, data.prior.camera
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
-    assumed, size = _assumed(data), (camera.width, camera.height)
-    readout_s = math.hypot(*assumed.readout_s)
+    size = camera.width, camera.height
+    readout_s = math.hypot(*data.assumed.readout_s)
     if before and 'rates' in before.linear.layout and 'readout' in before.linear.layout:
         at = before.linear.layout.places['readout'].start
         readout_s = math.hypot(before.posterior.mean[at], before.posterior.working[at, at] ** 0.5)
     rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
-    layout = unknowns_of(problem, state, rates, size, assumed)
+    layout = unknowns_of(problem, state, rates, size, data.assumed)
     measurements = arrange(table, judged.kept, judged.working_px2(table))
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
@@ -334,12 +325,11 @@ def _round(
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
 
 
-def _assumed(data: Data) -> Assumptions:
+def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
     """Return the priors of what is stated by the options and the observations."""
-    options = data.options
     velocity_m_s, usual_m_s = options.velocity_sigma_m_s, math.inf
     if velocity_m_s < 0:
-        velocity_m_s = float(data.velocity_sigma_m_s.max())
+        velocity_m_s = float(np.max([image.velocity_sigma_m_s for image in ensemble.images]))
         if not math.isfinite(velocity_m_s):
             velocity_m_s, usual_m_s = _SPACE_VELOCITY_M_S, _USUAL_M_S
     readout_s = {
@@ -348,21 +338,16 @@ def _assumed(data: Data) -> Assumptions:
         'unknown': (0.0, _UNKNOWN_READOUT_S),
     }
     readout = readout_s[options.shutter]
-    lens = UNSTATED
+    lens, refraction = UNSTATED, None
     if options.lens_residual_px:
         lens = math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA
-    stamp_s = options.stamp_sigma_s
-    return Assumptions(velocity_m_s, readout, stamp_s, data.refraction, lens, usual_m_s)
-
-
-def _refraction(ensemble: Ensemble) -> Refraction | None:
-    """Return the refraction that all images of an ensemble state."""
     zenith = np.array([image.zenith_icrf for image in ensemble.images])
-    if not np.isfinite(zenith).all():
-        return None
-    size, sigma = np.array([image.refraction_arcsec for image in ensemble.images]).max(axis=0)
-    stamps = np.array([image.time_ns for image in ensemble.images], np.int64)
-    return Refraction(stamps, zenith, float(size), float(sigma))
+    if np.isfinite(zenith).all():  # all images state one
+        size, sigma = np.array([image.refraction_arcsec for image in ensemble.images]).max(axis=0)
+        stamps = np.array([image.time_ns for image in ensemble.images], np.int64)
+        refraction = Refraction(stamps, zenith, float(size), float(sigma))
+    stamp_s = options.stamp_sigma_s
+    return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, usual_m_s)
 
 
 def _step_sigma(found: Posterior) -> Floats:
@@ -468,8 +453,9 @@ def _result(
     return Estimate(
         geometry=geometry,
         covariance=covariance[np.ix_(basic, basic)],
-        joint_covariance=covariance[np.ix_(joint, joint)],
-        pixel_sigma_px=math.sqrt(pixel_variance_px2(judged.errors)),
+        map_covariance=MapCovariance(
+            covariance[np.ix_(joint, joint)], math.sqrt(pixel_variance_px2(judged.errors))
+        ),
         information=found.equations.information[np.ix_(asked, asked)],
         information_names=tuple(layout.labels[k] for k in asked),
         shared_covariance=covariance[np.ix_(shared, shared)],

@@ -28,8 +28,13 @@ from starcal_ros.estimation.problem import (
     State,
     whitened_attitude_errors,
 )
-from starcal_ros.estimation.star_equations import Chunk, Measurements, whitened_chunks
-from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
+from starcal_ros.estimation.star_equations import (
+    Chunk,
+    Measurements,
+    normal_blocks,
+    whitened_chunks,
+)
+from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout
 
 
 @dataclass(frozen=True)
@@ -65,10 +70,19 @@ class StarSums:
     field_cross: Floats
 
 
-def stars_alone(blocks: Floats, problem: Problem, layout: Layout) -> StarSums:
-    """Return the sums of a list without turns and field, from `problem.image_blocks`."""
+def stars_alone(
+    problem: Problem,
+    state: State,
+    layout: Layout,
+    measurements: Measurements,
+    loss_scale: float = np.inf,
+) -> tuple[float, StarSums]:
+    """Cost of the stars and the sums of a list without turns and field, as of `normal_blocks`."""
+    own, rotations = image_parameters(problem, state), state.camera_from_icrf.as_matrix()
+    cost, blocks = normal_blocks(measurements, problem.model, own, rotations, loss_scale)
     none: Floats = np.empty((0, 0))
-    return _chained(blocks, none, np.empty((len(blocks), 0, blocks.shape[2])), problem, layout)
+    cross: Floats = np.empty((len(blocks), 0, blocks.shape[2]))
+    return cost, _chained(blocks, none, cross, problem, layout)
 
 
 def _chained(
@@ -313,36 +327,20 @@ def information_of_images(
 
     The list has neither field nor shapes; the rotation of the image is eliminated.
     """
-    at = seen_by_stars(layout)
-    blocks = sums.blocks
-    m = len(blocks)
-    stars, own, _ = chain_columns(layout)
-    A = np.zeros((m, layout.count, layout.count))
-    A[np.ix_(np.arange(m), at, at)] = blocks[:, stars, stars]
-    B: Floats = np.zeros((m, 3, layout.count))
-    B[:, :, at] = blocks[:, own, stars]
-    C = blocks[:, own, own].copy()
-    _, J = whitened_attitude_errors(problem, state)
+    normal, at = arrow(sums, problem, state, layout), seen_by_stars(layout)
+    stars, *_ = chain_columns(layout)
+    A = np.zeros((len(sums.blocks), layout.count, layout.count))
+    A[:, at[:, None], at] = sums.blocks[:, stars, stars]
     turning, turns = tracker_turns(layout)
-    by_tracker = J @ turns
+    by_tracker = whitened_attitude_errors(problem, state)[1] @ turns
     A[:, turning[:, None], turning] += by_tracker.transpose(0, 2, 1) @ by_tracker
-    B[:, :, turning] -= J.transpose(0, 2, 1) @ by_tracker
-    C += J.transpose(0, 2, 1) @ J
-    C[~C.any(axis=(1, 2))] += np.eye(3)
-    return np.asarray(A - B.transpose(0, 2, 1) @ np.linalg.solve(C, B))
+    return np.asarray(A - normal.B.transpose(0, 2, 1) @ np.linalg.solve(normal.C, normal.B))
 
 
 def seen_by_stars(layout: Layout) -> Indices:
     """Return the places of the shared unknowns that stars see, the field aside; as `chain`."""
     seen = [e.name for e in layout.shared if e.camera is not None or e.turn is not None]
     return layout.of(seen)
-
-
-def _columns(layout: Layout) -> tuple[list[Unknown], list[Unknown], list[Unknown]]:
-    """Return the shared entries by camera, those by turn, and those of an image."""
-    by_camera = [e for e in layout.shared if e.camera is not None]
-    by_turn = [e for e in layout.shared if e.turn is not None]
-    return by_camera, by_turn, list(layout.of_image)
 
 
 def chain(problem: Problem, layout: Layout, m: int) -> Floats:
@@ -352,7 +350,9 @@ def chain(problem: Problem, layout: Layout, m: int) -> Floats:
     In the order: shared ones by camera, by turn; the rotation of the image, its other unknowns;
     residual.
     """
-    by_camera, by_turn, of_image = _columns(layout)
+    by_camera = [entry for entry in layout.shared if entry.camera is not None]
+    by_turn = [entry for entry in layout.shared if entry.turn is not None]
+    of_image = layout.of_image
     p = problem.camera_count
     turns = sum(map(len, by_turn))
     first = sum(map(len, by_camera))

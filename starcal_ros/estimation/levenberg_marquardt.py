@@ -79,11 +79,14 @@ class NotObservable(TooFewObservations):
     """The normal matrix is singular: the data do not determine all unknowns."""
 
 
-def _factor(matrix: Floats) -> tuple[Floats, Floats]:
+def inverse(matrix: Floats) -> Floats:
     """
-    Scale (..., n), and inverse (..., n, n) of positive matrices scaled to a unit diagonal.
+    Inverse of positive definite matrices (..., n, n), scaled to a unit diagonal for the solution.
 
-    ``inverse(matrix) = scale * scaled_inverse * scale``, which is independent of units.
+    Raises
+    ------
+    NotObservable
+        If one is not positive definite beyond rounding.
     """
     diagonal = np.einsum('...ii->...i', matrix)
     if not (diagonal > 0).all():
@@ -98,28 +101,8 @@ def _factor(matrix: Floats) -> tuple[Floats, Floats]:
     if np.einsum('...ii->...i', lower).min(initial=1.0) < 1e-7:
         raise NotObservable('the unknowns cannot be separated')
     lower_inverse = np.linalg.inv(lower)
-    return scale, np.swapaxes(lower_inverse, -1, -2) @ lower_inverse
-
-
-def inverse(matrix: Floats) -> Floats:
-    """Inverse of positive definite matrices (..., n, n)."""
-    scale, scaled = _factor(matrix)
+    scaled = np.swapaxes(lower_inverse, -1, -2) @ lower_inverse
     return np.asarray(scale[..., :, None] * scaled * scale[..., None, :])
-
-
-def _schur_complement(A: Floats, flat_B: Floats, W: Floats) -> Floats:
-    """
-    ``A - B' C^-1 B`` (p, p): information on the shared unknowns with free blocks.
-
-    Raises
-    ------
-    NotObservable
-        If the information on an unknown is below rounding.
-    """
-    S = A - flat_B.T @ W.reshape(flat_B.shape)
-    if (np.diag(S) < _SCHUR_TOLERANCE * np.diag(A)).any():
-        raise NotObservable('a shared unknown cannot be separated from the blocks')
-    return np.asarray(S)
 
 
 def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats]:
@@ -129,7 +112,8 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     Raises
     ------
     NotObservable
-        When the matrix is not positive definite.
+        When the matrix is not positive definite, or what the blocks leave of the information on
+        a shared unknown is below rounding.
     """
     p = len(normal.a)
     A = normal.A + damping * np.diag(np.diag(normal.A))
@@ -139,7 +123,10 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     W = C_inverse @ normal.B
     w = np.einsum('mij,mj->mi', C_inverse, normal.c)
     flat_B = normal.B.reshape(len(normal.B) * q, p)
-    shared = inverse(_schur_complement(A, flat_B, W)) @ (normal.a - flat_B.T @ w.ravel())
+    S = A - flat_B.T @ W.reshape(flat_B.shape)
+    if (np.diag(S) < _SCHUR_TOLERANCE * np.diag(A)).any():
+        raise NotObservable('a shared unknown cannot be separated from the blocks')
+    shared = inverse(S) @ (normal.a - flat_B.T @ w.ravel())
     return shared, w - W @ shared
 
 

@@ -37,7 +37,6 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import parameter_names
-from starcal_ros.estimation.star_equations import Measurements, normal_blocks
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble, TemperatureTerms
 
 METHODS = ('hierarchical', 'per_image', 'single')
@@ -142,19 +141,6 @@ def mounting_errors_rad(problem: Problem, state: State) -> Floats:
     """Errors (m, 3) of the mounting of the star tracker of each image, rad; 0 of the first."""
     errors = np.concatenate([np.zeros((1, 3)), state.mountings.reshape(-1, 3)])
     return np.asarray(errors[problem.star_tracker])
-
-
-def image_blocks(
-    problem: Problem, state: State, measurements: Measurements, loss_scale: float = np.inf
-) -> tuple[float, Floats]:
-    """Cost and the matrices of `star_equations.normal_blocks` at a state."""
-    return normal_blocks(
-        measurements,
-        problem.model,
-        image_parameters(problem, state),
-        state.camera_from_icrf.as_matrix(),
-        loss_scale,
-    )
 
 
 def whitened_attitude_errors(problem: Problem, state: State) -> tuple[Floats, Floats]:

@@ -32,13 +32,7 @@ from starcal_ros.estimation.options import (
     estimated_parameters,
 )
 from starcal_ros.estimation.outliers import FEWEST_STARS
-from starcal_ros.estimation.problem import (
-    image_blocks,
-    Problem,
-    reference_degc,
-    star_tracker_names,
-    State,
-)
+from starcal_ros.estimation.problem import Problem, reference_degc, star_tracker_names, State
 from starcal_ros.estimation.star_equations import Measurements, StarTable, turned
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
 from starcal_ros.records import CameraGeometry, Ensemble
@@ -67,11 +61,18 @@ def minimise(
     """
 
     def evaluate(state: State) -> NormalEquations:
-        cost, blocks = image_blocks(problem, state, measurements, loss_scale)
-        if not np.isfinite(cost):
-            none: Floats = np.empty(0)
-            return NormalEquations(cost, none, none, none, none, none)
-        return equations_in_state(problem, state, cost, blocks)
+        layout = unknowns_in_state(problem, state)
+        cost, sums = stars_alone(problem, state, layout, measurements, loss_scale)
+        normal, kept = arrow(sums, problem, state, layout), estimated(layout)
+        precision, offset = layout.prior_precision[kept], layout.prior_offset[kept]
+        return NormalEquations(
+            cost + normal.cost + 0.5 * float(precision @ offset**2),
+            normal.A[np.ix_(kept, kept)] + np.diag(precision),
+            normal.a[kept] - precision * offset,
+            normal.B[:, :, kept],
+            normal.C,
+            normal.c,
+        )
 
     def move(state: State, shared: Floats, blocks: Floats) -> State:
         layout = unknowns_in_state(problem, state)
@@ -85,28 +86,6 @@ def minimise(
 def estimated(layout: Layout) -> Indices:
     """Return the places of the shared unknowns that are not held."""
     return np.flatnonzero(np.isfinite(layout.prior_precision))
-
-
-def equations_in_state(
-    problem: Problem, state: State, cost: float, blocks: Floats
-) -> NormalEquations:
-    """
-    Return the normal equations of the estimated unknowns with their priors.
-
-    ``cost`` and ``blocks`` are those of `problem.image_blocks`.
-    """
-    layout = unknowns_in_state(problem, state)
-    normal = arrow(stars_alone(blocks, problem, layout), problem, state, layout)
-    kept = estimated(layout)
-    precision, offset = layout.prior_precision[kept], layout.prior_offset[kept]
-    return NormalEquations(
-        cost + normal.cost + 0.5 * float(precision @ offset**2),
-        normal.A[np.ix_(kept, kept)] + np.diag(precision),
-        normal.a[kept] - precision * offset,
-        normal.B[:, :, kept],
-        normal.C,
-        normal.c,
-    )
 
 
 def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:

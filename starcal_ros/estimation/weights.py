@@ -56,7 +56,7 @@ from starcal_ros.estimation.tracker_errors import (
     tracker_errors,
     TrackerErrors,
 )
-from starcal_ros.estimation.unknowns import Refraction
+from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
 # Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
@@ -211,8 +211,7 @@ class Data:
     prior: CameraGeometry
     options: CalibrationOptions
     rates: Rates  # of the first star tracker in its frame
-    velocity_sigma_m_s: Floats  # (m,)
-    refraction: Refraction | None
+    assumed: Assumptions
     groups: tuple[Groups, ...]
 
 

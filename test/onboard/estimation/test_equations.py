@@ -32,7 +32,6 @@ from starcal_ros.estimation.equations import (
     stars_alone,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.problem import image_blocks
 from starcal_ros.estimation.unknowns import unknowns_in_state
 
 # Finite differences leave 1e-10 of a derivative, and attitude errors of 20 arcsec, which enter the
@@ -195,10 +194,8 @@ def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one
     given: Small, truth: Dense
 ) -> None:
     layout = unknowns_in_state(given.problem, given.state)
-    _, blocks = image_blocks(given.problem, given.state, given.measurements())
-    each = information_of_images(
-        stars_alone(blocks, given.problem, layout), given.problem, given.state, layout
-    )
+    _, sums = stars_alone(given.problem, given.state, layout, given.measurements())
+    each = information_of_images(sums, given.problem, given.state, layout)
     P = given.layout.count
     at = given.layout.of([e.name for e in layout.shared])
     for k in range(IMAGES):
@@ -214,7 +211,7 @@ def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one
         assert np.abs(difference).max() < EXACT
     # The same arrow, from the sums of the whole list.
     linear = dataclasses.replace(given.linear(), layout=layout)
-    arrow = equations(stars_alone(blocks, given.problem, layout), linear, SHAPE)
+    arrow = equations(sums, linear, SHAPE)
     size = np.diag(each.sum(axis=0))
     assert arrow.information / np.sqrt(np.outer(size, size)) == pytest.approx(
         each.sum(axis=0) / np.sqrt(np.outer(size, size)), abs=1e-9
@@ -227,8 +224,6 @@ def test_an_image_without_stars_and_star_tracker_has_no_information(given: Small
     problem = dataclasses.replace(given.problem, star_tracker_sigma_rad=sigma)
     without = dataclasses.replace(given, keep=given.keep & (given.table.image != 2))
     layout = unknowns_in_state(problem, given.state)
-    _, blocks = image_blocks(problem, given.state, without.measurements())
-    each = information_of_images(
-        stars_alone(blocks, problem, layout), problem, given.state, layout
-    )
+    _, sums = stars_alone(problem, given.state, layout, without.measurements())
+    each = information_of_images(sums, problem, given.state, layout)
     assert not each[2].any() and all(each[k].any() for k in (0, 1, 3))

@@ -11,6 +11,7 @@ from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.shared_errors import observation_groups
 from starcal_ros.estimation.tracker_errors import Rates
+from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.estimation.weights import CentroidVariance, Data, judge, Judged
 from starcal_ros.records import CameraGeometry
 
@@ -28,8 +29,7 @@ def test_residuals_that_no_star_is_left_of_say_so(off_px: float, words: str) -> 
         CameraGeometry(CAMERA, np.array([0.0, 0.0, 0.0, 1.0])),
         CalibrationOptions(variance_components=False),
         Rates(np.zeros((IMAGES, 3)), np.zeros((IMAGES, 3, 3))),
-        np.zeros(IMAGES),
-        None,
+        Assumptions(0.0, (0.0, 0.0), 0.0),
         observation_groups(table.measured_px, table.star, CAMERA.width),
     )
     before = Judged(CentroidVariance(1.0, 0.0), (), np.ones(n, bool), None)
