@@ -1,10 +1,7 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Comparison of two calibrations: parameters, alignment and lines of sight."""
 
-from __future__ import annotations
-
 import dataclasses
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -22,7 +19,7 @@ from starcal_ros.records import Calibration, CameraGeometry
 _SINGULAR = 1e-12  # smaller eigenvalues of a correlation matrix are rounding errors
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class ChiSquared:
     """A squared Mahalanobis distance and its degrees of freedom; both 0 if nothing is compared."""
 
@@ -55,7 +52,7 @@ def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
     return ChiSquared(float(scaled @ inverse @ scaled), rank)
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class DifferenceMap:
     """
     Movement of the lines of sight of a grid of pixels, in the camera frame of A.
@@ -83,7 +80,7 @@ class DifferenceMap:
         return float(known.max()), float(np.sqrt(np.mean(known**2)))
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Comparison:
     """
     Calibration B against A.

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Places that a command may write to; imports little, since ``starcal --help`` answers at once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import contextlib
 import os

@@ -5,11 +5,8 @@ The folder of products of a calibration, as the tool writes it.
 It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_calibrated.json``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 import dataclasses
-from dataclasses import dataclass, fields
 import io
 import json
 from pathlib import Path
@@ -126,7 +123,7 @@ def read_residuals(path: Path) -> Residuals:
     ((2997, 2), 2996)
     """
     with errors_as(ProductError, path):
-        names = ('format', *(field.name for field in fields(Residuals)))
+        names = ('format', *(field.name for field in dataclasses.fields(Residuals)))
         columns = read_archive(path, names)
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
@@ -137,7 +134,7 @@ def read_residuals(path: Path) -> Residuals:
     return residuals
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class NotCalibrated:
     """Why bags gave no calibration; ``cause`` and the rest as `starcal diagnose` has them."""
 

@@ -12,11 +12,8 @@ the stars do not show: its bound falls as stars are added (`forecast`).  So a fo
 nothing at random, never rises with an image, and does not depend on the order of the images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import dataclasses
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -50,7 +47,7 @@ _AT_ONCE = 32  # candidates: their rows take some 10 MB
 _TOLD = 1e-3  # of what is known of a direction: where each candidate adds less, none counts
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Target:
     """
     A sigma to lower: ``sqrt(tr(squares P) + constant) / unit``.
@@ -110,7 +107,7 @@ def expected_noise_px2(estimate: Estimate, magnitude: Floats) -> Floats:
     return np.asarray(np.exp(-np.interp(magnitude, middle, np.log(mean))))
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Prospect:
     """
     Information that c candidate images add to an estimate.
@@ -270,7 +267,7 @@ def _direction(ra_deg: float, dec_deg: float) -> Floats:
     return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Pointing:
     """+z of the camera to (ra, dec), ICRF; +x towards east, then turned about +z by the roll."""
 
@@ -285,7 +282,7 @@ class Pointing:
         return Rotation.from_euler('ZXZ', [ra + np.pi / 2, np.pi / 2 - dec, roll])
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Cone:
     """Directions within a radius of a direction, ICRF."""
 
@@ -294,7 +291,7 @@ class Cone:
     radius_deg: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Request:
     """
     Wishes and bounds of a plan.
@@ -324,7 +321,7 @@ class Request:
                 raise OptionError(f'{one}: the radius is not within 0 to 180 deg')
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Step:
     """An image to take: its pointing, the stars to expect, and the sigma to expect after it."""
 
@@ -333,7 +330,7 @@ class Step:
     sigma: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Plan:
     """
     The images to take, in order.

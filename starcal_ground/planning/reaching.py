@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The images that reach a requirement which a calibration misses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -11,7 +11,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Sequence
 import dataclasses
-from dataclasses import dataclass
 import html
 import math
 from pathlib import Path
@@ -40,7 +39,7 @@ _PALETTE = re.compile(r':root \{(.*?)\}', re.DOTALL)
 _VARIABLE = re.compile(r'--([\w-]+): (#[0-9a-f]+)')
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Drawing:
     """Elements of SVG in a view box of a height."""
 
@@ -66,7 +65,7 @@ class Drawing:
         )
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Chart:
     """A drawing with title and caption; the caption also describes it to screen readers."""
 
@@ -79,7 +78,7 @@ class Chart:
         return self.svg.document()
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Curve:
     """
     Points (n,) of a plot: joined by a line of a width unless 0, marked if it has a mark.
@@ -100,7 +99,7 @@ class Curve:
     titles: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Scale:
     """Map from the values ``low`` to ``high`` onto the view box, ``start`` to ``end``."""
 

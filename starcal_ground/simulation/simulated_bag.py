@@ -5,11 +5,8 @@ Writer of simulated scenarios: a bag, its truth, and the files to calibrate it.
 Deliberate mistakes of the set-up serve to practise their diagnosis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import dataclasses
-from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
@@ -35,7 +32,7 @@ from starcal_ros.sky.astrometry import earth_velocity_c
 _AXIS = (0.8, 0.6, 0.0)  # axis of the alignment error, perpendicular to the line of sight
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Mistakes:
     """
     Mistakes of a bag and its parameter file; none by default.
@@ -116,7 +113,7 @@ ATTITUDE_TOPIC = '/star_tracker/attitude'
 VELOCITY_TOPIC = '/spacecraft/velocity'
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class SimulatedBag:
     """Paths of a simulated bag, its truth, and the parameter and camera files to calibrate it."""
 

@@ -20,8 +20,6 @@ C represent the whole camera, as do the tables of starcal lookup.
   starcal export newer --to c --table -o uplink
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable
 import math

@@ -6,11 +6,8 @@ With its origin they are the comment of an exported file.  Names and reasons hol
 comment, and each text in a format without escapes, passes `ascii_line`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +25,7 @@ Files = Mapping[str, str | bytes | Callable[[Path], None]]
 GRID = 25  # pixels a side, as in the fits of `camera`
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Loss:
     """
     A part of a calibration that a format cannot hold.
@@ -41,7 +38,7 @@ class Loss:
     cost_px: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Content:
     """
     Files of an export: content by name, or a function that writes the file to a path.

@@ -1,11 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A bag of images and telemetry of a mission, and a parameter file to calibrate it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
-from dataclasses import dataclass
 import heapq
 from itertools import repeat
 import json
@@ -38,7 +35,7 @@ _MARGIN_NS = 60 * NANOSECONDS_PER_SECOND  # for an offset of the stamps of the c
 _COARSE = 1 / 3  # step of the pixel values over their noise from which centroids lose accuracy
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Prior:
     """
     The camera file and alignments of a calibration of the bag.
@@ -56,7 +53,7 @@ def frame_name(frame: str) -> str:
     return name if name[:1].isalpha() else f'star_tracker_{name.strip("_")}'
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Recorded:
     """Paths of a bag that was written, and notes: one line for each thing to know of it."""
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 import contextlib
 import dataclasses
-from dataclasses import dataclass, field
 import errno
 import functools
 import hashlib
@@ -61,7 +60,7 @@ _SETTINGS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Task:
     """
     A calibration file to read, or a bag to calibrate.
@@ -176,7 +175,7 @@ def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
     return bags
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Cameras:
     """
     Which camera a path below the root belongs to, and the parameters of that camera.
@@ -232,7 +231,7 @@ def read_cameras(pattern: str, params: str) -> Cameras:
     )
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Answer:
     """
     The row that a task gives, and ``calibration.json`` of a bag.
@@ -312,7 +311,7 @@ def _mean_temperature(records: Sequence[StarObservations]) -> float:
     return float(np.mean(known)) if len(known) else math.nan
 
 
-@dataclass
+@dataclasses.dataclass
 class Done:
     """
     How many tasks were computed, failed, or have a row in the table.
@@ -324,7 +323,7 @@ class Done:
     computed: int = 0
     failed: int = 0
     known: int = 0
-    unreachable: list[str] = field(default_factory=list)
+    unreachable: list[str] = dataclasses.field(default_factory=list)
     silent: int = 0
 
     def count(self, table: trend_table.Table, task: Task, answer: Answer) -> None:
