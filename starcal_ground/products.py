@@ -15,17 +15,15 @@ import numpy as np
 import yaml
 
 from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages.record_messages import camera_info_fields
-from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
-from starcal_ros.record_fields import json_object, plain_record, read_record
+from starcal_ros.formats.products import camera_yaml, product_files
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
-from starcal_ros.untrusted import json_value, read_archive
 
 OBSERVATIONS_TOPIC = '/observations'
 CAMERA_INFO_FILE = 'camera_info.yaml'
@@ -46,7 +44,7 @@ def write_products(
 ) -> None:
     """Write a calibration, its camera and residuals, if given; raises ProductError."""
     product_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
-    name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
+    name = calibration.provenance.get('camera_name', camera_yaml.DEFAULT_CAMERA_NAME)
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
     if residuals is not None:
         write_residuals(residuals, folder / RESIDUALS_FILE)
@@ -54,7 +52,7 @@ def write_products(
 
 
 def write_camera_info(
-    camera: CameraModel, path: Path, camera_name: str = DEFAULT_CAMERA_NAME
+    camera: CameraModel, path: Path, camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
 ) -> None:
     """
     Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
@@ -108,7 +106,7 @@ def write_observations(
 def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
-    np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **plain_record(residuals))
+    np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **record_fields.plain_record(residuals))
     product_files.write_atomically(path, memory.getvalue())
 
 
@@ -124,11 +122,11 @@ def read_residuals(path: Path) -> Residuals:
     """
     with errors_as(ProductError, path):
         names = ('format', *(field.name for field in dataclasses.fields(Residuals)))
-        columns = read_archive(path, names)
+        columns = untrusted.read_archive(path, names)
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
     with errors_as(ProductError, path):
-        residuals = read_record(Residuals, columns)
+        residuals = record_fields.read_record(Residuals, columns)
     if (residuals.image >= len(residuals.image_time_ns)).any():
         raise ProductError(f'{path}: image names images that are not there')
     return residuals
@@ -149,7 +147,7 @@ class NotCalibrated:
 
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """Write the record of a failure and remove earlier products; raises ProductError."""
-    content = {'calibrated': False, **json_object(record)}
+    content = {'calibrated': False, **record_fields.json_object(record)}
     product_files.write_atomically(
         folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n'
     )
@@ -165,7 +163,7 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
         return None
     content = product_files.read_json(path)
     try:
-        return read_record(NotCalibrated, content)
+        return record_fields.read_record(NotCalibrated, content)
     except ValueError as error:
         raise ProductError(f'{path}: not a record of a failure: {error}') from error
 
@@ -175,7 +173,7 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
     camera = calibration.geometry.camera
     count = len(camera.parameters)
     try:
-        numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
+        numbers = np.array(untrusted.json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
         camera = dataclasses.replace(camera, parameters=numbers[:count])

@@ -18,8 +18,7 @@ from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import campaign
-from starcal_ros.pipeline.solve import inputs_of
+from starcal_ros.pipeline import campaign, solve
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 
@@ -56,7 +55,7 @@ def digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
     with ThreadPoolExecutor(1, 'digests') as thread:
         stopped = threading.Event()
         try:
-            yield thread.submit(inputs_of, files, stopped.is_set).result
+            yield thread.submit(solve.inputs_of, files, stopped.is_set).result
         finally:
             stopped.set()
 

@@ -12,12 +12,10 @@ import numpy as np
 from starcal_ground.file_kinds import explained
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.frames import read_ahead
-from starcal_ros.formats.bag.reader import Damage
+from starcal_ros.formats.bag import frames, reader
 from starcal_ros.formats.messages import message_codec, sensor_messages
+from starcal_ros.pipeline import campaign, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.campaign import ThroughAir
 from starcal_ros.pipeline.diagnosis import bags
 from starcal_ros.pipeline.diagnosis.bags import Refused
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
@@ -93,7 +91,7 @@ def inspect(
     given: bag_topics.Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
-    through_air: ThroughAir | None = None,
+    through_air: campaign.ThroughAir | None = None,
     problem: str = '',
 ) -> Inspection:
     """
@@ -118,9 +116,7 @@ def inspect(
                 bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given)),
             )
         if setup:
-            from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
-
-            source = source_of(paths, setup, given, through_air)
+            source = campaign.source_of(paths, setup, given, through_air)
             chosen, setup, notes = source.topics, source.setup, source.notes
             records = bag_topics.read(paths, chosen, setup)
         elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:
@@ -140,8 +136,6 @@ def inspect(
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
     if setup and chosen:
-        from starcal_ros.pipeline import solve
-
         status = solve.ensemble_status(solve.ensemble_of(seen, setup), setup)
     if chosen and problems in ([], [problem]):
         problems += _shortages(used, status)
@@ -168,13 +162,13 @@ def inspect(
     )
 
 
-def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, ...]:
+def _contents(paths: Sequence[Path], on_damage: reader.Damage) -> tuple[TopicContent, ...]:
     """Statistics of every topic, sorted by name, from one pass over the files."""
     type_names: dict[str, str] = {}
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
     bad: Counter[str] = Counter()
-    for raw in read_ahead(reader.read_raw(paths, on_damage=on_damage)):
+    for raw in frames.read_ahead(reader.read_raw(paths, on_damage=on_damage)):
         type_names[raw.topic] = raw.type_name
         stamp_ns = raw.log_time_ns
         if raw.type_name in _STAMPED:

@@ -16,9 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 import yaml
 
+from starcal_ground import outputs, products
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.outputs import check_outputs
-from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
@@ -191,7 +190,7 @@ def write_bag(
         beside = _BESIDE
     truth, params, camera, table = (writer.file.with_name(name) for name in beside)
     tables = [] if scenario.table is None else [table]
-    check_outputs((*writer.outputs(), truth, params, camera, *tables))
+    outputs.check_outputs((*writer.outputs(), truth, params, camera, *tables))
     length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0
     turn_rad = length_px / float(scenario.truth.camera.parameters[0])
     scenario = dataclasses.replace(
@@ -220,7 +219,7 @@ def write_bag(
             on_image(index)
         # Just before the bag replaces an older one, so that all files are replaced together.
         write_atomically(truth, truth_text)
-        write_camera_info(scenario.prior.camera, camera, 'opnav')
+        products.write_camera_info(scenario.prior.camera, camera, 'opnav')
         if scenario.table is not None:
             write_atomically(table, scenario.table)
         write_atomically(params, text)

@@ -23,11 +23,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_table, print_text
+from starcal_ground.cli import arguments, terminal
+from starcal_ros import errors, text
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import ProductError
-from starcal_ros.text import p_value_text, significant, to_sigma
 
 if TYPE_CHECKING:
     from starcal_ground.comparison import Comparison, DifferenceMap
@@ -59,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_comparison(result)
         if args.output:
-            print_text(f'figure written to {args.output}')
+            terminal.print_text(f'figure written to {args.output}')
     return arguments.EXIT_ACCEPTED
 
 
@@ -71,10 +69,10 @@ def print_comparison(comparison: Comparison) -> None:
     rows = [
         (
             name,
-            to_sigma(of_a[name], sigma[k]) if name in of_a else '',
-            to_sigma(b.parameters[k], sigma[k]),
-            to_sigma(difference[k], sigma[k], '+'),
-            significant(sigma[k], 2) if sigma[k] else 'held',
+            text.to_sigma(of_a[name], sigma[k]) if name in of_a else '',
+            text.to_sigma(b.parameters[k], sigma[k]),
+            text.to_sigma(difference[k], sigma[k], '+'),
+            text.significant(sigma[k], 2) if sigma[k] else 'held',
             _sigmas(difference[k], sigma[k]),
         )
         for k, name in enumerate(b.parameter_names)
@@ -85,8 +83,8 @@ def print_comparison(comparison: Comparison) -> None:
         for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
         if comparison.is_aligned
     ]
-    print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
-    print_table(
+    terminal.print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
+    terminal.print_table(
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [
             *[('as calibrated', *_map_cells(comparison.before))] * comparison.is_aligned,
@@ -94,17 +92,17 @@ def print_comparison(comparison: Comparison) -> None:
         ],
     )
     if comparison.is_aligned:
-        print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
+        terminal.print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
     else:
-        print_text('alignment: not in both, so the cameras alone are compared')
+        terminal.print_text('alignment: not in both, so the cameras alone are compared')
     total = comparison.total
     if total.degrees_of_freedom:
-        print_text(
+        terminal.print_text(
             f'all parameters  chi2 {total.value:.1f}, {total.degrees_of_freedom} degrees of '
-            f'freedom, p-value {p_value_text(total.p_value)}'
+            f'freedom, p-value {text.p_value_text(total.p_value)}'
         )
     for note in comparison.notes:
-        print_text(f'note: {note}')
+        terminal.print_text(f'note: {note}')
 
 
 def _map_cells(difference: DifferenceMap) -> Sequence[str]:
@@ -130,11 +128,11 @@ def _truth_of(path: Path, like: Calibration) -> Calibration | None:
 
     try:
         content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
-    except (ProductError, ValueError):
+    except (errors.ProductError, ValueError):
         return None
     if not (isinstance(content, dict) and 'k_true' in content):
         return None
     try:
         return truth_like(like, true_geometry(content))
     except (ValueError, KeyError, TypeError) as error:
-        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
+        raise errors.ProductError(f'{path}: not the truth of a simulated bag: {error}') from error

@@ -64,21 +64,24 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground import outputs, products
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
-    from starcal_ground.outputs import make_folder
-    from starcal_ground.products import OBSERVATIONS_TOPIC
     from starcal_ros.formats.bag.reader import read_observations
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
-    calibration = read_calibration(calibration_file(args.calibration))
+    file = calibration_file(args.calibration)
+    calibration = read_calibration(file)
     names = None
     if args.spacecraft_id is not None:
         names = arguments.record_of(SpiceNames, args)
-    make_folder(args.output)
+    outputs.make_folder(args.output)
     observations: Iterable[StarObservations] = ()
     if args.to == 'ck':
-        observations = read_observations([_observations_of(args.calibration)], OBSERVATIONS_TOPIC)
+        recorded = file.with_name(outputs.OBSERVATIONS_FILE)
+        if not recorded.exists():
+            raise OptionError(f'--to ck: needs {recorded} with the stars of the images')
+        observations = read_observations([recorded], products.OBSERVATIONS_TOPIC)
     done = export(
         *(calibration, args.to, args.output, names, args.table, observations, args.kernels)
     )
@@ -96,13 +99,3 @@ def run(args: argparse.Namespace) -> int:
     for loss in done.losses:
         terminal.print_text(f'left out: {loss.part}, {significant(loss.cost_px, 3)} px alone')
     return arguments.EXIT_ACCEPTED
-
-
-def _observations_of(calibration: Path) -> Path:
-    from starcal_ground.outputs import OBSERVATIONS_FILE
-    from starcal_ros.formats.products.product_files import calibration_file
-
-    path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)
-    if not path.exists():
-        raise OptionError(f'--to ck: needs {path} with the stars of the images')
-    return path

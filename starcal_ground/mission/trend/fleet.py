@@ -26,8 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import outputs
-from starcal_ground.file_kinds import explained
+from starcal_ground import file_kinds, outputs
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ground.outputs import OBSERVATIONS_FILE
 from starcal_ros import untrusted
@@ -289,7 +288,7 @@ def _answer(task: Task, path: Path) -> Answer:
         cause = error.__cause__
         if isinstance(cause, OSError):
             raise cause from error
-        said = explained(error) if isinstance(error, StarcalError) else str(error)
+        said = file_kinds.explained(error) if isinstance(error, StarcalError) else str(error)
         return failed(task, said.replace(str(path), task.url))
 
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from starcal_ground.mission.trend import series as trends
 from starcal_ground.mission.trend.trend_table import Row
-from starcal_ground.report import svg
-from starcal_ground.report.page import page_template
+from starcal_ground.report import page, svg
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.formats.products.product_files import write_atomically
@@ -78,7 +77,7 @@ def write_page(
             times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
     lines.sort(key=lambda line: not line[0].needs_attention)
-    text = page_template('trend.html').render(
+    text = page.page_template('trend.html').render(
         root=printable(root),
         lines=[(overview, *line) for overview, line in lines] if len(lines) > 1 else (),
         attention=sum(overview.needs_attention for overview, _ in lines),
