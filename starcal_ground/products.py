@@ -1,25 +1,28 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The folder of products of a calibration, as the tool writes it.
+The folder of products of a calibration, as the tool writes it, and places that may be written to.
 
-It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_calibrated.json``.
+The folder holds ``residuals.npz`` and, in place of a calibration that failed,
+``not_calibrated.json``.
 """
 
 from collections.abc import Iterable, Mapping
+import contextlib
 import dataclasses
 import io
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
 from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.files import is_marked
 from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
@@ -27,6 +30,7 @@ from starcal_ros.records import Calibration, CameraGeometry, check_drawable, Sta
 
 OBSERVATIONS_TOPIC = '/observations'
 CAMERA_INFO_FILE = 'camera_info.yaml'
+OBSERVATIONS_FILE, REPORT_FILE = 'observations.mcap', 'report.html'
 RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
     product_files.CALIBRATION_FILE,
@@ -183,3 +187,51 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         return prior
     except (KeyError, ValueError, TypeError, OverflowError):
         return None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it where they are not there; raises ProductError."""
+    with errors_as(ProductError, path, 'created'):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
+    """
+    Check that a command may write its files: none is an input, and each is new or was its own.
+
+    Its own is a file that starcal wrote and nothing changed since.  Raises ProductError naming the
+    first file that would be replaced and the remedy.
+    """
+    inputs = tuple(inputs)
+    for path in outputs:
+        if same_as_one_of(path, inputs):
+            raise ProductError(
+                f'{path}: is an input of this command and would be replaced; choose another '
+                'place (-o)'
+            )
+        if os.path.isdir(path):
+            raise ProductError(f'{path}: is a folder, where a file is written; give another name')
+        if os.path.lexists(path) and not _is_own(path):
+            raise ProductError(
+                f'{path}: was not written by starcal, or was changed or copied since (or its file'
+                ' system keeps no extended attributes): give another name or remove it'
+            )
+
+
+def _is_own(path: Path) -> bool:
+    with contextlib.suppress(OSError, ValueError), untrusted.regular_file(path, False) as file:
+        return is_marked(file)
+    return False
+
+
+def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
+    """True if a path names the same file, by whatever name, as one of the others."""
+    try:
+        own = path.stat()
+    except OSError:
+        return False  # there is no such file
+    for other in others:
+        with contextlib.suppress(OSError):
+            if os.path.samestat(own, other.stat()):
+                return True
+    return False

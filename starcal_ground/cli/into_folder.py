@@ -8,10 +8,10 @@ import dataclasses
 from pathlib import Path
 import threading
 
-from starcal_ground import outputs, products
+from starcal_ground import products
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
-from starcal_ground.planning.reaching import with_images_to_reach
+from starcal_ground.planning.plan import with_images_to_reach
 from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
@@ -29,11 +29,11 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
     Raises OptionError or ProductError naming the folder or the file.
     """
     bag_files = reader.files_of_bags(bags)
-    if outputs.same_as_one_of(folder, [file.parent for file in bag_files]):
+    if products.same_as_one_of(folder, [file.parent for file in bag_files]):
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
     written = [folder / name for name in (*products.PRODUCT_FILES, products.NOT_CALIBRATED_FILE)]
     pictures = thumbnails.thumbnails_in(folder / thumbnails.THUMBNAILS_FOLDER)
-    outputs.check_outputs((*written, *pictures), (*bag_files, *files))
+    products.check_outputs((*written, *pictures), (*bag_files, *files))
 
 
 @contextlib.contextmanager
@@ -44,7 +44,7 @@ def failure_recorded(
     try:
         yield
     except kind as error:
-        outputs.make_folder(folder)
+        products.make_folder(folder)
         look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
         raise type(error)(f'{error}{look}') from error
 
@@ -82,7 +82,7 @@ def calibrate_into(
         observed = campaign.observe(source, selection, show, advance)
     if selection is not None and not observed.observations:
         raise OptionError(selection.without_images())
-    outputs.make_folder(folder)
+    products.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     products.write_observations(observed.observations, folder, source.setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
@@ -95,7 +95,7 @@ def calibrate_into(
             pictures = thumbnails.ordered(drawn.result())
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
     products.write_products(made.calibration, folder, made.residuals)
-    page, report, path = '', '', folder / outputs.REPORT_FILE
+    page, report, path = '', '', folder / products.REPORT_FILE
     if with_report:
         with drawings.kind('report'):
             page, report = _drawn(made, pictures, folder)
@@ -144,7 +144,7 @@ def _drawn(
     except ModuleNotFoundError as error:
         return '', f'no report: {missing_package(error)}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
-    return page.render(content, folder), f'look at {folder / outputs.REPORT_FILE}'
+    return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
 
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:

@@ -21,9 +21,10 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.assessment import gate
 from starcal_ros.assessment.budget import mean_squares
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
@@ -33,10 +34,11 @@ from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
+from starcal_ros.pipeline.campaign import Campaign
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
 from starcal_ros.processes import one_blas_thread
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import Ensemble, GateCheck, StarObservations
 from starcal_ros.text import significant
 
 MAP, LINE_OF_SIGHT = 'map', 'line_of_sight'
@@ -458,3 +460,51 @@ def _expected(
         # A camera at rest, where the rates of the images are known.
         star_tracker_rate_rad_s=0.0 * last.star_tracker_rate_rad_s,
     )
+
+
+_MOST_IMAGES = 20  # that reach a requirement
+_LISTED = 2  # pointings in a sentence
+
+
+def with_images_to_reach(campaign: Campaign) -> Campaign:
+    """
+    A campaign whose missed requirements have the next images in the note of their check.
+
+    The sigma that a plan lowers is an RMS: a requirement over a share falls in proportion.
+    """
+    wanted = iter(gate.requirements_of(campaign.setup.gate.requirements))
+    checks = tuple(
+        _planned(campaign, next(wanted).quantity, one) if one.option == gate.REQUIREMENTS else one
+        for one in campaign.calibration.gate
+    )
+    if checks == campaign.calibration.gate:
+        return campaign
+    reasons = gate.reasons_of(checks)
+    calibration = dataclasses.replace(campaign.calibration, gate=checks, reasons=reasons)
+    return dataclasses.replace(campaign, calibration=calibration)
+
+
+def _planned(campaign: Campaign, quantity: str, check: GateCheck) -> GateCheck:
+    if not check.found > check.limit:
+        return check
+    minimise = {gate.POINTING: LINE_OF_SIGHT, gate.FOCAL: 'fx'}.get(quantity, quantity)
+    try:
+        request = Request(_MOST_IMAGES, minimise)
+        plan = plan_pointings(campaign.ensemble, campaign.setup, request)
+    except (StarcalError, np.linalg.LinAlgError):  # not estimated, or no image shows a star
+        return check
+    scale = check.found / plan.sigma
+    enough = [k for k, step in enumerate(plan.steps, 1) if scale * step.sigma <= check.limit]
+    if not enough:
+        last = significant(scale * plan.steps[-1].sigma, 2)
+        unit = check.unit and f' {check.unit}'
+        words = f'{len(plan.steps)} more images reach {last}{unit}'
+    else:
+        count = enough[0]
+        words = f'{count} more image{"s reach" if count > 1 else " reaches"} it'
+        places = '; '.join(
+            f'RA {place.ra_deg:.1f}, Dec {place.dec_deg:+.1f}, roll {place.roll_deg:.0f}'
+            for place in (step.pointing for step in plan.steps[:count])
+        )
+        words += f', at {places} degrees' if count <= _LISTED else ' (starcal plan)'
+    return dataclasses.replace(check, note=f'{check.note}; {words}')

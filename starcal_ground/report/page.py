@@ -21,7 +21,7 @@ import jinja2
 from markupsafe import Markup
 import numpy as np
 
-from starcal_ground import outputs, products
+from starcal_ground import products
 from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
 from starcal_ground.report.thumbnails import Thumbnail
 from starcal_ros.assessment.predictions import Residuals
@@ -240,7 +240,7 @@ def write_report(folder: Path) -> Path:
     failure = products.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
-    path = folder / outputs.REPORT_FILE
+    path = folder / products.REPORT_FILE
     product_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
@@ -248,7 +248,7 @@ def write_report(folder: Path) -> Path:
 def _read_folder(folder: Path) -> Found:
     residuals = folder / products.RESIDUALS_FILE
     observations, ensemble = (
-        folder / outputs.OBSERVATIONS_FILE,
+        folder / products.OBSERVATIONS_FILE,
         folder / product_files.STATE_ENSEMBLE,
     )
     calibration = product_files.read_calibration(product_files.calibration_file(folder))
@@ -292,7 +292,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     written = [
         name
         for name in products.PRODUCT_FILES
-        if name != outputs.REPORT_FILE and (folder / name).is_file()
+        if name != products.REPORT_FILE and (folder / name).is_file()
     ]
     return {
         'calibration': calibration,
@@ -362,7 +362,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
         for reason, count in record.images_refused.items()
     ]
     text = page_template('failure.html').render(record=record, pictures=pictures, refused=refused)
-    path = folder / outputs.REPORT_FILE
+    path = folder / products.REPORT_FILE
     product_files.write_atomically(path, text)
     return path
 

@@ -10,7 +10,7 @@ import re
 import cv2
 import numpy as np
 
-from starcal_ground.outputs import make_folder
+from starcal_ground.products import make_folder
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.formats.products.product_files import write_atomically

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 import yaml
 
-from starcal_ground import outputs, products
+from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
@@ -190,7 +190,7 @@ def write_bag(
         beside = _BESIDE
     truth, params, camera, table = (writer.file.with_name(name) for name in beside)
     tables = [] if scenario.table is None else [table]
-    outputs.check_outputs((*writer.outputs(), truth, params, camera, *tables))
+    products.check_outputs((*writer.outputs(), truth, params, camera, *tables))
     length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0
     turn_rad = length_px / float(scenario.truth.camera.parameters[0])
     scenario = dataclasses.replace(

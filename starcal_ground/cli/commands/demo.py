@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from starcal_ground import comparison, outputs, products
+    from starcal_ground import comparison, products
     from starcal_ground.cli.commands.compare import print_comparison
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
     from starcal_ground.report import page
@@ -50,10 +50,10 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
 
-    outputs.make_folder(args.output)
+    products.make_folder(args.output)
     bag = tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
-    outputs.check_outputs(node_processes.outputs(args.output))
+    products.check_outputs(node_processes.outputs(args.output))
     terminal.print_text(f'bag {bag.bag}; log files and products in {args.output}')
     with terminal.progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = node_processes.calibrate_with_nodes(

@@ -64,7 +64,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground import outputs, products
+    from starcal_ground import products
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
     from starcal_ros.formats.bag.reader import read_observations
@@ -75,10 +75,10 @@ def run(args: argparse.Namespace) -> int:
     names = None
     if args.spacecraft_id is not None:
         names = arguments.record_of(SpiceNames, args)
-    outputs.make_folder(args.output)
+    products.make_folder(args.output)
     observations: Iterable[StarObservations] = ()
     if args.to == 'ck':
-        recorded = file.with_name(outputs.OBSERVATIONS_FILE)
+        recorded = file.with_name(products.OBSERVATIONS_FILE)
         if not recorded.exists():
             raise OptionError(f'--to ck: needs {recorded} with the stars of the images')
         observations = read_observations([recorded], products.OBSERVATIONS_TOPIC)

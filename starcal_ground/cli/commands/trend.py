@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.mission.trend import fleet, places, trend_page
     from starcal_ground.mission.trend.fleet import find, read_cameras
     from starcal_ground.mission.trend.trend_table import Table
-    from starcal_ground.outputs import check_outputs, make_folder
+    from starcal_ground.products import check_outputs, make_folder
 
     root, cameras = places.absolute(args.root), read_cameras(args.cameras, args.params)
     if places.is_remote(args.output):

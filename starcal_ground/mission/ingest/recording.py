@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from starcal_ground import outputs
+from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import photographs
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
@@ -101,9 +101,9 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     """
     record, params, copied = _files_beside(bag)
     prior = [params] if camera else []
-    if camera and not outputs.same_as_one_of(copied, [camera]):
+    if camera and not products.same_as_one_of(copied, [camera]):
         prior.append(copied)
-    outputs.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
+    products.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
 
 
 def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
@@ -291,6 +291,6 @@ def _prior_files(
         values['saturation_dn'] = (min(saturation) - scale.offset) / scale.step
     content = {'/**': {'ros__parameters': values}}
     texts = {params: yaml.safe_dump(content, sort_keys=False, default_flow_style=None)}
-    if not outputs.same_as_one_of(copied, [prior.camera]):
+    if not products.same_as_one_of(copied, [prior.camera]):
         texts[copied] = product_files.read_text(prior.camera, PARAMETER_BYTES)
     return texts

@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import file_kinds, outputs
+from starcal_ground import file_kinds, products
 from starcal_ground.mission.trend import places, trend_table
-from starcal_ground.outputs import OBSERVATIONS_FILE
+from starcal_ground.products import OBSERVATIONS_FILE
 from starcal_ros import untrusted
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.bag import reader
@@ -335,7 +335,7 @@ class Done:
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
-            outputs.make_folder(folder)
+            products.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error
