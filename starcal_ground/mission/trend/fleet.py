@@ -46,7 +46,6 @@ KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
-_TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
 MOST_SILENT = 5  # files in turn that a store does not give, before it is asked if it answers
 _CONNECT_S = 10.0
@@ -216,18 +215,15 @@ def read_cameras(pattern: str, params: str) -> Cameras:
         return Cameras(params=params)
     start = pattern[: pattern.rfind('}') + 1]
     start += pattern[len(start) :].partition('/')[0]
-    expression, names = '', []
-    for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
-        if other or (name and name not in _KEYS) or name in names:
-            break
-        names += [name] if name else []
-        expression += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
-    else:
-        if names:
-            return Cameras(re.compile(f'{expression}(?:/|$)'), params)
-    raise OptionError(
-        f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and {{camera}}'
-    )
+    expression = re.escape(start.removeprefix('./')).replace(r'\*', '[^/]*')
+    for key in _KEYS:
+        expression = expression.replace(rf'\{{{key}\}}', f'(?P<{key}>[^/]+?)', 1)
+    if '(?P' not in expression or re.search(r'\\[{}]', expression):
+        raise OptionError(
+            f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and'
+            ' {camera}'
+        )
+    return Cameras(re.compile(f'{expression}(?:/|$)'), params)
 
 
 @dataclasses.dataclass(frozen=True)
