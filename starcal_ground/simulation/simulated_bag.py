@@ -18,15 +18,18 @@ import yaml
 
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.comparison import truth_like
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
-from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.records import AttitudeSample, CameraGeometry, Image
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.records import AttitudeSample, Calibration, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
+from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 
 _AXIS = (0.8, 0.6, 0.0)  # axis of the alignment error, perpendicular to the line of sight
 
@@ -161,6 +164,24 @@ def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
     camera = CameraModel(content['width'], content['height'], parameters, model)
     star_tracker_from_camera = Rotation.from_matrix(np.array(content['A_true']).T)
     return CameraGeometry(camera, star_tracker_from_camera.as_quat())
+
+
+def read_truth(path: Path, like: Calibration) -> Calibration | None:
+    """
+    The truth of a simulated bag as a calibration like another one; None for another file.
+
+    Raises ProductError when it is damaged.
+    """
+    try:
+        content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
+    except (ProductError, ValueError):
+        return None
+    if not (isinstance(content, dict) and 'k_true' in content):
+        return None
+    try:
+        return truth_like(like, true_geometry(content))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
 
 
 def write_bag(

@@ -20,16 +20,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros import errors, text
+from starcal_ros import text
 from starcal_ros.constants import ARCSECOND_RAD
 
 if TYPE_CHECKING:
     from starcal_ground.comparison import Comparison, DifferenceMap
-    from starcal_ros.records import Calibration
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -42,11 +40,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import comparison
+    from starcal_ground.simulation.simulated_bag import read_truth
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     files = [calibration_file(path) for path in (args.a, args.b)]
     a = read_calibration(files[0])
-    result = comparison.compare(a, _truth_of(files[1], a) or read_calibration(files[1]))
+    result = comparison.compare(a, read_truth(files[1], a) or read_calibration(files[1]))
     if args.output:
         from starcal_ground.report.detector_figures import write_comparison
 
@@ -113,26 +112,3 @@ def _map_cells(difference: DifferenceMap) -> Sequence[str]:
 
 def _sigmas(difference: float, sigma: float) -> str:
     return f'{difference / sigma:+.1f}' if sigma > 0 else ''
-
-
-def _truth_of(path: Path, like: Calibration) -> Calibration | None:
-    """
-    The truth of a simulated bag, as ``starcal simulate`` writes it; None for another file.
-
-    Raises ProductError when it is damaged.
-    """
-    from starcal_ground.comparison import truth_like
-    from starcal_ground.simulation.simulated_bag import true_geometry
-    from starcal_ros.formats.products.product_files import read_text
-    from starcal_ros.untrusted import json_value, PRODUCT_BYTES
-
-    try:
-        content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
-    except (errors.ProductError, ValueError):
-        return None
-    if not (isinstance(content, dict) and 'k_true' in content):
-        return None
-    try:
-        return truth_like(like, true_geometry(content))
-    except (ValueError, KeyError, TypeError) as error:
-        raise errors.ProductError(f'{path}: not the truth of a simulated bag: {error}') from error

@@ -21,17 +21,12 @@ C represent the whole camera, as do the tables of starcal lookup.
 """
 
 import argparse
-from collections.abc import Iterable
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
-
-if TYPE_CHECKING:
-    from starcal_ros.records import StarObservations
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -76,12 +71,10 @@ def run(args: argparse.Namespace) -> int:
     if args.spacecraft_id is not None:
         names = arguments.record_of(SpiceNames, args)
     products.make_folder(args.output)
-    observations: Iterable[StarObservations] = ()
-    if args.to == 'ck':
-        recorded = file.with_name(products.OBSERVATIONS_FILE)
-        if not recorded.exists():
-            raise OptionError(f'--to ck: needs {recorded} with the stars of the images')
-        observations = read_observations([recorded], products.OBSERVATIONS_TOPIC)
+    recorded = [file.with_name(products.OBSERVATIONS_FILE)] if args.to == 'ck' else []
+    if recorded and not recorded[0].exists():
+        raise OptionError(f'--to ck: needs {recorded[0]} with the stars of the images')
+    observations = read_observations(recorded, products.OBSERVATIONS_TOPIC)
     done = export(
         *(calibration, args.to, args.output, names, args.table, observations, args.kernels)
     )
