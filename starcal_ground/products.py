@@ -77,8 +77,13 @@ def write_camera_info(
         'rectification_matrix': _matrix(3, info['r']),
         'projection_matrix': _matrix(3, info['p']),
     }
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    product_files.write_atomically(path, text)
+    product_files.write_atomically(path, yaml_text(content))
+
+
+def yaml_text(content: object) -> str:
+    """YAML of an object in its order, each list of numbers in one line."""
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    return text
 
 
 def _matrix(rows: int, values: Floats) -> dict[str, object]:

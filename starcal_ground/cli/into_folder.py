@@ -149,21 +149,18 @@ def _drawn(
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ground.planning.inspect import of_a_failure
-    from starcal_ros.pipeline.diagnosis.bags import of_refusals, refusals
+    from starcal_ground.planning.inspect import cause_of
+    from starcal_ros.pipeline.diagnosis.bags import refusals
 
     source, count = observed.source, len(observed.observations)
     groups = refusals(observed.observations)
     refused = {group.reason: group.count for group in groups}
-    is_none_used = sum(refused.values()) == count
-    if count and is_none_used:
+    if count and sum(refused.values()) == count:
         words = f'no image of {count} can be used'
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
     named = tuple(map(str, source.bags))
-    cause = of_refusals(groups, count)
-    if source.topics.image and is_none_used:
-        cause = of_a_failure(source.bags, source.topics, source.setup, groups)
+    cause = cause_of(source.bags, source.topics, source.setup, groups, count)
     if cause is None:
         return NotCalibrated(words, named, refused)
     command = 'starcal diagnose' if source.through_air is None else ''

@@ -140,8 +140,8 @@ def inspect(
     if chosen and problems in ([], [problem]):
         problems += _shortages(used, status)
     if chosen and seen and not used:
-        command = '' if by_stars else 'starcal diagnose'
-        problems += _causes(paths, chosen, setup, bags.refusals(seen), command)
+        cause = cause_of(paths, chosen, setup, bags.refusals(seen), len(seen))
+        problems += [cause.in_a_sentence('' if by_stars else 'starcal diagnose')] if cause else []
     return Inspection(
         bags=tuple(map(str, paths)),
         topics=topics,
@@ -217,25 +217,16 @@ def _kind(message: message_codec.Message) -> str:
     return f'{"PNG" if png else "JPEG"} {header.width} x {header.height}'
 
 
-def _causes(
+def cause_of(
     paths: Sequence[Path],
-    chosen: bag_topics.Topics,
+    requested: bag_topics.Topics,
     setup: Setup | None,
     refused: Sequence[Refused],
-    command: str,
-) -> list[str]:
-    """The cause for which all images are refused, in a sentence; ``command`` gives details."""
-    if setup and not chosen.observations:
-        cause = of_a_failure(paths, chosen, setup, refused)
-    else:
-        cause = bags.of_refusals(refused, sum(group.count for group in refused))
-    return [cause.in_a_sentence(command)] if cause else []
-
-
-def of_a_failure(
-    paths: Sequence[Path], requested: bag_topics.Topics, setup: Setup, refused: Sequence[Refused]
+    images: int,
 ) -> Diagnosis | None:
-    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
+    """The cause for which images are refused, by a diagnosis where all are; None: none is."""
+    if setup is None or not requested.image or sum(group.count for group in refused) < images:
+        return bags.of_refusals(refused, images)
     try:
         diagnosis = bags.diagnose_bags(paths, requested, setup, refused)
     except BagError:

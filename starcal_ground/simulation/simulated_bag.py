@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-import yaml
 
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
@@ -224,7 +223,6 @@ def write_bag(
             'magnitude_limit': scenario.magnitude_limit,
             'prior_alignment_sigma_deg': math.degrees(synthetic.MOUNTING_SIGMA_RAD),
         }
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
     true = truth_content(scenario, writer.file.name)
     if mistakes != NO_MISTAKES:
         true['mistakes'] = dataclasses.asdict(mistakes)
@@ -243,7 +241,7 @@ def write_bag(
         products.write_camera_info(scenario.prior.camera, camera, 'opnav')
         if scenario.table is not None:
             write_atomically(table, scenario.table)
-        write_atomically(params, text)
+        write_atomically(params, products.yaml_text(content))
     return SimulatedBag(path, truth, params, camera)
 
 

@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import yaml
 
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
@@ -290,7 +289,7 @@ def _prior_files(
     if saturation:
         values['saturation_dn'] = (min(saturation) - scale.offset) / scale.step
     content = {'/**': {'ros__parameters': values}}
-    texts = {params: yaml.safe_dump(content, sort_keys=False, default_flow_style=None)}
+    texts = {params: products.yaml_text(content)}
     if not products.same_as_one_of(copied, [prior.camera]):
         texts[copied] = product_files.read_text(prior.camera, PARAMETER_BYTES)
     return texts
