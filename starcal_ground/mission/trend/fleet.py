@@ -28,8 +28,7 @@ import numpy as np
 
 from starcal_ground import file_kinds, products
 from starcal_ground.mission.trend import places, trend_table
-from starcal_ground.products import OBSERVATIONS_FILE
-from starcal_ros import untrusted
+from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -38,7 +37,6 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import StarObservations
 from starcal_ros.text import printable
 
@@ -112,8 +110,8 @@ def _tasks(
     """Tasks of files by name: calibrations in order of their paths, then bags."""
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:
-            observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
-            yield _task(root, name, (entry,), cameras, beside=observations)
+            beside = posixpath.join(posixpath.dirname(name), products.OBSERVATIONS_FILE)
+            yield _task(root, name, (entry,), cameras, beside=listed.get(beside))
         elif _ARCHIVED.fullmatch(posixpath.basename(name)):
             yield _task(root, name, (entry,), cameras)
     for name, files in _bags(listed).items():
@@ -166,7 +164,7 @@ def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
         if not file.endswith('.mcap') or posixpath.basename(folder) == 'ensemble':
             continue
         metadata = listed.get(posixpath.join(folder, _METADATA))
-        if metadata and file != OBSERVATIONS_FILE:
+        if metadata and file != products.OBSERVATIONS_FILE:
             bags.setdefault(folder, [metadata]).append(entry)
         else:
             bags[name] = [entry]
@@ -245,7 +243,7 @@ def compute(task: Task) -> Answer:
         if task.size >= 0 and not places.exists(task.url):
             raise FileNotFoundError(errno.ENOENT, _NOT_SEEN, task.url)
         # The result must not depend on the threads of BLAS.
-        with places.fetched(task.url, task.files, task.size) as path, one_blas_thread():
+        with places.fetched(task.url, task.files, task.size) as path, processes.one_blas_thread():
             return _answer(task, path)
     except (OSError, ModuleNotFoundError) as error:
         reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
@@ -277,7 +275,7 @@ def _answer(task: Task, path: Path) -> Answer:
             text = product_files.calibration_text(made)
         else:
             made, kind = product_files.read_calibration(path), trend_table.RECORDED
-            degc = _temperature(path.with_name(OBSERVATIONS_FILE))
+            degc = _temperature(path.with_name(products.OBSERVATIONS_FILE))
         row = trend_table.row_of(made, task.stamp, task.url, kind, degc)
         return Answer(_of_camera(row, task), text)
     except (StarcalError, ValueError) as error:
