@@ -8,7 +8,7 @@ The folder holds ``residuals.npz`` and, in place of a calibration that failed,
 
 from collections.abc import Iterable, Mapping
 import contextlib
-import dataclasses
+from dataclasses import dataclass, fields, replace
 import io
 import json
 import os
@@ -130,7 +130,7 @@ def read_residuals(path: Path) -> Residuals:
     ((2997, 2), 2996)
     """
     with errors_as(ProductError, path):
-        names = ('format', *(field.name for field in dataclasses.fields(Residuals)))
+        names = ('format', *(field.name for field in fields(Residuals)))
         columns = untrusted.read_archive(path, names)
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
@@ -141,7 +141,7 @@ def read_residuals(path: Path) -> Residuals:
     return residuals
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class NotCalibrated:
     """Why bags gave no calibration; ``cause`` and the rest as `starcal diagnose` has them."""
 
@@ -185,7 +185,7 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         numbers = np.array(untrusted.json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
-        camera = dataclasses.replace(camera, parameters=numbers[:count])
+        camera = replace(camera, parameters=numbers[:count])
         check_plausible(camera)
         prior = CameraGeometry(camera, numbers[count:])
         check_drawable(prior)

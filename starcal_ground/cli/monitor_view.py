@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-import dataclasses
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -28,26 +28,24 @@ _SHADES = ' ░▒▓█'
 _TIGHTEST = 4  # gate checks shown of a calibration that passed
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Received:
     """Newest messages of each topic; None or empty before the first."""
 
     images: int = 0
-    refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    refused: Mapping[str, int] = field(default_factory=dict)
     last: StarObservations | None = None
     status: EnsembleStatus | None = None
     active: Calibration | None = None
     candidate: Calibration | None = None
-    health: Mapping[str, tuple[int, str]] = dataclasses.field(default_factory=dict)
+    health: Mapping[str, tuple[int, str]] = field(default_factory=dict)
 
     def with_image(self, observations: StarObservations) -> Received:
         """A copy with one more image."""
         refused = Counter(self.refused)
         if observations.refusal:
             refused[observations.refusal] += 1
-        return dataclasses.replace(
-            self, images=self.images + 1, refused=dict(refused), last=observations
-        )
+        return replace(self, images=self.images + 1, refused=dict(refused), last=observations)
 
 
 class Line(Text):

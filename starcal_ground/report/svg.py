@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Sequence
-import dataclasses
+from dataclasses import dataclass, replace
 import html
 import math
 from pathlib import Path
@@ -39,7 +39,7 @@ _PALETTE = re.compile(r':root \{(.*?)\}', re.DOTALL)
 _VARIABLE = re.compile(r'--([\w-]+): (#[0-9a-f]+)')
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Drawing:
     """Elements of SVG in a view box of a height."""
 
@@ -65,7 +65,7 @@ class Drawing:
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Chart:
     """A drawing with title and caption; the caption also describes it to screen readers."""
 
@@ -78,7 +78,7 @@ class Chart:
         return self.svg.document()
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Curve:
     """
     Points (n,) of a plot: joined by a line of a width unless 0, marked if it has a mark.
@@ -99,7 +99,7 @@ class Curve:
     titles: Sequence[str] = ()
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Scale:
     """Map from the values ``low`` to ``high`` onto the view box, ``start`` to ``end``."""
 
@@ -422,8 +422,8 @@ def plot(
     is_turned = widest * len(x_names) > WIDTH - left
     below = (24.0 if x_names else 6.0) + (18.0 if x_label else 0.0) + (26.0 if is_turned else 0.0)
     panel = Panel(
-        dataclasses.replace(scale_x, start=left, end=WIDTH - 12),
-        dataclasses.replace(scale_y, start=height - below, end=top),
+        replace(scale_x, start=left, end=WIDTH - 12),
+        replace(scale_y, start=height - below, end=top),
     )
     if under is not None:
         under(panel)

@@ -7,7 +7,7 @@ comment, and each text in a format without escapes, passes `ascii_line`.
 """
 
 from collections.abc import Callable, Mapping
-import dataclasses
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ Files = Mapping[str, str | bytes | Callable[[Path], None]]
 GRID = 25  # pixels a side, as in the fits of `camera`
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Loss:
     """
     A part of a calibration that a format cannot hold.
@@ -38,7 +38,7 @@ class Loss:
     cost_px: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Content:
     """
     Files of an export: content by name, or a function that writes the file to a path.
@@ -64,7 +64,7 @@ def fitted(
     camera = calibration.geometry.camera
     nearest, worst_px = nearest_camera(camera, model, zero)
     losses = []
-    lens = dataclasses.replace(camera, field=None)
+    lens = replace(camera, field=None)
     if camera.has_field:
         losses.append(Loss('field beside the lens model', _alone(camera, camera.model, ())))
     if model != camera.model:
@@ -89,7 +89,7 @@ def temperature_losses(calibration: Calibration) -> tuple[Loss, ...]:
     terms = calibration.temperature
     if terms is None:
         return ()
-    lens = dataclasses.replace(calibration.geometry.camera, field=None)
+    lens = replace(calibration.geometry.camera, field=None)
     pixels = pixel_grid(lens, GRID, GRID)
     losses = []
     if terms.focal_per_degc:

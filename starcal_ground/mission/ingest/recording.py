@@ -2,7 +2,7 @@
 """A bag of images and telemetry of a mission, and a parameter file to calibrate it."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-import dataclasses
+from dataclasses import dataclass, replace
 import heapq
 from itertools import repeat
 import json
@@ -34,7 +34,7 @@ _MARGIN_NS = 60 * NANOSECONDS_PER_SECOND  # for an offset of the stamps of the c
 _COARSE = 1 / 3  # step of the pixel values over their noise from which centroids lose accuracy
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Prior:
     """
     The camera file and alignments of a calibration of the bag.
@@ -52,7 +52,7 @@ def frame_name(frame: str) -> str:
     return name if name[:1].isalpha() else f'star_tracker_{name.strip("_")}'
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Recorded:
     """Paths of a bag that was written, and notes: one line for each thing to know of it."""
 
@@ -89,7 +89,7 @@ def _options_of(path: Path, options: photographs.ImageOptions) -> photographs.Im
     if options.times is None:
         return options
     times = {name: options.times[name] for name in (path.name,) if name in options.times}
-    return dataclasses.replace(options, times=times)
+    return replace(options, times=times)
 
 
 def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -> None:

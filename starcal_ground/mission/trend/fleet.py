@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 import contextlib
-import dataclasses
+from dataclasses import dataclass, field, replace
 import errno
 import functools
 import hashlib
@@ -56,7 +56,7 @@ _SETTINGS = {
 }
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Task:
     """
     A calibration file to read, or a bag to calibrate.
@@ -171,7 +171,7 @@ def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
     return bags
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Cameras:
     """
     Which camera a path below the root belongs to, and the parameters of that camera.
@@ -224,7 +224,7 @@ def read_cameras(pattern: str, params: str) -> Cameras:
     return Cameras(re.compile(f'{expression}(?:/|$)'), params)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Answer:
     """
     The row that a task gives, and ``calibration.json`` of a bag.
@@ -261,7 +261,7 @@ def failed(task: Task, error: str) -> Answer:
 
 
 def _of_camera(row: trend_table.Row, task: Task) -> trend_table.Row:
-    return dataclasses.replace(row, spacecraft=task.spacecraft, camera=task.camera)
+    return replace(row, spacecraft=task.spacecraft, camera=task.camera)
 
 
 def _answer(task: Task, path: Path) -> Answer:
@@ -304,7 +304,7 @@ def _mean_temperature(records: Sequence[StarObservations]) -> float:
     return float(np.mean(known)) if len(known) else math.nan
 
 
-@dataclasses.dataclass
+@dataclass
 class Done:
     """
     How many tasks were computed, failed, or have a row in the table.
@@ -316,7 +316,7 @@ class Done:
     computed: int = 0
     failed: int = 0
     known: int = 0
-    unreachable: list[str] = dataclasses.field(default_factory=list)
+    unreachable: list[str] = field(default_factory=list)
     silent: int = 0
 
     def count(self, table: trend_table.Table, task: Task, answer: Answer) -> None:
