@@ -1,10 +1,7 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Comparison of two calibrations: parameters, alignment and lines of sight."""
 
-from __future__ import annotations
-
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -108,7 +105,7 @@ class Comparison:
     >>> import dataclasses, starcal_ground, starcal_ros
     >>> a = starcal_ros.read_calibration('out')
     >>> longer = a.geometry.camera.replace(fx=a.geometry.camera.camera_matrix[0, 0] + 0.5)
-    >>> b = dataclasses.replace(a, geometry=dataclasses.replace(a.geometry, camera=longer))
+    >>> b = replace(a, geometry=replace(a.geometry, camera=longer))
     >>> comparison = starcal_ground.compare(a, b)
     >>> print(comparison.difference[0].round(3), comparison.after.length_px.shape)
     0.5 (25, 25)
@@ -185,7 +182,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
 def truth_like(calibration: Calibration, geometry: CameraGeometry) -> Calibration:
     """The truth behind a calibration as one without sigma, to compare it with."""
     none = np.zeros((len(geometry.camera.parameters) + 3,) * 2)
-    return dataclasses.replace(
+    return replace(
         calibration,
         geometry=geometry,
         covariance=none,

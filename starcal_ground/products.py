@@ -1,37 +1,36 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The folder of products of a calibration, as the tool writes it.
+The folder of products of a calibration, as the tool writes it, and places that may be written to.
 
-It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_calibrated.json``.
+The folder holds ``residuals.npz`` and, in place of a calibration that failed,
+``not_calibrated.json``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
-import dataclasses
-from dataclasses import dataclass, fields
+import contextlib
+from dataclasses import dataclass, fields, replace
 import io
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from starcal_ground.outputs import OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.files import is_marked
 from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages.record_messages import camera_info_fields
-from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.camera_yaml import DEFAULT_CAMERA_NAME
-from starcal_ros.record_fields import json_object, plain_record, read_record
+from starcal_ros.formats.products import camera_yaml, product_files
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
-from starcal_ros.untrusted import json_value, read_archive
 
 OBSERVATIONS_TOPIC = '/observations'
 CAMERA_INFO_FILE = 'camera_info.yaml'
+OBSERVATIONS_FILE, REPORT_FILE = 'observations.mcap', 'report.html'
 RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
 PRODUCT_FILES = (
     product_files.CALIBRATION_FILE,
@@ -49,7 +48,7 @@ def write_products(
 ) -> None:
     """Write a calibration, its camera and residuals, if given; raises ProductError."""
     product_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
-    name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
+    name = calibration.provenance.get('camera_name', camera_yaml.DEFAULT_CAMERA_NAME)
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
     if residuals is not None:
         write_residuals(residuals, folder / RESIDUALS_FILE)
@@ -57,7 +56,7 @@ def write_products(
 
 
 def write_camera_info(
-    camera: CameraModel, path: Path, camera_name: str = DEFAULT_CAMERA_NAME
+    camera: CameraModel, path: Path, camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
 ) -> None:
     """
     Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
@@ -78,8 +77,13 @@ def write_camera_info(
         'rectification_matrix': _matrix(3, info['r']),
         'projection_matrix': _matrix(3, info['p']),
     }
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    product_files.write_atomically(path, text)
+    product_files.write_atomically(path, yaml_text(content))
+
+
+def yaml_text(content: object) -> str:
+    """YAML of an object in its order, each list of numbers in one line."""
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    return text
 
 
 def _matrix(rows: int, values: Floats) -> dict[str, object]:
@@ -111,7 +115,7 @@ def write_observations(
 def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
-    np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **plain_record(residuals))
+    np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **record_fields.plain_record(residuals))
     product_files.write_atomically(path, memory.getvalue())
 
 
@@ -127,11 +131,11 @@ def read_residuals(path: Path) -> Residuals:
     """
     with errors_as(ProductError, path):
         names = ('format', *(field.name for field in fields(Residuals)))
-        columns = read_archive(path, names)
+        columns = untrusted.read_archive(path, names)
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
     with errors_as(ProductError, path):
-        residuals = read_record(Residuals, columns)
+        residuals = record_fields.read_record(Residuals, columns)
     if (residuals.image >= len(residuals.image_time_ns)).any():
         raise ProductError(f'{path}: image names images that are not there')
     return residuals
@@ -152,7 +156,7 @@ class NotCalibrated:
 
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """Write the record of a failure and remove earlier products; raises ProductError."""
-    content = {'calibrated': False, **json_object(record)}
+    content = {'calibrated': False, **record_fields.json_object(record)}
     product_files.write_atomically(
         folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n'
     )
@@ -168,7 +172,7 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
         return None
     content = product_files.read_json(path)
     try:
-        return read_record(NotCalibrated, content)
+        return record_fields.read_record(NotCalibrated, content)
     except ValueError as error:
         raise ProductError(f'{path}: not a record of a failure: {error}') from error
 
@@ -178,13 +182,61 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
     camera = calibration.geometry.camera
     count = len(camera.parameters)
     try:
-        numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
+        numbers = np.array(untrusted.json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
-        camera = dataclasses.replace(camera, parameters=numbers[:count])
+        camera = replace(camera, parameters=numbers[:count])
         check_plausible(camera)
         prior = CameraGeometry(camera, numbers[count:])
         check_drawable(prior)
         return prior
     except (KeyError, ValueError, TypeError, OverflowError):
         return None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it where they are not there; raises ProductError."""
+    with errors_as(ProductError, path, 'created'):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
+    """
+    Check that a command may write its files: none is an input, and each is new or was its own.
+
+    Its own is a file that starcal wrote and nothing changed since.  Raises ProductError naming the
+    first file that would be replaced and the remedy.
+    """
+    inputs = tuple(inputs)
+    for path in outputs:
+        if same_as_one_of(path, inputs):
+            raise ProductError(
+                f'{path}: is an input of this command and would be replaced; choose another '
+                'place (-o)'
+            )
+        if os.path.isdir(path):
+            raise ProductError(f'{path}: is a folder, where a file is written; give another name')
+        if os.path.lexists(path) and not _is_own(path):
+            raise ProductError(
+                f'{path}: was not written by starcal, or was changed or copied since (or its file'
+                ' system keeps no extended attributes): give another name or remove it'
+            )
+
+
+def _is_own(path: Path) -> bool:
+    with contextlib.suppress(OSError, ValueError), untrusted.regular_file(path, False) as file:
+        return is_marked(file)
+    return False
+
+
+def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
+    """True if a path names the same file, by whatever name, as one of the others."""
+    try:
+        own = path.stat()
+    except OSError:
+        return False  # there is no such file
+    for other in others:
+        with contextlib.suppress(OSError):
+            if os.path.samestat(own, other.stat()):
+                return True
+    return False

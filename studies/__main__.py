@@ -5,8 +5,6 @@
 ``paper`` instead simulates the night of the paper and compares the results with its figures.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable, Sequence
 import dataclasses
@@ -19,7 +17,7 @@ from typing import TypeVar
 
 from starcal_ground.cli import terminal
 from starcal_ground.cli.arguments import number
-from starcal_ground.outputs import make_folder
+from starcal_ground.products import make_folder
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, StarcalError

@@ -191,8 +191,7 @@ def print_notes(notes: Sequence[str]) -> None:
 
 def check_file(output: Path, inputs: Sequence[Path]) -> None:
     """`check_outputs` of one file, which is no product beside an input either."""
-    from starcal_ground.outputs import check_outputs
-    from starcal_ground.products import PRODUCT_FILES
+    from starcal_ground.products import check_outputs, PRODUCT_FILES
 
     beside = [file.with_name(name) for file in inputs for name in PRODUCT_FILES]
     check_outputs([output], [*inputs, *beside])

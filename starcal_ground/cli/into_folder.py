@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A calibration into a folder: products, pictures and report, or why there are none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
@@ -10,18 +8,17 @@ import dataclasses
 from pathlib import Path
 import threading
 
-from starcal_ground import outputs, products
+from starcal_ground import products
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
-from starcal_ground.planning.reaching import with_images_to_reach
+from starcal_ground.planning.plan import with_images_to_reach
 from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import campaign
-from starcal_ros.pipeline.solve import inputs_of
+from starcal_ros.pipeline import campaign, solve
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 
@@ -32,11 +29,11 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
     Raises OptionError or ProductError naming the folder or the file.
     """
     bag_files = reader.files_of_bags(bags)
-    if outputs.same_as_one_of(folder, [file.parent for file in bag_files]):
+    if products.same_as_one_of(folder, [file.parent for file in bag_files]):
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
     written = [folder / name for name in (*products.PRODUCT_FILES, products.NOT_CALIBRATED_FILE)]
     pictures = thumbnails.thumbnails_in(folder / thumbnails.THUMBNAILS_FOLDER)
-    outputs.check_outputs((*written, *pictures), (*bag_files, *files))
+    products.check_outputs((*written, *pictures), (*bag_files, *files))
 
 
 @contextlib.contextmanager
@@ -47,7 +44,7 @@ def failure_recorded(
     try:
         yield
     except kind as error:
-        outputs.make_folder(folder)
+        products.make_folder(folder)
         look = _write_failure(folder, NotCalibrated(str(error), tuple(map(str, bags)), {}))
         raise type(error)(f'{error}{look}') from error
 
@@ -58,7 +55,7 @@ def digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
     with ThreadPoolExecutor(1, 'digests') as thread:
         stopped = threading.Event()
         try:
-            yield thread.submit(inputs_of, files, stopped.is_set).result
+            yield thread.submit(solve.inputs_of, files, stopped.is_set).result
         finally:
             stopped.set()
 
@@ -85,7 +82,7 @@ def calibrate_into(
         observed = campaign.observe(source, selection, show, advance)
     if selection is not None and not observed.observations:
         raise OptionError(selection.without_images())
-    outputs.make_folder(folder)
+    products.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     products.write_observations(observed.observations, folder, source.setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
@@ -98,7 +95,7 @@ def calibrate_into(
             pictures = thumbnails.ordered(drawn.result())
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
     products.write_products(made.calibration, folder, made.residuals)
-    page, report, path = '', '', folder / outputs.REPORT_FILE
+    page, report, path = '', '', folder / products.REPORT_FILE
     if with_report:
         with drawings.kind('report'):
             page, report = _drawn(made, pictures, folder)
@@ -147,26 +144,23 @@ def _drawn(
     except ModuleNotFoundError as error:
         return '', f'no report: {missing_package(error)}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
-    return page.render(content, folder), f'look at {folder / outputs.REPORT_FILE}'
+    return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
 
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ground.planning.inspect import of_a_failure
-    from starcal_ros.pipeline.diagnosis.bags import of_refusals, refusals
+    from starcal_ground.planning.inspect import cause_of
+    from starcal_ros.pipeline.diagnosis.bags import refusals
 
     source, count = observed.source, len(observed.observations)
     groups = refusals(observed.observations)
     refused = {group.reason: group.count for group in groups}
-    is_none_used = sum(refused.values()) == count
-    if count and is_none_used:
+    if count and sum(refused.values()) == count:
         words = f'no image of {count} can be used'
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
     named = tuple(map(str, source.bags))
-    cause = of_refusals(groups, count)
-    if source.topics.image and is_none_used:
-        cause = of_a_failure(source.bags, source.topics, source.setup, groups)
+    cause = cause_of(source.bags, source.topics, source.setup, groups, count)
     if cause is None:
         return NotCalibrated(words, named, refused)
     command = 'starcal diagnose' if source.through_air is None else ''

@@ -24,8 +24,7 @@ import yaml
 from starcal_ground.images import night_sky
 from starcal_ground.images.from_stars import FEWEST_IMAGES
 from starcal_ground.images.photographs import image_paths
-from starcal_ground.outputs import make_folder
-from starcal_ground.products import write_camera_info
+from starcal_ground.products import make_folder, write_camera_info
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Contents of a bag and the images that a calibration would refuse, by the calibration's code."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,12 +12,10 @@ import numpy as np
 from starcal_ground.file_kinds import explained
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.frames import read_ahead
-from starcal_ros.formats.bag.reader import Damage
+from starcal_ros.formats.bag import frames, reader
 from starcal_ros.formats.messages import message_codec, sensor_messages
+from starcal_ros.pipeline import campaign, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.campaign import ThroughAir
 from starcal_ros.pipeline.diagnosis import bags
 from starcal_ros.pipeline.diagnosis.bags import Refused
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
@@ -95,7 +91,7 @@ def inspect(
     given: bag_topics.Topics,
     setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
-    through_air: ThroughAir | None = None,
+    through_air: campaign.ThroughAir | None = None,
     problem: str = '',
 ) -> Inspection:
     """
@@ -120,9 +116,7 @@ def inspect(
                 bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given)),
             )
         if setup:
-            from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
-
-            source = source_of(paths, setup, given, through_air)
+            source = campaign.source_of(paths, setup, given, through_air)
             chosen, setup, notes = source.topics, source.setup, source.notes
             records = bag_topics.read(paths, chosen, setup)
         elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:
@@ -142,14 +136,12 @@ def inspect(
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
     if setup and chosen:
-        from starcal_ros.pipeline import solve
-
         status = solve.ensemble_status(solve.ensemble_of(seen, setup), setup)
     if chosen and problems in ([], [problem]):
         problems += _shortages(used, status)
     if chosen and seen and not used:
-        command = '' if by_stars else 'starcal diagnose'
-        problems += _causes(paths, chosen, setup, bags.refusals(seen), command)
+        cause = cause_of(paths, chosen, setup, bags.refusals(seen), len(seen))
+        problems += [cause.in_a_sentence('' if by_stars else 'starcal diagnose')] if cause else []
     return Inspection(
         bags=tuple(map(str, paths)),
         topics=topics,
@@ -170,13 +162,13 @@ def inspect(
     )
 
 
-def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, ...]:
+def _contents(paths: Sequence[Path], on_damage: reader.Damage) -> tuple[TopicContent, ...]:
     """Statistics of every topic, sorted by name, from one pass over the files."""
     type_names: dict[str, str] = {}
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
     bad: Counter[str] = Counter()
-    for raw in read_ahead(reader.read_raw(paths, on_damage=on_damage)):
+    for raw in frames.read_ahead(reader.read_raw(paths, on_damage=on_damage)):
         type_names[raw.topic] = raw.type_name
         stamp_ns = raw.log_time_ns
         if raw.type_name in _STAMPED:
@@ -225,25 +217,16 @@ def _kind(message: message_codec.Message) -> str:
     return f'{"PNG" if png else "JPEG"} {header.width} x {header.height}'
 
 
-def _causes(
+def cause_of(
     paths: Sequence[Path],
-    chosen: bag_topics.Topics,
+    requested: bag_topics.Topics,
     setup: Setup | None,
     refused: Sequence[Refused],
-    command: str,
-) -> list[str]:
-    """The cause for which all images are refused, in a sentence; ``command`` gives details."""
-    if setup and not chosen.observations:
-        cause = of_a_failure(paths, chosen, setup, refused)
-    else:
-        cause = bags.of_refusals(refused, sum(group.count for group in refused))
-    return [cause.in_a_sentence(command)] if cause else []
-
-
-def of_a_failure(
-    paths: Sequence[Path], requested: bag_topics.Topics, setup: Setup, refused: Sequence[Refused]
+    images: int,
 ) -> Diagnosis | None:
-    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
+    """The cause for which images are refused, by a diagnosis where all are; None: none is."""
+    if setup is None or not requested.image or sum(group.count for group in refused) < images:
+        return bags.of_refusals(refused, images)
     try:
         diagnosis = bags.diagnose_bags(paths, requested, setup, refused)
     except BagError:

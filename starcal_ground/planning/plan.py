@@ -12,11 +12,8 @@ the stars do not show: its bound falls as stars are added (`forecast`).  So a fo
 nothing at random, never rises with an image, and does not depend on the order of the images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import dataclasses
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -24,9 +21,10 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.assessment import gate
 from starcal_ros.assessment.budget import mean_squares
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
@@ -36,10 +34,11 @@ from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
+from starcal_ros.pipeline.campaign import Campaign
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
 from starcal_ros.processes import one_blas_thread
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import Ensemble, GateCheck, StarObservations
 from starcal_ros.text import significant
 
 MAP, LINE_OF_SIGHT = 'map', 'line_of_sight'
@@ -50,7 +49,7 @@ _AT_ONCE = 32  # candidates: their rows take some 10 MB
 _TOLD = 1e-3  # of what is known of a direction: where each candidate adds less, none counts
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Target:
     """
     A sigma to lower: ``sqrt(tr(squares P) + constant) / unit``.
@@ -110,7 +109,7 @@ def expected_noise_px2(estimate: Estimate, magnitude: Floats) -> Floats:
     return np.asarray(np.exp(-np.interp(magnitude, middle, np.log(mean))))
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Prospect:
     """
     Information that c candidate images add to an estimate.
@@ -270,7 +269,7 @@ def _direction(ra_deg: float, dec_deg: float) -> Floats:
     return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Pointing:
     """+z of the camera to (ra, dec), ICRF; +x towards east, then turned about +z by the roll."""
 
@@ -285,7 +284,7 @@ class Pointing:
         return Rotation.from_euler('ZXZ', [ra + np.pi / 2, np.pi / 2 - dec, roll])
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Cone:
     """Directions within a radius of a direction, ICRF."""
 
@@ -294,7 +293,7 @@ class Cone:
     radius_deg: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Request:
     """
     Wishes and bounds of a plan.
@@ -324,7 +323,7 @@ class Request:
                 raise OptionError(f'{one}: the radius is not within 0 to 180 deg')
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Step:
     """An image to take: its pointing, the stars to expect, and the sigma to expect after it."""
 
@@ -333,7 +332,7 @@ class Step:
     sigma: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Plan:
     """
     The images to take, in order.
@@ -461,3 +460,51 @@ def _expected(
         # A camera at rest, where the rates of the images are known.
         star_tracker_rate_rad_s=0.0 * last.star_tracker_rate_rad_s,
     )
+
+
+_MOST_IMAGES = 20  # that reach a requirement
+_LISTED = 2  # pointings in a sentence
+
+
+def with_images_to_reach(campaign: Campaign) -> Campaign:
+    """
+    A campaign whose missed requirements have the next images in the note of their check.
+
+    The sigma that a plan lowers is an RMS: a requirement over a share falls in proportion.
+    """
+    wanted = iter(gate.requirements_of(campaign.setup.gate.requirements))
+    checks = tuple(
+        _planned(campaign, next(wanted).quantity, one) if one.option == gate.REQUIREMENTS else one
+        for one in campaign.calibration.gate
+    )
+    if checks == campaign.calibration.gate:
+        return campaign
+    reasons = gate.reasons_of(checks)
+    calibration = dataclasses.replace(campaign.calibration, gate=checks, reasons=reasons)
+    return dataclasses.replace(campaign, calibration=calibration)
+
+
+def _planned(campaign: Campaign, quantity: str, check: GateCheck) -> GateCheck:
+    if not check.found > check.limit:
+        return check
+    minimise = {gate.POINTING: LINE_OF_SIGHT, gate.FOCAL: 'fx'}.get(quantity, quantity)
+    try:
+        request = Request(_MOST_IMAGES, minimise)
+        plan = plan_pointings(campaign.ensemble, campaign.setup, request)
+    except (StarcalError, np.linalg.LinAlgError):  # not estimated, or no image shows a star
+        return check
+    scale = check.found / plan.sigma
+    enough = [k for k, step in enumerate(plan.steps, 1) if scale * step.sigma <= check.limit]
+    if not enough:
+        last = significant(scale * plan.steps[-1].sigma, 2)
+        unit = check.unit and f' {check.unit}'
+        words = f'{len(plan.steps)} more images reach {last}{unit}'
+    else:
+        count = enough[0]
+        words = f'{count} more image{"s reach" if count > 1 else " reaches"} it'
+        places = '; '.join(
+            f'RA {place.ra_deg:.1f}, Dec {place.dec_deg:+.1f}, roll {place.roll_deg:.0f}'
+            for place in (step.pointing for step in plan.steps[:count])
+        )
+        words += f', at {places} degrees' if count <= _LISTED else ' (starcal plan)'
+    return dataclasses.replace(check, note=f'{check.note}; {words}')

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Figures over the detector and over the sky."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import functools
 from pathlib import Path
@@ -15,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.comparison import Comparison, DifferenceMap
-from starcal_ground.report import svg
-from starcal_ground.report.verdict import VISIBLE_PX
+from starcal_ground.report import svg, verdict
+from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.predictions import Residuals
@@ -24,14 +22,6 @@ from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.records import (
-    BUDGET_COLUMNS,
-    BUDGET_ROWS,
-    CameraGeometry,
-    DetectorMaps,
-    SigmaPart,
-    StarObservations,
-)
 from starcal_ros.text import significant
 
 FLAT = 0.02  # relative range below which a map counts as flat
@@ -126,7 +116,7 @@ def distortion_contours(camera: CameraModel) -> svg.Chart:
     )
 
 
-def change_contours(before: CameraGeometry, after: CameraGeometry) -> svg.Chart:
+def change_contours(before: records.CameraGeometry, after: records.CameraGeometry) -> svg.Chart:
     """Change of the lines of sight in pixels, common rotation removed."""
     _, moved_px = movement(before, after, 60, 48)
     return svg.Chart(
@@ -164,7 +154,7 @@ def field_vectors(field: DetectorField, camera: CameraModel) -> svg.Chart:
     places = _middles_of_cells(camera)
     return svg.Chart(
         'Residual field in addition to the lens model',
-        arrows(camera, places, field.displacement_px(places), _SHORT, VISIBLE_PX),
+        arrows(camera, places, field.displacement_px(places), _SHORT, verdict.VISIBLE_PX),
         'Displacement of a star from its position by the lens model, enlarged to the scale of '
         'the arrow above the figure.',
     )
@@ -220,7 +210,9 @@ def _draw_arrows(
     panel.outside.append(svg.words(start - 7, 17, f'scale: {svg.in_digits(key_px)} px', 'end'))
 
 
-def line_of_sight_sigma(maps: DetectorMaps, camera: CameraModel, is_alone: bool) -> svg.Chart:
+def line_of_sight_sigma(
+    maps: records.DetectorMaps, camera: CameraModel, is_alone: bool
+) -> svg.Chart:
     """1-sigma of the lines of sight, of the camera alone or with its alignment."""
     sigma = maps.shape_sigma_arcsec if is_alone else maps.line_of_sight_sigma_arcsec
     title, text = (
@@ -236,7 +228,9 @@ def line_of_sight_sigma(maps: DetectorMaps, camera: CameraModel, is_alone: bool)
     )
 
 
-def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> svg.Chart | None:
+def budget_over_detector(
+    parts: Sequence[records.SigmaPart], camera: CameraModel
+) -> svg.Chart | None:
     """1-sigma of the camera alone over the detector, in total and by cause, on one scale."""
     shown = [part for part in parts if part.map_over_detector_arcsec]
     least = _BUDGET_SHARE * max((part.map_arcsec for part in shown), default=0.0)
@@ -254,7 +248,9 @@ def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> svg
         panel = svg.Panel(
             svg.Scale(0.0, 1.0, left, left + wide), svg.Scale(0.0, 1.0, upper, upper + high)
         )
-        sigma = np.reshape(part.map_over_detector_arcsec, (BUDGET_ROWS, BUDGET_COLUMNS))
+        sigma = np.reshape(
+            part.map_over_detector_arcsec, (records.BUDGET_ROWS, records.BUDGET_COLUMNS)
+        )
         panel.picture(_coloured(cv2.resize(255 * sigma / top, (90, 70))))
         panel.outside.append(svg.words(left, upper - 7, part.cause, 'start'))
         panels.append(panel)
@@ -374,7 +370,7 @@ def _viridis() -> NDArray[np.uint8]:
 
 
 def pointings(
-    observations: Sequence[StarObservations], geometry: CameraGeometry
+    observations: Sequence[records.StarObservations], geometry: records.CameraGeometry
 ) -> svg.Chart | None:
     """
     Footprints of the images on the whole sky; None without an image that has an attitude.

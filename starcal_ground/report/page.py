@@ -6,8 +6,6 @@ The report is made from the product files of a folder; a section whose file is m
 The page needs no network: styles, script and pictures are embedded.
 """
 
-from __future__ import annotations
-
 import base64
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,19 +21,16 @@ import jinja2
 from markupsafe import Markup
 import numpy as np
 
-from starcal_ground import outputs, products
-from starcal_ground.report import detector_figures, figures, thumbnails, verdict
-from starcal_ground.report.svg import Chart, light
+from starcal_ground import products
+from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
 from starcal_ground.report.thumbnails import Thumbnail
-from starcal_ground.report.verdict import Row
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.annotation import STAR_MARKS
+from starcal_ros.pipeline import annotation, solve
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import Calibration, IMAGE_REFUSALS, STAR_REFUSALS, StarObservations, TOTAL
 from starcal_ros.text import significant
@@ -53,9 +48,12 @@ _LETTERS = {
 }
 
 
-def typeset(rows: Sequence[Row]) -> list[Row]:
+def typeset(rows: Sequence[verdict.Row]) -> list[verdict.Row]:
     """Rows with minus signs in place of hyphens."""
-    return [Row(*(text.replace('-', '\N{MINUS SIGN}') for text in astuple(row))) for row in rows]
+    return [
+        verdict.Row(*(text.replace('-', '\N{MINUS SIGN}') for text in astuple(row)))
+        for row in rows
+    ]
 
 
 def _none(count: int) -> str:
@@ -187,12 +185,12 @@ def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str,
     """Colour, letter and reason of the marks of refused stars in the pictures."""
     return [
         (
-            '#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)),
-            _LETTERS[STAR_MARKS[reason].shape],
+            '#{:02x}{:02x}{:02x}'.format(*reversed(annotation.STAR_MARKS[reason].color)),
+            _LETTERS[annotation.STAR_MARKS[reason].shape],
             reason,
         )
         for reason, count in _counts(observations).items()
-        if count and reason in STAR_MARKS
+        if count and reason in annotation.STAR_MARKS
     ]
 
 
@@ -242,7 +240,7 @@ def write_report(folder: Path) -> Path:
     failure = products.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
-    path = folder / outputs.REPORT_FILE
+    path = folder / products.REPORT_FILE
     product_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
@@ -250,7 +248,7 @@ def write_report(folder: Path) -> Path:
 def _read_folder(folder: Path) -> Found:
     residuals = folder / products.RESIDUALS_FILE
     observations, ensemble = (
-        folder / outputs.OBSERVATIONS_FILE,
+        folder / products.OBSERVATIONS_FILE,
         folder / product_files.STATE_ENSEMBLE,
     )
     calibration = product_files.read_calibration(product_files.calibration_file(folder))
@@ -294,7 +292,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     written = [
         name
         for name in products.PRODUCT_FILES
-        if name != outputs.REPORT_FILE and (folder / name).is_file()
+        if name != products.REPORT_FILE and (folder / name).is_file()
     ]
     return {
         'calibration': calibration,
@@ -364,7 +362,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
         for reason, count in record.images_refused.items()
     ]
     text = page_template('failure.html').render(record=record, pictures=pictures, refused=refused)
-    path = folder / outputs.REPORT_FILE
+    path = folder / products.REPORT_FILE
     product_files.write_atomically(path, text)
     return path
 
@@ -374,7 +372,7 @@ def plot(
     name: str,
     residuals: Residuals | None = None,
     observations: Sequence[StarObservations] = (),
-) -> Chart:
+) -> svg.Chart:
     """
     Figure of the report by its name, such as ``shape``, ``budget`` or ``histogram``, as SVG.
 
@@ -400,11 +398,11 @@ def plot(
 
 def charts_of(
     calibration: Calibration, residuals: Residuals | None, observations: Sequence[StarObservations]
-) -> Mapping[str, Chart]:
+) -> Mapping[str, svg.Chart]:
     """Charts by their name in the template; charts without data are left out."""
     geometry, prior = calibration.geometry, products.prior_of(calibration)
     camera, maps = geometry.camera, calibration.maps
-    charts: dict[str, Chart | None] = {
+    charts: dict[str, svg.Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
         'contours': detector_figures.distortion_contours(camera),
         'sky': detector_figures.pointings(observations, geometry),
@@ -428,7 +426,9 @@ def charts_of(
     return {name: chart for name, chart in charts.items() if chart is not None}
 
 
-def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str, Chart | None]:
+def _residual_charts(
+    calibration: Calibration, residuals: Residuals
+) -> dict[str, svg.Chart | None]:
     camera = calibration.geometry.camera
     sigma_arcsec = calibration.star_tracker_sigma_arcsec
     return {
@@ -473,7 +473,7 @@ def write_pdf(page: Path) -> Path:
         ) from error
     logging.getLogger('weasyprint').setLevel(logging.ERROR)  # styles of the screen alone
     within_page = weasyprint.URLFetcher(allowed_protocols=('data',))
-    document = weasyprint.HTML(string=light(page.read_text()), url_fetcher=within_page)
+    document = weasyprint.HTML(string=svg.light(page.read_text()), url_fetcher=within_page)
     path = page.with_name(PDF_FILE)
     product_files.write_atomically(path, document.write_pdf())
     return path

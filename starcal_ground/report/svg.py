@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Sequence
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import html
 import math
 from pathlib import Path
@@ -423,8 +422,8 @@ def plot(
     is_turned = widest * len(x_names) > WIDTH - left
     below = (24.0 if x_names else 6.0) + (18.0 if x_label else 0.0) + (26.0 if is_turned else 0.0)
     panel = Panel(
-        dataclasses.replace(scale_x, start=left, end=WIDTH - 12),
-        dataclasses.replace(scale_y, start=height - below, end=top),
+        replace(scale_x, start=left, end=WIDTH - 12),
+        replace(scale_y, start=height - below, end=top),
     )
     if under is not None:
         under(panel)

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Thumbnails of a few images, stored beside the products for the report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 import itertools
@@ -12,7 +10,7 @@ import re
 import cv2
 import numpy as np
 
-from starcal_ground.outputs import make_folder
+from starcal_ground.products import make_folder
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.formats.products.product_files import write_atomically

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Results in words: parameters, checks, assumptions, precision by cause and the next step."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
@@ -13,13 +11,7 @@ from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import of_held, REMEDIES, requirement_answers, REQUIREMENTS
-from starcal_ros.camera import (
-    CameraModel,
-    INTRINSIC_NAMES,
-    line_of_sight,
-    pixel_grid,
-    project_parameters,
-)
+from starcal_ros.camera import CameraModel, INTRINSIC_NAMES, projection
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
 
@@ -369,8 +361,8 @@ def _movement_px(camera: CameraModel, changes: Floats) -> Floats:
 
     For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
     """
-    pixels = pixel_grid(camera, 25, 20)
-    directions = line_of_sight(camera, pixels)
-    moved = camera.parameters - np.diag(changes)
-    found = np.stack([project_parameters(camera.model, row, directions) for row in moved])
-    return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))
+    pixels = projection.pixel_grid(camera, 25, 20)
+    directions = projection.line_of_sight(camera, pixels)
+    rows = camera.parameters - np.diag(changes)
+    moved = [projection.project_parameters(camera.model, row, directions) for row in rows]
+    return np.asarray(np.linalg.norm(pixels - np.stack(moved), axis=-1).max(axis=1))

@@ -22,11 +22,7 @@ from rich.live import Live
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.cli.monitor_view import Received, view
 from starcal_ros import records
-from starcal_ros.formats.messages.message_codec import record_from_message
-from starcal_ros.formats.messages.record_messages import (
-    calibration_from_message,
-    observations_from_message,
-)
+from starcal_ros.formats.messages import message_codec, record_messages
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import end_quietly, is_overdue, until_told_to_end
 
@@ -68,17 +64,19 @@ class Monitor(Node):
         self.received = dataclasses.replace(self.received, **changes)
 
     def _on_observations(self, message: Any) -> None:
-        self.received = self.received.with_image(observations_from_message(message))
+        self.received = self.received.with_image(
+            record_messages.observations_from_message(message)
+        )
 
     def _on_status(self, message: Any) -> None:
-        self._set(status=record_from_message(records.EnsembleStatus, message))
+        self._set(status=message_codec.record_from_message(records.EnsembleStatus, message))
 
     def _on_calibration(self, message: Any) -> None:
         # An earlier candidate has been replaced by this decision.
-        self._set(active=calibration_from_message(message), candidate=None)
+        self._set(active=record_messages.calibration_from_message(message), candidate=None)
 
     def _on_candidate(self, message: Any) -> None:
-        candidate, active = calibration_from_message(message), self.received.active
+        candidate, active = record_messages.calibration_from_message(message), self.received.active
         if active is None or candidate.time_ns >= active.time_ns:
             self._set(candidate=candidate)
 

@@ -6,8 +6,6 @@ Simulated centroids without pixels, and Cramer-Rao bounds.
 `cramer_rao_covariance` is the bound of the camera parameters estimated from them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import dataclasses
 import math
@@ -20,8 +18,7 @@ from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import CameraModel, project_jacobians, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Ensemble, StarObservations
-from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
-from starcal_ros.sky.attitude import rate_of
+from starcal_ros.sky import astrometry, attitude
 
 BOUND_SNR = 5.0
 
@@ -62,7 +59,7 @@ def true_observations(
         has_own = scenario.star_tracker_hz > 0
         tracker_sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD * has_own
         samples = synthetic.attitude_samples(scenario, index)
-        rate = rate_of(samples, shown.time_ns, tracker_sigma_rad)
+        rate = attitude.rate_of(samples, shown.time_ns, tracker_sigma_rad)
         images.append(with_rate(observed, *rate))
     return Ensemble(tuple(images))
 
@@ -122,7 +119,7 @@ def observations(
         noise_dn=detector.noise_electrons / detector.electrons_per_dn,
         psf_sigma_px=detector.psf_sigma_px,
         catalog_digest=shown.catalog_digest,
-        velocity_sigma_m_s=GIVEN_SIGMA_M_S,
+        velocity_sigma_m_s=astrometry.GIVEN_SIGMA_M_S,
     )
 
 

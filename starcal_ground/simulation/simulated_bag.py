@@ -5,11 +5,8 @@ Writer of simulated scenarios: a bag, its truth, and the files to calibrate it.
 Deliberate mistakes of the set-up serve to practise their diagnosis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import dataclasses
-from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
@@ -17,25 +14,26 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-import yaml
 
+from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.outputs import check_outputs
-from starcal_ground.products import write_camera_info
+from starcal_ground.comparison import truth_like
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
-from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.records import AttitudeSample, CameraGeometry, Image
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.records import AttitudeSample, Calibration, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
+from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 
 _AXIS = (0.8, 0.6, 0.0)  # axis of the alignment error, perpendicular to the line of sight
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Mistakes:
     """
     Mistakes of a bag and its parameter file; none by default.
@@ -116,7 +114,7 @@ ATTITUDE_TOPIC = '/star_tracker/attitude'
 VELOCITY_TOPIC = '/spacecraft/velocity'
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class SimulatedBag:
     """Paths of a simulated bag, its truth, and the parameter and camera files to calibrate it."""
 
@@ -167,6 +165,24 @@ def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
     return CameraGeometry(camera, star_tracker_from_camera.as_quat())
 
 
+def read_truth(path: Path, like: Calibration) -> Calibration | None:
+    """
+    The truth of a simulated bag as a calibration like another one; None for another file.
+
+    Raises ProductError when it is damaged.
+    """
+    try:
+        content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
+    except (ProductError, ValueError):
+        return None
+    if not (isinstance(content, dict) and 'k_true' in content):
+        return None
+    try:
+        return truth_like(like, true_geometry(content))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
+
+
 def write_bag(
     scenario: synthetic.Scenario,
     path: Path,
@@ -194,7 +210,7 @@ def write_bag(
         beside = _BESIDE
     truth, params, camera, table = (writer.file.with_name(name) for name in beside)
     tables = [] if scenario.table is None else [table]
-    check_outputs((*writer.outputs(), truth, params, camera, *tables))
+    products.check_outputs((*writer.outputs(), truth, params, camera, *tables))
     length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0
     turn_rad = length_px / float(scenario.truth.camera.parameters[0])
     scenario = dataclasses.replace(
@@ -207,7 +223,6 @@ def write_bag(
             'magnitude_limit': scenario.magnitude_limit,
             'prior_alignment_sigma_deg': math.degrees(synthetic.MOUNTING_SIGMA_RAD),
         }
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
     true = truth_content(scenario, writer.file.name)
     if mistakes != NO_MISTAKES:
         true['mistakes'] = dataclasses.asdict(mistakes)
@@ -223,10 +238,10 @@ def write_bag(
             on_image(index)
         # Just before the bag replaces an older one, so that all files are replaced together.
         write_atomically(truth, truth_text)
-        write_camera_info(scenario.prior.camera, camera, 'opnav')
+        products.write_camera_info(scenario.prior.camera, camera, 'opnav')
         if scenario.table is not None:
             write_atomically(table, scenario.table)
-        write_atomically(params, text)
+        write_atomically(params, products.yaml_text(content))
     return SimulatedBag(path, truth, params, camera)
 
 

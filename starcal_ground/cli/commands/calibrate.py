@@ -104,7 +104,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
     """The set-up that the arguments give, and its source; a failure is recorded in the folder."""
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
-    from starcal_ground.outputs import check_outputs, make_folder, same_as_one_of
+    from starcal_ground.products import check_outputs, make_folder, same_as_one_of
     from starcal_ros.assessment.gate import requirements_of
 
     requirements_of(args.require or ())

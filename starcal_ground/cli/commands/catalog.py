@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from starcal_ground.mission.ingest.deep_catalog import refusals, write_deep_catalog
-    from starcal_ground.outputs import check_outputs
+    from starcal_ground.products import check_outputs
     from starcal_ros.constants import ARCSECOND_RAD
     from starcal_ros.sky.astrometry import julian_year
     from starcal_ros.sky.catalog import load_catalog, UNMOVED

@@ -20,18 +20,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ground.cli import arguments
-from starcal_ground.cli.terminal import print_table, print_text
+from starcal_ground.cli import arguments, terminal
+from starcal_ros import text
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import ProductError
-from starcal_ros.text import p_value_text, significant, to_sigma
 
 if TYPE_CHECKING:
     from starcal_ground.comparison import Comparison, DifferenceMap
-    from starcal_ros.records import Calibration
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -44,11 +40,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import comparison
+    from starcal_ground.simulation.simulated_bag import read_truth
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     files = [calibration_file(path) for path in (args.a, args.b)]
     a = read_calibration(files[0])
-    result = comparison.compare(a, _truth_of(files[1], a) or read_calibration(files[1]))
+    result = comparison.compare(a, read_truth(files[1], a) or read_calibration(files[1]))
     if args.output:
         from starcal_ground.report.detector_figures import write_comparison
 
@@ -59,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_comparison(result)
         if args.output:
-            print_text(f'figure written to {args.output}')
+            terminal.print_text(f'figure written to {args.output}')
     return arguments.EXIT_ACCEPTED
 
 
@@ -71,10 +68,10 @@ def print_comparison(comparison: Comparison) -> None:
     rows = [
         (
             name,
-            to_sigma(of_a[name], sigma[k]) if name in of_a else '',
-            to_sigma(b.parameters[k], sigma[k]),
-            to_sigma(difference[k], sigma[k], '+'),
-            significant(sigma[k], 2) if sigma[k] else 'held',
+            text.to_sigma(of_a[name], sigma[k]) if name in of_a else '',
+            text.to_sigma(b.parameters[k], sigma[k]),
+            text.to_sigma(difference[k], sigma[k], '+'),
+            text.significant(sigma[k], 2) if sigma[k] else 'held',
             _sigmas(difference[k], sigma[k]),
         )
         for k, name in enumerate(b.parameter_names)
@@ -85,8 +82,8 @@ def print_comparison(comparison: Comparison) -> None:
         for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
         if comparison.is_aligned
     ]
-    print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
-    print_table(
+    terminal.print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
+    terminal.print_table(
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [
             *[('as calibrated', *_map_cells(comparison.before))] * comparison.is_aligned,
@@ -94,17 +91,17 @@ def print_comparison(comparison: Comparison) -> None:
         ],
     )
     if comparison.is_aligned:
-        print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
+        terminal.print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}″')
     else:
-        print_text('alignment: not in both, so the cameras alone are compared')
+        terminal.print_text('alignment: not in both, so the cameras alone are compared')
     total = comparison.total
     if total.degrees_of_freedom:
-        print_text(
+        terminal.print_text(
             f'all parameters  chi2 {total.value:.1f}, {total.degrees_of_freedom} degrees of '
-            f'freedom, p-value {p_value_text(total.p_value)}'
+            f'freedom, p-value {text.p_value_text(total.p_value)}'
         )
     for note in comparison.notes:
-        print_text(f'note: {note}')
+        terminal.print_text(f'note: {note}')
 
 
 def _map_cells(difference: DifferenceMap) -> Sequence[str]:
@@ -115,26 +112,3 @@ def _map_cells(difference: DifferenceMap) -> Sequence[str]:
 
 def _sigmas(difference: float, sigma: float) -> str:
     return f'{difference / sigma:+.1f}' if sigma > 0 else ''
-
-
-def _truth_of(path: Path, like: Calibration) -> Calibration | None:
-    """
-    The truth of a simulated bag, as ``starcal simulate`` writes it; None for another file.
-
-    Raises ProductError when it is damaged.
-    """
-    from starcal_ground.comparison import truth_like
-    from starcal_ground.simulation.simulated_bag import true_geometry
-    from starcal_ros.formats.products.product_files import read_text
-    from starcal_ros.untrusted import json_value, PRODUCT_BYTES
-
-    try:
-        content = json_value(read_text(path, PRODUCT_BYTES)) if path.suffix == '.json' else None
-    except (ProductError, ValueError):
-        return None
-    if not (isinstance(content, dict) and 'k_true' in content):
-        return None
-    try:
-        return truth_like(like, true_geometry(content))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error

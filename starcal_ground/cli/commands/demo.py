@@ -42,20 +42,18 @@ def run(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from starcal_ground import comparison
+    from starcal_ground import comparison, products
     from starcal_ground.cli.commands.compare import print_comparison
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
-    from starcal_ground.outputs import check_outputs, make_folder
-    from starcal_ground.products import write_products
     from starcal_ground.report import page
     from starcal_ros.pipeline.campaign import source_of
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
 
-    make_folder(args.output)
+    products.make_folder(args.output)
     bag = tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
-    check_outputs(node_processes.outputs(args.output))
+    products.check_outputs(node_processes.outputs(args.output))
     terminal.print_text(f'bag {bag.bag}; log files and products in {args.output}')
     with terminal.progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = node_processes.calibrate_with_nodes(
@@ -77,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
     again, _ = calibrate_into(args.output, source_of([bag.bag], setup, Topics()), dict)
-    write_products(calibration, args.output)
+    products.write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again.calibration).before.length_px.max())
     same = apart_px <= _SAME_PX
     terminal.print_verdict(

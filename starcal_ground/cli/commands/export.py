@@ -20,20 +20,13 @@ C represent the whole camera, as do the tables of starcal lookup.
   starcal export newer --to c --table -o uplink
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Iterable
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
-
-if TYPE_CHECKING:
-    from starcal_ros.records import StarObservations
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -66,21 +59,22 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground import products
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
-    from starcal_ground.outputs import make_folder
-    from starcal_ground.products import OBSERVATIONS_TOPIC
     from starcal_ros.formats.bag.reader import read_observations
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
-    calibration = read_calibration(calibration_file(args.calibration))
+    file = calibration_file(args.calibration)
+    calibration = read_calibration(file)
     names = None
     if args.spacecraft_id is not None:
         names = arguments.record_of(SpiceNames, args)
-    make_folder(args.output)
-    observations: Iterable[StarObservations] = ()
-    if args.to == 'ck':
-        observations = read_observations([_observations_of(args.calibration)], OBSERVATIONS_TOPIC)
+    products.make_folder(args.output)
+    recorded = [file.with_name(products.OBSERVATIONS_FILE)] if args.to == 'ck' else []
+    if recorded and not recorded[0].exists():
+        raise OptionError(f'--to ck: needs {recorded[0]} with the stars of the images')
+    observations = read_observations(recorded, products.OBSERVATIONS_TOPIC)
     done = export(
         *(calibration, args.to, args.output, names, args.table, observations, args.kernels)
     )
@@ -98,13 +92,3 @@ def run(args: argparse.Namespace) -> int:
     for loss in done.losses:
         terminal.print_text(f'left out: {loss.part}, {significant(loss.cost_px, 3)} px alone')
     return arguments.EXIT_ACCEPTED
-
-
-def _observations_of(calibration: Path) -> Path:
-    from starcal_ground.outputs import OBSERVATIONS_FILE
-    from starcal_ros.formats.products.product_files import calibration_file
-
-    path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)
-    if not path.exists():
-        raise OptionError(f'--to ck: needs {path} with the stars of the images')
-    return path

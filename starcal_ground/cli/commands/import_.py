@@ -69,7 +69,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.photographs import ImageOptions
     from starcal_ground.mission.ingest import mission_records, recording, sources
-    from starcal_ground.mission.ingest.mission_records import Guard
     from starcal_ros.formats.products.camera_yaml import read_camera_info
 
     options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=None)
@@ -85,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     paths = _expanded(args.images)
     inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
-    with Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
+    with mission_records.Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
         if args.times:
             times = guard.call(args.times, mission_records.read_times, args.times)
             options = dataclasses.replace(options, times=times)

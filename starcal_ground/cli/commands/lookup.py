@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.text import significant
+from starcal_ros import errors, text
 
 if TYPE_CHECKING:
     from starcal_ros.assessment.lookup import LineOfSightTable
@@ -55,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
     if args.step is not None:
         least = math.sqrt(camera.width * camera.height) / _MOST_POINTS
         if not least <= args.step <= max(camera.width, camera.height):
-            raise OptionError(
-                f'--step: {args.step:g} px: give {significant(least, 3)} px (a table of'
+            raise errors.OptionError(
+                f'--step: {args.step:g} px: give {text.significant(least, 3)} px (a table of'
                 f' {_MOST_POINTS}^2 pixels) or more, up to the size of the detector'
             )
         pixels = pixels_every(camera, args.step)
@@ -88,4 +87,4 @@ def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
         np.savez_compressed(memory, **columns)
         write_atomically(path, memory.getvalue())
     else:
-        raise ProductError(f'{path}: ends neither in .csv nor in .npz')
+        raise errors.ProductError(f'{path}: ends neither in .csv nor in .npz')

@@ -22,9 +22,7 @@ import tempfile
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros.errors import errors_as, OptionError
-from starcal_ros.text import significant
-from starcal_ros.untrusted import PRODUCT_BYTES, read_text
+from starcal_ros import errors, text, untrusted
 
 if TYPE_CHECKING:
     from starcal_ground.planning.plan import Plan, Pointing
@@ -102,17 +100,17 @@ def _pointings(path: Path) -> tuple[Pointing, ...]:
     """Return the rows of a file of pointings."""
     from starcal_ground.planning.plan import Pointing
 
-    with errors_as(OptionError, path):
-        rows = csv.DictReader(io.StringIO(read_text(path, PRODUCT_BYTES)))
+    with errors.errors_as(errors.OptionError, path):
+        rows = csv.DictReader(io.StringIO(untrusted.read_text(path, untrusted.PRODUCT_BYTES)))
     try:
         lacking = [name for name in _COLUMNS[:2] if name not in (rows.fieldnames or ())]
         if lacking:
-            raise OptionError(f'{path}: no column {" and ".join(lacking)}')
+            raise errors.OptionError(f'{path}: no column {" and ".join(lacking)}')
         pointings = [Pointing(*(float(row.get(name) or 0.0) for name in _COLUMNS)) for row in rows]
     except (TypeError, ValueError, csv.Error) as error:
-        raise OptionError(f'{path}: line {rows.line_num}: {error}') from error
+        raise errors.OptionError(f'{path}: line {rows.line_num}: {error}') from error
     if not pointings:
-        raise OptionError(f'{path}: no pointings')
+        raise errors.OptionError(f'{path}: no pointings')
     return tuple(pointings)
 
 
@@ -129,9 +127,9 @@ def _csv(plan: Plan) -> str:
 
 def _table(plan: Plan) -> tuple[list[str], list[list[str]]]:
     header = ['image', 'ra', 'dec', 'roll', 'stars', plan.name]
-    rows = [['now', '', '', '', '', significant(plan.sigma, 4)]]
+    rows = [['now', '', '', '', '', text.significant(plan.sigma, 4)]]
     for k, step in enumerate(plan.steps, 1):
         place = step.pointing
         angles = [f'{deg:.3f}' for deg in (place.ra_deg, place.dec_deg, place.roll_deg)]
-        rows.append([str(k), *angles, str(step.stars), significant(step.sigma, 4)])
+        rows.append([str(k), *angles, str(step.stars), text.significant(step.sigma, 4)])
     return header, rows

@@ -25,7 +25,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.outputs import check_outputs, REPORT_FILE
+    from starcal_ground.products import check_outputs, REPORT_FILE
     from starcal_ground.report import page
 
     names = (REPORT_FILE, page.PDF_FILE) if args.pdf else (REPORT_FILE,)

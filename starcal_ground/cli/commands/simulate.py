@@ -17,8 +17,6 @@ parameter file beside the bag.
   starcal simulate -o mirrored --scenario tiny --flip
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 

@@ -14,19 +14,13 @@ time, steps and drifts with p-values, and the change that a recalibration would 
   starcal trend /data/fleet -o trend --params camera.yaml --scheduler tcp://host:8786
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import OptionError
-
-if TYPE_CHECKING:
-    from starcal_ground.mission.trend.fleet import Task
 
 _FAILURES_SHOWN = 5
 
@@ -56,26 +50,24 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.mission.trend import fleet, places, trend_page
-    from starcal_ground.mission.trend.fleet import find, read_cameras
-    from starcal_ground.mission.trend.trend_table import Table
-    from starcal_ground.outputs import check_outputs, make_folder
+    from starcal_ground.mission.trend import fleet, places, trend_page, trend_table
+    from starcal_ground.products import check_outputs, make_folder
 
-    root, cameras = places.absolute(args.root), read_cameras(args.cameras, args.params)
+    root, cameras = places.absolute(args.root), fleet.read_cameras(args.cameras, args.params)
     if places.is_remote(args.output):
         raise OptionError(f'-o: {args.output}: results are written to a local folder, no URL')
     with _reading(args.root):
         if not places.exists(root):
             raise OptionError(f'{args.root}: no such folder')
 
-    def tasks() -> Iterator[Task]:
+    def tasks() -> Iterator[fleet.Task]:
         with _reading(args.root):
-            yield from find(root, cameras)
+            yield from fleet.find(root, cameras)
 
     folder = Path(places.absolute(args.output))
     make_folder(folder)
     check_outputs([folder / trend_page.TREND_FILE])
-    table = Table(folder)
+    table = trend_table.Table(folder)
     with terminal.progress_bar(None, 'calibrations') as advance:
         done = fleet.update(table, tasks(), args.workers, args.scheduler, advance)
     if done == fleet.Done():

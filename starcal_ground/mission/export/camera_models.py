@@ -14,18 +14,15 @@ line of sight) and ISIS (CameraDistortionMap: ``OD_K``; CameraFocalPlaneMap: ``I
 ``ITRANSL``).  The first pixel has its centre at (0.5, 0.5) in an ISD, at (1, 1) in ISIS.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 
 import numpy as np
 from scipy.optimize import least_squares
-import yaml
 
 from starcal_ground.mission.export import exported
 from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
-from starcal_ground.products import CAMERA_INFO_FILE, write_camera_info
+from starcal_ground.products import CAMERA_INFO_FILE, write_camera_info, yaml_text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
@@ -84,9 +81,10 @@ def ros_yaml(calibration: Calibration) -> exported.Content:
             'rotation': {'x': x, 'y': y, 'z': z, 'w': w},
         },
     }
+    comment = _commented(exported.origin(calibration))
     files: exported.Files = {
         CAMERA_INFO_FILE: lambda path: write_camera_info(camera, path, calibration.child_frame),
-        'alignment.yaml': '\n'.join([*_commented(exported.origin(calibration)), _yaml(content)]),
+        'alignment.yaml': '\n'.join([*comment, yaml_text(content)]),
     }
     return dataclasses.replace(made, files=files)
 
@@ -148,11 +146,6 @@ def mrcal_cameramodel(calibration: Calibration) -> exported.Content:
 
 def _commented(lines: list[str]) -> list[str]:
     return [f'# {exported.ascii_line(line)}' for line in lines]
-
-
-def _yaml(content: object) -> str:
-    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    return text
 
 
 def _opencv_matrix(name: str, matrix: Floats) -> list[str]:

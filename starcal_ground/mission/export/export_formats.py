@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Files of a calibration in a format of another tool."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +8,7 @@ from pathlib import Path
 from starcal_ground.mission.export import camera_models, spice
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
 from starcal_ground.mission.export.exported import Content, Loss
-from starcal_ground.outputs import check_outputs
+from starcal_ground.products import check_outputs
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import nearest

@@ -6,11 +6,8 @@ With its origin they are the comment of an exported file.  Names and reasons hol
 comment, and each text in a format without escapes, passes `ascii_line`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +64,7 @@ def fitted(
     camera = calibration.geometry.camera
     nearest, worst_px = nearest_camera(camera, model, zero)
     losses = []
-    lens = dataclasses.replace(camera, field=None)
+    lens = replace(camera, field=None)
     if camera.has_field:
         losses.append(Loss('field beside the lens model', _alone(camera, camera.model, ())))
     if model != camera.model:
@@ -92,7 +89,7 @@ def temperature_losses(calibration: Calibration) -> tuple[Loss, ...]:
     terms = calibration.temperature
     if terms is None:
         return ()
-    lens = dataclasses.replace(calibration.geometry.camera, field=None)
+    lens = replace(calibration.geometry.camera, field=None)
     pixels = pixel_grid(lens, GRID, GRID)
     losses = []
     if terms.focal_per_degc:

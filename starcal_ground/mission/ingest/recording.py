@@ -1,11 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A bag of images and telemetry of a mission, and a parameter file to calibrate it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import heapq
 from itertools import repeat
 import json
@@ -16,9 +13,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import yaml
 
-from starcal_ground import outputs
+from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.images import photographs
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
@@ -93,7 +89,7 @@ def _options_of(path: Path, options: photographs.ImageOptions) -> photographs.Im
     if options.times is None:
         return options
     times = {name: options.times[name] for name in (path.name,) if name in options.times}
-    return dataclasses.replace(options, times=times)
+    return replace(options, times=times)
 
 
 def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -> None:
@@ -104,9 +100,9 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     """
     record, params, copied = _files_beside(bag)
     prior = [params] if camera else []
-    if camera and not outputs.same_as_one_of(copied, [camera]):
+    if camera and not products.same_as_one_of(copied, [camera]):
         prior.append(copied)
-    outputs.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
+    products.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
 
 
 def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
@@ -293,7 +289,7 @@ def _prior_files(
     if saturation:
         values['saturation_dn'] = (min(saturation) - scale.offset) / scale.step
     content = {'/**': {'ros__parameters': values}}
-    texts = {params: yaml.safe_dump(content, sort_keys=False, default_flow_style=None)}
-    if not outputs.same_as_one_of(copied, [prior.camera]):
+    texts = {params: products.yaml_text(content)}
+    if not products.same_as_one_of(copied, [prior.camera]):
         texts[copied] = product_files.read_text(prior.camera, PARAMETER_BYTES)
     return texts

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 import contextlib
-import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import errno
 import functools
 import hashlib
@@ -27,11 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import outputs
-from starcal_ground.file_kinds import explained
+from starcal_ground import file_kinds, products
 from starcal_ground.mission.trend import places, trend_table
-from starcal_ground.outputs import OBSERVATIONS_FILE
-from starcal_ros import untrusted
+from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -40,7 +37,6 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE
 from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import StarObservations
 from starcal_ros.text import printable
 
@@ -48,7 +44,6 @@ KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
-_TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
 MOST_SILENT = 5  # files in turn that a store does not give, before it is asked if it answers
 _CONNECT_S = 10.0
@@ -115,8 +110,8 @@ def _tasks(
     """Tasks of files by name: calibrations in order of their paths, then bags."""
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:
-            observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
-            yield _task(root, name, (entry,), cameras, beside=observations)
+            beside = posixpath.join(posixpath.dirname(name), products.OBSERVATIONS_FILE)
+            yield _task(root, name, (entry,), cameras, beside=listed.get(beside))
         elif _ARCHIVED.fullmatch(posixpath.basename(name)):
             yield _task(root, name, (entry,), cameras)
     for name, files in _bags(listed).items():
@@ -169,7 +164,7 @@ def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
         if not file.endswith('.mcap') or posixpath.basename(folder) == 'ensemble':
             continue
         metadata = listed.get(posixpath.join(folder, _METADATA))
-        if metadata and file != OBSERVATIONS_FILE:
+        if metadata and file != products.OBSERVATIONS_FILE:
             bags.setdefault(folder, [metadata]).append(entry)
         else:
             bags[name] = [entry]
@@ -218,18 +213,15 @@ def read_cameras(pattern: str, params: str) -> Cameras:
         return Cameras(params=params)
     start = pattern[: pattern.rfind('}') + 1]
     start += pattern[len(start) :].partition('/')[0]
-    expression, names = '', []
-    for name, star, text, other in _TOKEN.findall(start.removeprefix('./')):
-        if other or (name and name not in _KEYS) or name in names:
-            break
-        names += [name] if name else []
-        expression += f'(?P<{name}>[^/]+?)' if name else '[^/]*' if star else re.escape(text)
-    else:
-        if names:
-            return Cameras(re.compile(f'{expression}(?:/|$)'), params)
-    raise OptionError(
-        f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and {{camera}}'
-    )
+    expression = re.escape(start.removeprefix('./')).replace(r'\*', '[^/]*')
+    for key in _KEYS:
+        expression = expression.replace(rf'\{{{key}\}}', f'(?P<{key}>[^/]+?)', 1)
+    if '(?P' not in expression or re.search(r'\\[{}]', expression):
+        raise OptionError(
+            f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and'
+            ' {camera}'
+        )
+    return Cameras(re.compile(f'{expression}(?:/|$)'), params)
 
 
 @dataclass(frozen=True)
@@ -251,7 +243,7 @@ def compute(task: Task) -> Answer:
         if task.size >= 0 and not places.exists(task.url):
             raise FileNotFoundError(errno.ENOENT, _NOT_SEEN, task.url)
         # The result must not depend on the threads of BLAS.
-        with places.fetched(task.url, task.files, task.size) as path, one_blas_thread():
+        with places.fetched(task.url, task.files, task.size) as path, processes.one_blas_thread():
             return _answer(task, path)
     except (OSError, ModuleNotFoundError) as error:
         reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
@@ -269,7 +261,7 @@ def failed(task: Task, error: str) -> Answer:
 
 
 def _of_camera(row: trend_table.Row, task: Task) -> trend_table.Row:
-    return dataclasses.replace(row, spacecraft=task.spacecraft, camera=task.camera)
+    return replace(row, spacecraft=task.spacecraft, camera=task.camera)
 
 
 def _answer(task: Task, path: Path) -> Answer:
@@ -283,14 +275,14 @@ def _answer(task: Task, path: Path) -> Answer:
             text = product_files.calibration_text(made)
         else:
             made, kind = product_files.read_calibration(path), trend_table.RECORDED
-            degc = _temperature(path.with_name(OBSERVATIONS_FILE))
+            degc = _temperature(path.with_name(products.OBSERVATIONS_FILE))
         row = trend_table.row_of(made, task.stamp, task.url, kind, degc)
         return Answer(_of_camera(row, task), text)
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
             raise cause from error
-        said = explained(error) if isinstance(error, StarcalError) else str(error)
+        said = file_kinds.explained(error) if isinstance(error, StarcalError) else str(error)
         return failed(task, said.replace(str(path), task.url))
 
 
@@ -337,7 +329,7 @@ class Done:
             return
         if answer.calibration:
             folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
-            outputs.make_folder(folder)
+            products.make_folder(folder)
             product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
         table.add(row)
         self.computed += not row.error

@@ -10,8 +10,6 @@ of the residuals, but at least that of the sigmas; the p-value of a step is mult
 number of places that it could stand at (Bonferroni).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import itertools
@@ -383,7 +381,7 @@ def distinct(rows: Sequence[Row]) -> list[Row]:
     return list(first.values())
 
 
-_OPEN = 'too few to tell'
+_ATTENTION = {'drift': 'drifting', 'step': 'stepped'}
 
 
 @dataclass(frozen=True)
@@ -391,28 +389,19 @@ class Overview:
     """
     A camera as a line among others.
 
-    ``kinds`` are those of its terms; temperature asks for nothing to be done.  ``is_stable`` is
-    False if the newest calibration differs from the active one; None if too few tell.
+    ``verdict``: stepped, drifting, changed since the active calibration; too few to tell; or
+    sound.  Temperature asks for nothing to be done.
     """
 
     name: str
-    kinds: frozenset[str]
-    is_stable: bool | None
-
-    @property
-    def needs_attention(self) -> bool:
-        """True for a step, a drift or a newest calibration that differs."""
-        return self.verdict not in ('sound', _OPEN)
-
-    @property
-    def verdict(self) -> str:
-        """Stepped, drifting, changed since the active calibration; too few to tell; or sound."""
-        words = {'drift': 'drifting', 'step': 'stepped'}
-        reasons = [word for kind, word in words.items() if kind in self.kinds]
-        reasons += ['changed'] if self.is_stable is False else []
-        return ', '.join(reasons) or (_OPEN if self.is_stable is None else 'sound')
+    verdict: str
+    needs_attention: bool
 
 
 def overview_of(name: str, shown: Sequence[Series], is_stable: bool | None) -> Overview:
-    """Overview of a camera with these series."""
-    return Overview(name, frozenset(term.kind for _, term in findings(shown)), is_stable)
+    """Overview of a camera with these series; ``is_stable`` is None if too few tell."""
+    kinds = {term.kind for _, term in findings(shown)}
+    reasons = [word for kind, word in _ATTENTION.items() if kind in kinds]
+    reasons += ['changed'] if is_stable is False else []
+    calm = 'too few to tell' if is_stable is None else 'sound'
+    return Overview(name, ', '.join(reasons) or calm, bool(reasons))

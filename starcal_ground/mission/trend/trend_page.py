@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The page of a trend, ``trend.html``: one file that needs no network."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -13,8 +11,7 @@ import numpy as np
 
 from starcal_ground.mission.trend import series as trends
 from starcal_ground.mission.trend.trend_table import Row
-from starcal_ground.report import svg
-from starcal_ground.report.page import page_template
+from starcal_ground.report import page, svg
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.formats.products.product_files import write_atomically
@@ -47,12 +44,14 @@ class Page:
 
 @dataclass(frozen=True)
 class _Judged:
-    """A camera with its overview, and its calibrations and series for the figures."""
+    """A camera with its overview, calibrations, those that differ, series, and its verdict."""
 
     overview: trends.Overview
     group: Sequence[Row]
+    rows: Sequence[Row]
     shown: Sequence[trends.Series]
-    line: tuple[object, ...]
+    is_stable: bool | None
+    verdict: tuple[str, str]
 
 
 def write_page(
@@ -67,7 +66,7 @@ def write_page(
     max_p_value = trends.MAX_P_VALUE / max(camera_count, 1)
     failures: list[Row] = []
     drawn: list[_Judged] = []
-    lines: list[tuple[trends.Overview, tuple[object, ...]]] = []
+    lines: list[tuple[trends.Overview, int, str, float, str]] = []
     failed = count = 0
     times: list[int] = []
     for rows in cameras:
@@ -75,15 +74,16 @@ def write_page(
         failures += bad[: _LISTED - len(failures)]
         failed, count = failed + len(bad), count + len(rows) - len(bad)
         for name, group in trends.groups(rows).items():
-            camera = _judged(name, group, max_p_value)
-            lines.append((camera.overview, camera.line))
+            camera, px = _judged(name, group, max_p_value)
+            newest = utc_text(camera.rows[-1].time_ns)[:10]
+            lines.append((camera.overview, len(camera.rows), newest, px, camera.verdict[1]))
             times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
     lines.sort(key=lambda line: not line[0].needs_attention)
-    text = page_template('trend.html').render(
+    text = page.page_template('trend.html').render(
         root=printable(root),
-        lines=[(overview, *line) for overview, line in lines] if len(lines) > 1 else (),
-        attention=sum(overview.needs_attention for overview, _ in lines),
+        lines=lines if len(lines) > 1 else (),
+        attention=sum(overview.needs_attention for overview, *_ in lines),
         cameras=[_camera(camera) for camera in drawn],
         failures=[(row.path, row.error) for row in failures],
         failure_count=failed,
@@ -105,31 +105,30 @@ def _order(camera: _Judged) -> tuple[bool, int, str]:
 
 
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
-def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
+def _judged(name: str, group: Sequence[Row], max_p_value: float) -> tuple[_Judged, float]:
+    """A camera, and the change of its newest calibration against the active one, px."""
     rows = trends.distinct(group)
     active = trends.activations(group)
     shown = trends.series_of(rows, max_p_value)
     new = trends.changes(group, active[-1:])
     is_stable, verdict = verdict_of(rows, group, active, new, shown)
+    overview = trends.overview_of(name, shown, is_stable)
     px = new[-1].line_of_sight_px if new else math.nan
-    line = (len(rows), utc_text(rows[-1].time_ns)[:10], px, verdict[1])
-    return _Judged(trends.overview_of(name, shown, is_stable), group, shown, line)
+    return _Judged(overview, group, rows, shown, is_stable, verdict), px
 
 
 @np.errstate(all='ignore')
 def _camera(judged: _Judged) -> dict[str, object]:
     """The part of the page on one camera."""
-    group, shown = judged.group, judged.shown
-    rows = trends.distinct(group)
+    group, rows, shown = judged.group, judged.rows, judged.shown
     active = trends.activations(group)
     new = trends.changes(group, active)
     charts = [_change_chart(group, new)] if new else []
     charts += [_chart(series, rows) for series in shown]
-    is_stable, verdict = verdict_of(rows, group, active, new, shown)
     return {
         'name': judged.overview.name,
-        'headline': _HEADLINES[is_stable],
-        'verdict': verdict,
+        'headline': _HEADLINES[judged.is_stable],
+        'verdict': judged.verdict,
         'rows': rows,
         'findings': [_finding(series, term, rows) for series, term in trends.findings(shown)],
         'charts': charts,
@@ -159,11 +158,9 @@ def verdict_of(
     ``rows`` are the different calibrations of a group.
     """
     words = {'step': 'steps of', 'drift': 'drifts of', 'temperature': 'effects of temperature on'}
-    changes = []
+    terms, changes = trends.findings(shown), []
     for kind, word in words.items():
-        names = list(
-            dict.fromkeys(series.name for series, t in trends.findings(shown) if t.kind == kind)
-        )
+        names = dict.fromkeys(series.name for series, term in terms if term.kind == kind)
         changes += [f'{word} {", ".join(names)}'] if names else []
     text = f'Found: {"; ".join(changes)}.' if changes else 'No step or drift was found.'
     if len(rows) < trends.FEWEST:

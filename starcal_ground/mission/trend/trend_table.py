@@ -8,8 +8,6 @@ default and not the write-ahead log, whose index is memory shared by all process
 file open: between machines on a network file system there is none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 import contextlib
 from dataclasses import dataclass
@@ -25,16 +23,15 @@ import weakref
 
 import numpy as np
 
+from starcal_ros import files, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import replacing
 from starcal_ros.record_fields import check_shape, Finite, json_object, read_record, Stamp
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable
 from starcal_ros.text import printable
-from starcal_ros.untrusted import check_text, json_value, regular_file
 
 RECORDED, COMPUTED, FAILED = 'recorded', 'computed', 'failed'
 _LONGEST = 20_000  # characters of a text: a path has 4096, each of up to four after `printable`
@@ -91,7 +88,7 @@ class Row:
     def __post_init__(self) -> None:
         """Check what `series` and `trend_page` rely on."""
         for name, value in vars(self).items():
-            if isinstance(value, str) and len(check_text(value)) > _LONGEST:
+            if isinstance(value, str) and len(untrusted.check_text(value)) > _LONGEST:
                 raise ValueError(f'{name}: {len(value)} characters')
         if self.error:
             return
@@ -206,7 +203,7 @@ class Table:
         self.path = Path(os.path.abspath(folder), TABLE_FILE)
         with self._naming():
             if os.path.lexists(self.path):
-                with regular_file(self.path):
+                with untrusted.regular_file(self.path):
                     pass
             # Python 3.13 warns of a connection that is left open. The collector closes it in
             # whichever thread it runs; SQLite itself takes turns.
@@ -298,7 +295,7 @@ class Table:
         path = self.path.with_name(PARQUET_FILE)
         with (
             errors_as(ProductError, path, 'written'),
-            replacing(path) as file,
+            files.replacing(path) as file,
             pq.ParquetWriter(file, schema) as writer,
         ):
             for rows in self.cameras():
@@ -343,6 +340,6 @@ class Table:
 
 def _row(values: dict[str, Any]) -> Row:
     """Row of the values of its columns; raises ValueError in one line."""
-    values.update({name: json_value(values[name]) for name in _LISTS})
+    values.update({name: untrusted.json_value(values[name]) for name in _LISTS})
     values.update({name: bool(values[name]) for name in _FLAGS})
     return read_record(Row, values)

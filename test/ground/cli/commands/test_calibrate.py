@@ -14,8 +14,12 @@ import pytest
 import yaml
 
 from starcal_ground.cli import main
-from starcal_ground.outputs import OBSERVATIONS_FILE
-from starcal_ground.products import NOT_CALIBRATED_FILE, OBSERVATIONS_TOPIC, write_observations
+from starcal_ground.products import (
+    NOT_CALIBRATED_FILE,
+    OBSERVATIONS_FILE,
+    OBSERVATIONS_TOPIC,
+    write_observations,
+)
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import refused_image

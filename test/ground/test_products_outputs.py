@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcal_ground.outputs import same_as_one_of
+from starcal_ground.products import same_as_one_of
 
 
 def test_a_file_is_recognised_by_any_name(tmp_path: Path) -> None:
