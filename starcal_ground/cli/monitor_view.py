@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -46,9 +45,7 @@ class Received:
         refused = Counter(self.refused)
         if observations.refusal:
             refused[observations.refusal] += 1
-        return dataclasses.replace(
-            self, images=self.images + 1, refused=dict(refused), last=observations
-        )
+        return replace(self, images=self.images + 1, refused=dict(refused), last=observations)
 
 
 class Line(Text):

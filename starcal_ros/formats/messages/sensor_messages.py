@@ -15,9 +15,8 @@ from typing import Any, NamedTuple, TypeVar
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
@@ -88,7 +87,7 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
         )
     dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if message.is_bigendian else '<u2')
     # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
-    rows: NDArray[Any] = np.ndarray(
+    rows: AnyArray = np.ndarray(
         (height, width, channels),
         dtype,
         buffer=flat,
@@ -97,7 +96,7 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
     rows = plane(rows, letters, channel) if letters else rows[:, :, 0]
     if encoding in BAYER_ENCODINGS:
         rows = of_mosaic(rows, BAYER_ENCODINGS[encoding][0], channel)
-    pixels: NDArray[Any] = np.ascontiguousarray(rows, dtype.newbyteorder('='))
+    pixels: AnyArray = np.ascontiguousarray(rows, dtype.newbyteorder('='))
     pixels.setflags(write=False)
     return Image(time_ns, pixels)
 
@@ -317,7 +316,7 @@ def refused_from_message(
 
 
 def image_to_message(
-    time_ns: int, pixels: NDArray[Any], frame_id: str, make: codec.Make
+    time_ns: int, pixels: AnyArray, frame_id: str, make: codec.Make
 ) -> codec.Message:
     """Return a sensor_msgs/Image, mono8 or mono16 of (height, width), bgr8 of (h, w, 3)."""
     pixels = np.ascontiguousarray(pixels)
@@ -333,12 +332,12 @@ def image_to_message(
     )
 
 
-def plane(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
+def plane(pixels: AnyArray, letters: str, channel: str) -> AnyArray:
     """Pixels (h, w) of a channel of an image (h, w, c) whose channels have these letters."""
     return np.ascontiguousarray(pixels[:, :, letters.index(channel[0])])
 
 
-def of_mosaic(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
+def of_mosaic(pixels: AnyArray, letters: str, channel: str) -> AnyArray:
     """
     Pixels (h // 2, w // 2) of a colour in a Bayer mosaic (h, w).
 
