@@ -15,8 +15,7 @@ import yaml
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
-from starcal_ros.formats.bag import writer as mcap
-from starcal_ros.formats.bag.typestore import make_message, typestore
+from starcal_ros.formats.bag import typestore as bag_types
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.record_messages import observations_to_message
@@ -53,7 +52,7 @@ class BagWriter:
         with errors_as(BagError, self.file, 'written'):
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self._replacing = replacing(self.file)
-            self._writer = mcap.started(self._replacing.__enter__())
+            self._writer = bag_types.started(self._replacing.__enter__())
         return self
 
     def __exit__(
@@ -90,7 +89,7 @@ class BagWriter:
             number, of_topic = self._channels.get(topic) or self._open(topic, type_name)
             if of_topic != type_name:
                 raise ValueError(f'topic: {topic} holds {of_topic}, not {type_name}')
-            data = mcap.serialised(topic, type_name, message)
+            data = bag_types.serialised(topic, type_name, message)
             self._writer.add_message(
                 number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
             )
@@ -99,7 +98,7 @@ class BagWriter:
         self._last_ns = max(self._last_ns, time_ns)
 
     def _open(self, topic: str, type_name: str) -> tuple[int, str]:
-        self._channels[topic] = mcap.opened(self._writer, topic, type_name), type_name
+        self._channels[topic] = bag_types.opened(self._writer, topic, type_name), type_name
         return self._channels[topic]
 
     def _metadata(self) -> str:
@@ -119,8 +118,8 @@ class BagWriter:
                     'name': topic,
                     'type': type_name,
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': [mcap.offered_qos()],
-                    'type_description_hash': typestore().hash_rihs01(type_name),
+                    'offered_qos_profiles': [bag_types.offered_qos()],
+                    'type_description_hash': bag_types.typestore().hash_rihs01(type_name),
                 },
                 'message_count': self._counts[topic],
             }
@@ -142,31 +141,33 @@ class BagWriter:
 
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
-        message = image_to_message(image, frame_id, make_message)
+        message = image_to_message(image, frame_id, bag_types.make_message)
         self.write(topic, codec.IMAGE_TYPE, image.time_ns, message)
 
     def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
         """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
-        message = attitude_to_message(time_ns, xyzw, frame_id, make_message)
+        message = attitude_to_message(time_ns, xyzw, frame_id, bag_types.make_message)
         self.write(topic, codec.ATTITUDE_TYPE, time_ns, message)
 
     def write_velocity(
         self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
     ) -> None:
         """Write a geometry_msgs/TwistStamped."""
-        message = velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
+        message = velocity_to_message(time_ns, velocity_m_s, frame_id, bag_types.make_message)
         self.write(topic, codec.VELOCITY_TYPE, time_ns, message)
 
     def write_temperature(
         self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
     ) -> None:
         """Write a sensor_msgs/Temperature."""
-        message = temperature_to_message(time_ns, temperature_degc, frame_id, make_message)
+        message = temperature_to_message(
+            time_ns, temperature_degc, frame_id, bag_types.make_message
+        )
         self.write(topic, codec.TEMPERATURE_TYPE, time_ns, message)
 
     def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
         """Write a starcal/StarObservations."""
-        message = observations_to_message(record, frame_id, make_message)
+        message = observations_to_message(record, frame_id, bag_types.make_message)
         self.write(topic, codec.OBSERVATIONS_TYPE, record.time_ns, message)
 
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import dataclasses
-from dataclasses import dataclass
 import difflib
 import functools
 import math
@@ -29,16 +28,15 @@ import types
 from typing import Annotated, Any, get_args, get_origin, get_type_hints, TypeVar, Union
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import AnyArray, Floats, Mask
 from starcal_ros.constants import MAX_STAMP_NS
 from starcal_ros.untrusted import check_text, shown
 
 MOST = sys.float_info.max
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Shape:
     """
     Shape of an array or length of a tuple; a number, or a name, for each dimension.
@@ -51,7 +49,7 @@ class Shape:
     dimensions: tuple[int | str, ...]
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Within:
     """Smallest and largest number allowed, neither infinite; NaN, an unknown number, is within."""
 
@@ -59,28 +57,28 @@ class Within:
     high: float = MOST
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Finite:
     """Numbers that must be known and finite."""
 
     is_finite: bool = True
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Unit:
     """Vectors along the last axis whose length is 1 to a tolerance."""
 
     unit_tolerance: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class OneOf:
     """The texts allowed."""
 
     choices: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Most:
     """Most characters of a text, and most items of a tuple or mapping."""
 
@@ -88,7 +86,7 @@ class Most:
     most_items: int | None = None
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Named:
     """
     Name of a field in messages, where it differs from its own.
@@ -106,7 +104,7 @@ Stamp = Annotated[int, Within(0, MAX_STAMP_NS)]
 Quaternion = Annotated[Floats, Finite(), Shape((4,))]
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FieldType:
     """
     Type of a field of a record, or of the items of one, with its marks.
@@ -435,7 +433,7 @@ def _check_count(kind: FieldType, count: int, path: str) -> None:
         raise ValueError(f'{path}: {count} values, at most {kind.most_items} are read')
 
 
-def _array(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> NDArray[Any]:
+def _array(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> AnyArray:
     assert kind.dtype is not None  # arrays have one
     wanted, depth = kind.dtype, len(kind.dimensions)
     if isinstance(value, np.ndarray):
@@ -478,7 +476,7 @@ def _rows(item: FieldType, value: object, path: str, depth: int) -> Any:
     return rows
 
 
-def _check_numbers(kind: FieldType, array: NDArray[Any], path: str) -> None:
+def _check_numbers(kind: FieldType, array: AnyArray, path: str) -> None:
     """Refuse the first number of an array, or the first vector, that is not allowed."""
     if kind.is_finite or kind.low is not None:
         wrong = ~np.isfinite(array) if kind.is_finite else np.isinf(array)
@@ -498,7 +496,7 @@ def _check_numbers(kind: FieldType, array: NDArray[Any], path: str) -> None:
             raise ValueError(f'{place}: length {norm:.6g} is not 1')
 
 
-def _first(where: Mask, array: NDArray[Any], path: str) -> tuple[str, Any]:
+def _first(where: Mask, array: AnyArray, path: str) -> tuple[str, Any]:
     """Path and value of the first number that a mask marks."""
     index = np.argwhere(where)[0].tolist()
     return path + ''.join(f'[{k}]' for k in index), array[tuple(index)].item()

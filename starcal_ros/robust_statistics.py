@@ -8,25 +8,22 @@ and averages the two middle values of an even count.  These functions take the u
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import AnyArray, Floats
 
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 RAYLEIGH_TO_SIGMA = 1.0 / 1.1774  # median length of a vector of two normal components
 
 
-def median(values: NDArray[Any]) -> float:
+def median(values: AnyArray) -> float:
     """Median of at least one value; the upper middle value of an even count."""
     flat = values.ravel()
     middle = flat.size // 2
     return float(np.partition(flat, middle)[middle])
 
 
-def medians(values: NDArray[Any]) -> Floats:
+def medians(values: AnyArray) -> Floats:
     """Medians (k,) of the columns of (n, k)."""
     middle = len(values) // 2
     return np.asarray(np.partition(values, middle, axis=0)[middle], np.float64)

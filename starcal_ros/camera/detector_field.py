@@ -18,9 +18,8 @@ import functools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Integers
 from starcal_ros.record_fields import Record
 
 # Domain of the cosines in detector sides: a field need not be flat at the border.
@@ -28,7 +27,7 @@ COSINE_DOMAIN = 1.2
 
 
 @functools.lru_cache(maxsize=16)
-def cosine_terms(width: int, height: int, octaves: int) -> tuple[NDArray[np.int64], Indices]:
+def cosine_terms(width: int, height: int, octaves: int) -> tuple[Integers, Indices]:
     """Half waves (t, 2) of the cosines along u and v, and the octave (t,) of each, ascending."""
     most = math.ceil(COSINE_DOMAIN * 2.0**octaves * max(1.0, height / width)) + 1
     i, j = (axis.ravel() for axis in np.meshgrid(np.arange(most), np.arange(most), indexing='ij'))
@@ -90,7 +89,7 @@ def _waves(pixels: Floats, sizes: tuple[int, int], most: Indices) -> list[Floats
     return along
 
 
-def _sizes(terms: NDArray[np.int64]) -> Floats:
+def _sizes(terms: Integers) -> Floats:
     """Return the largest values (t,) of the functions."""
     return np.asarray(np.where(terms > 0, math.sqrt(2.0), 1.0).prod(axis=1))
 
@@ -138,7 +137,7 @@ class DetectorField(Record):
         return np.asarray((table @ along_v * along_u).sum(axis=1).T)
 
     @property
-    def orders(self) -> NDArray[np.int64]:
+    def orders(self) -> Integers:
         """Half waves (t, 2) of the functions along u and v."""
         return cosine_terms(self.width, self.height, self.octaves)[0]
 

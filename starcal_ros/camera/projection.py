@@ -18,7 +18,6 @@ dy up vp, k1 k2 k3 p1 p2); note that ROS orders D as k1 k2 p1 p2 k3.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 import functools
 
 import numpy as np
@@ -57,7 +56,7 @@ _INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal leng
 _HELD_PX = 1e-2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class CameraModel(Record):
     """
     A camera: image size in pixels, parameters and lens model.

@@ -15,14 +15,14 @@ import warnings
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import AnyArray
 from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.untrusted import regular_file
 
 _RGB, _GREY = 3, 2
-MOST_VALUES = 2**27  # per image, all colours; the nodes have the same limit
+MOST_VALUES = sensor_messages.MOST_PIXELS  # per image, all planes of a FITS file
 MOST_BYTES = 2**29  # a larger file is not decoded
 _START_BYTES = 512
 _BLOCK_BYTES = 2**20  # bzip2 gives its first byte after a block of 900 kB
@@ -40,7 +40,7 @@ class Card(NamedTuple):
 
 def read_image(
     path: Path, hdu: str = '', channel: str = '', bayer: str = ''
-) -> tuple[NDArray[Any], Mapping[str, Card]]:
+) -> tuple[AnyArray, Mapping[str, Card]]:
     """
     Unscaled values (height, width) of an image file and its FITS cards; raises IngestError.
 
@@ -110,7 +110,7 @@ def is_fits(path: Path) -> bool:
     return start.startswith(b'SIMPLE  =')
 
 
-def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
+def read_fits(path: Path, hdu: str) -> tuple[AnyArray, Mapping[str, Card]]:
     """Values and cards of the image ``hdu``, or the first, of a FITS file; raises IngestError."""
     with needing('mission', IngestError, path):
         from astropy.io import fits
@@ -178,25 +178,10 @@ def content_of(path: Path, first_bytes: int = MOST_BYTES) -> bytes:
         return file.read(min(size, first_bytes))
 
 
-def decoded(path: Path, content: bytes) -> NDArray[Any]:
-    """
-    Values of an image file without EXIF rotation, colour as BGR; raises IngestError.
-
-    The size in the header of a PNG or TIFF is checked before anything is decoded.
-    """
-    png = sensor_messages.png_header(content)
-    header = png or tiff_header(content)
-    if header and header.width * header.height * header.channels > MOST_VALUES:
-        raise IngestError(f'{path}: its header claims {header.width} x {header.height} pixels')
-    if header and tiff_header(content, 1) == header:
-        raise IngestError(f'{path}: several images: write each image to its own file')
-    if png and sensor_messages.has_surplus(content, png):
-        raise IngestError(f'{path}: inflates to far more than its pixels')
-    import cv2  # slow to import, and the kind of a file needs it not
-
-    values = None
-    with contextlib.suppress(cv2.error):
-        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise IngestError(f'{path}: damaged, or in a format that OpenCV cannot read')
-    return np.asarray(values)
+def decoded(path: Path, content: bytes) -> AnyArray:
+    """Values of an image file of one image, by `sensor_messages.decoded`; raises IngestError."""
+    header = sensor_messages.png_header(content) or tiff_header(content)
+    with errors_as(IngestError, path):
+        if header and tiff_header(content, 1) == header:
+            raise ValueError('several images: write each image to its own file')
+        return sensor_messages.decoded(content, header)

@@ -9,9 +9,8 @@ import textwrap
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Picture, Pixels
+from starcal_ros.arrays import Floats, Picture, Pixels, Singles
 from starcal_ros.camera import project
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
@@ -76,7 +75,7 @@ def annotate_reduced(
     size = _mark_size(picture)
     width = max(1, round(size))
 
-    def reduced(places_px: Floats | NDArray[np.float32]) -> Floats:
+    def reduced(places_px: Floats | Singles) -> Floats:
         return np.asarray((places_px + 0.5) * scale - 0.5, np.float64)
 
     for reason, places in observations.refused_places().items():
@@ -102,7 +101,7 @@ def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Fl
     return project(geometry.camera, directions.T)
 
 
-def stretch(pixels: Pixels) -> NDArray[np.uint8]:
+def stretch(pixels: Pixels) -> Picture:
     """8-bit picture of an image: sky dark, faint stars visible, bright ones white."""
     # Quantiles of a sample of the pixels suffice for a picture.
     sample = pixels[:: max(1, pixels.shape[0] // 256), :: max(1, pixels.shape[1] // 256)]

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
-from dataclasses import dataclass
 import math
 
 import cv2
@@ -36,7 +35,7 @@ _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
 _IMAGES_OF_AN_UNFIT = 10  # cost of an unfit attitude: its search takes as long as five images
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Unfit:
     """Number of images for which a star tracker's attitude was unfit, and the last reason."""
 
@@ -44,7 +43,7 @@ class Unfit:
     why: str = ''  # empty: its attitude was used since
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Track:
     """
     State of an image sequence.

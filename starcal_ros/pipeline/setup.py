@@ -15,19 +15,17 @@ tool, and the tool must distinguish a parameter of a node from a misspelt name.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros import options
-from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.arrays import AnyArray, Floats, Indices, Pixels
 from starcal_ros.assessment.gate import GateOptions, requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import COEFFICIENTS
@@ -442,7 +440,7 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
 def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
     """A copy of a setup with the prior alignment found from the images."""
     prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
-    return dataclasses.replace(setup, prior=prior, is_aligned=True)
+    return replace(setup, prior=prior, is_aligned=True)
 
 
 def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
@@ -456,8 +454,8 @@ def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
     for field in options.option_fields(CalibrationOptions):
         if field.name in changed:
             options.check_value(field, changed[field.name])
-    calibration = dataclasses.replace(setup.calibration, **changed)  # type: ignore[arg-type]
-    return dataclasses.replace(setup, calibration=calibration)
+    calibration = replace(setup.calibration, **changed)  # type: ignore[arg-type]
+    return replace(setup, calibration=calibration)
 
 
 def _mountings(
@@ -598,10 +596,10 @@ def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPix
     """Hot pixels, bad pixels and those without response in the flat field, together."""
     blind = np.empty(0, np.int64) if flat is None else np.flatnonzero(np.isnan(flat))
     index = np.union1d(np.union1d(hot.index, bad), blind)
-    return dataclasses.replace(hot, index=index) if len(index) else hot
+    return replace(hot, index=index) if len(index) else hot
 
 
-def _read(name: str, path: str, width: int, height: int) -> NDArray[Any]:
+def _read(name: str, path: str, width: int, height: int) -> AnyArray:
     expected = f'expected one channel of {width} x {height}'
     try:
         values, _ = read_image(Path(path.removeprefix('file://')))

@@ -9,8 +9,7 @@ detector in addition to the lens model, with the covariance of lines of sight.
 from __future__ import annotations
 
 from collections.abc import Mapping
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 import math
 from typing import Annotated, TYPE_CHECKING
@@ -651,8 +650,8 @@ class Calibration(Record):
             count = p + detector_field.coefficients.size
             if self.field.rows != count:
                 raise ValueError(f'field: covariance of {self.field.rows} rows, not {count}')
-            camera = dataclasses.replace(camera, field=detector_field)
-            geometry = dataclasses.replace(self.geometry, camera=camera)
+            camera = replace(camera, field=detector_field)
+            geometry = replace(self.geometry, camera=camera)
             object.__setattr__(self, 'geometry', geometry)
 
     def __repr__(self) -> str:

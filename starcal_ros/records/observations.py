@@ -5,29 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import dataclasses
-from dataclasses import dataclass
 from enum import IntEnum
 import math
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros import record_fields as fields
+from starcal_ros.arrays import Codes, Floats, Integers, Mask, Pixels, Singles
 from starcal_ros.camera import MAX_SIDE_PX
-from starcal_ros.record_fields import (
-    Count,
-    Finite,
-    Most,
-    Named,
-    OneOf,
-    Quaternion,
-    Record,
-    Shape,
-    Stamp,
-    Unit,
-    Within,
-)
 
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
@@ -61,7 +47,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'other': 'the sender gave a reason that this version does not have',
 }
 """Reasons to refuse an image: stable name -> meaning."""
-_REFUSAL = OneOf(('', *IMAGE_REFUSALS))  # Sphinx cannot show a star within an annotation
+_REFUSAL = fields.OneOf(('', *IMAGE_REFUSALS))  # Sphinx cannot show a star within an annotation
 
 
 def counted_refusal(refusal: str) -> str:
@@ -113,7 +99,7 @@ STAR_REFUSALS: Mapping[str, str] = {
 """Reasons to leave out a single predicted star: stable name -> meaning."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Image:
     """
     One image as its camera gave it.
@@ -126,7 +112,7 @@ class Image:
     pixels: Pixels
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class AttitudeSample:
     """One star-tracker attitude: takes star-tracker coordinates to ICRF; (4,) xyzw, unit."""
 
@@ -134,15 +120,18 @@ class AttitudeSample:
     icrf_from_star_tracker_xyzw: Floats
 
 
-_Name = Annotated[str, Most(most_characters=100)]
-_Side = Annotated[int, Within(0, MAX_SIDE_PX)]
-_Attitude = Annotated[Quaternion, Unit(1e-3)]  # rounding to single precision is smaller
-_FiniteOrNaN = Annotated[float, Within()]
-_FloatsOrNaN = Annotated[NDArray[np.float32], Within(), Shape(('n',))]
+_Name = Annotated[str, fields.Most(most_characters=100)]
+_Side = Annotated[int, fields.Within(0, MAX_SIDE_PX)]
+# Rounding to single precision is smaller.
+_Attitude = Annotated[fields.Quaternion, fields.Unit(1e-3)]
+_FiniteOrNaN = Annotated[float, fields.Within()]
+_FloatsOrNaN = Annotated[Singles, fields.Within(), fields.Shape(('n',))]
+_Vector = Annotated[Floats, fields.Shape((3,))]
+_UNKNOWN, _IDENTITY = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class StarObservations(Record):
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class StarObservations(fields.Record):
     """
     The stars measured and identified in one image, or the reason of its refusal.
 
@@ -210,50 +199,50 @@ class StarObservations(Record):
     (0, (0, 2), nan)
     """
 
-    time_ns: Stamp
+    time_ns: fields.Stamp
     width: _Side
     height: _Side
     refusal: Annotated[str, _REFUSAL]
     detail: str
-    icrf_from_star_tracker_xyzw: Annotated[_Attitude, Named('attitude')]
-    attitude_gap_s: Annotated[float, Within(0)]
-    catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
-    direction_icrf: Annotated[Floats, Finite(), Shape(('n', 3)), Unit(1e-6)]
+    icrf_from_star_tracker_xyzw: Annotated[_Attitude, fields.Named('attitude')]
+    attitude_gap_s: Annotated[float, fields.Within(0)]
+    catalog_id: Annotated[Integers, fields.Shape(('n',))]
+    direction_icrf: Annotated[Floats, fields.Finite(), fields.Shape(('n', 3)), fields.Unit(1e-6)]
     magnitude: _FloatsOrNaN
-    measured_px: Annotated[Floats, Finite(), Shape(('n', 2))]
-    covariance_px2: Annotated[Floats, Finite(), Shape(('n', 3))]
+    measured_px: Annotated[Floats, fields.Finite(), fields.Shape(('n', 2))]
+    covariance_px2: Annotated[Floats, fields.Finite(), fields.Shape(('n', 3))]
     flux_dn: _FloatsOrNaN
     snr: _FloatsOrNaN
-    refused_stars: Annotated[Mapping[str, Count], Most(100, most_items=50)]
+    refused_stars: Annotated[Mapping[str, fields.Count], fields.Most(100, most_items=50)]
     background_dn: _FiniteOrNaN
     noise_dn: _FiniteOrNaN
     psf_sigma_px: _FiniteOrNaN
     catalog_digest: _Name
-    temperature_degc: Annotated[float, Within(-273.15, 1000.0)] = math.nan
+    temperature_degc: Annotated[float, fields.Within(-273.15, 1000.0)] = math.nan
     star_tracker: _Name = ''
-    first_from_star_tracker_xyzw: Annotated[_Attitude, Named('first_from_star_tracker')] = (
-        dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
+    first_from_star_tracker_xyzw: Annotated[_Attitude, fields.Named('first_from_star_tracker')] = (
+        dataclasses.field(default_factory=_IDENTITY.copy)
     )
-    refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',)), Named('refused_star_id')] = (
-        dataclasses.field(default_factory=lambda: np.empty(0, np.int64))
-    )
+    refused_catalog_id: Annotated[
+        Integers, fields.Shape(('m',)), fields.Named('refused_star_id')
+    ] = dataclasses.field(default_factory=lambda: np.empty(0, np.int64))
     refused_px: Annotated[
-        NDArray[np.float32], Finite(), Shape(('m', 2)), Named('refused_star_px')
+        Singles, fields.Finite(), fields.Shape(('m', 2)), fields.Named('refused_star_px')
     ] = dataclasses.field(default_factory=lambda: np.empty((0, 2), np.float32))
-    refused_reason: Annotated[NDArray[np.uint8], Shape(('m',)), Named('refused_star_reason')] = (
+    refused_reason: Annotated[Codes, fields.Shape(('m',)), fields.Named('refused_star_reason')] = (
         dataclasses.field(default_factory=lambda: np.empty(0, np.uint8))
     )
-    star_tracker_rate_rad_s: Annotated[Floats, Within(), Shape((3,))] = dataclasses.field(
-        default_factory=lambda: np.full(3, math.nan)
+    star_tracker_rate_rad_s: Annotated[_Vector, fields.Within()] = dataclasses.field(
+        default_factory=_UNKNOWN.copy
     )
-    star_tracker_rate_sigma_rad_s: Annotated[Floats, Within(0), Shape((3,))] = dataclasses.field(
-        default_factory=lambda: np.full(3, math.nan)
+    star_tracker_rate_sigma_rad_s: Annotated[_Vector, fields.Within(0)] = dataclasses.field(
+        default_factory=_UNKNOWN.copy
     )
-    velocity_sigma_m_s: Annotated[float, Within(0)] = math.nan
-    zenith_icrf: Annotated[Floats, Within(), Shape((3,)), Unit(1e-6)] = dataclasses.field(
-        default_factory=lambda: np.full(3, math.nan)
+    velocity_sigma_m_s: Annotated[float, fields.Within(0)] = math.nan
+    zenith_icrf: Annotated[_Vector, fields.Within(), fields.Unit(1e-6)] = dataclasses.field(
+        default_factory=_UNKNOWN.copy
     )
-    refraction_arcsec: Annotated[Floats, Finite(), Shape((2,))] = dataclasses.field(
+    refraction_arcsec: Annotated[Floats, fields.Finite(), fields.Shape((2,))] = dataclasses.field(
         default_factory=lambda: np.zeros(2)
     )
 
@@ -266,7 +255,7 @@ class StarObservations(Record):
             height=size[1],
             refusal='',
             detail='',
-            icrf_from_star_tracker_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+            icrf_from_star_tracker_xyzw=_IDENTITY.copy(),
             attitude_gap_s=math.nan,
             catalog_id=np.empty(0, np.int64),
             direction_icrf=np.empty((0, 3)),
@@ -287,14 +276,14 @@ class StarObservations(Record):
         """Return the number of stars."""
         return len(self.catalog_id)
 
-    def refused_places(self) -> dict[str, NDArray[np.float32]]:
+    def refused_places(self) -> dict[str, Singles]:
         """Positions (k, 2) of the refused stars by the name of the reason, px."""
         return {
             name: self.refused_px[self.refused_reason == code]
             for code, name in enumerate(self.refused_stars)
         }
 
-    def select(self, keep: NDArray[np.bool_]) -> StarObservations:
+    def select(self, keep: Mask) -> StarObservations:
         """Return the same image with only the stars of an (n,) mask."""
         return dataclasses.replace(
             self, **{name: getattr(self, name)[keep] for name in STAR_COLUMNS}
@@ -322,8 +311,8 @@ def refused_image(
     )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Ensemble(Record):
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Ensemble(fields.Record):
     """
     The input of a calibration: usable images in order of arrival, and counts of the others.
 
@@ -358,8 +347,8 @@ class Ensemble(Record):
         return Ensemble((*self.images, observations), self.refused)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class EnsembleStatus(Record):
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class EnsembleStatus(fields.Record):
     """
     Images and stars collected so far, and the precision of a calibration made from them.
 
@@ -368,13 +357,13 @@ class EnsembleStatus(Record):
     ``images_saved`` counts the images on disk, which survive a crash or a power loss.
     """
 
-    time_ns: Stamp
-    images: Count
-    stars: Count
-    min_images: Count
-    min_stars: Count
-    refused: Mapping[str, Count]
-    coverage: Annotated[NDArray[np.int64], Shape(('coverage_rows', 'coverage_cols'))]
-    parameter_names: Annotated[tuple[str, ...], Shape(('k',))]
-    predicted_sigma: Annotated[Floats, Shape(('k',))]
-    images_saved: Count = 0
+    time_ns: fields.Stamp
+    images: fields.Count
+    stars: fields.Count
+    min_images: fields.Count
+    min_stars: fields.Count
+    refused: Mapping[str, fields.Count]
+    coverage: Annotated[Integers, fields.Shape(('coverage_rows', 'coverage_cols'))]
+    parameter_names: Annotated[tuple[str, ...], fields.Shape(('k',))]
+    predicted_sigma: Annotated[Floats, fields.Shape(('k',))]
+    images_saved: fields.Count = 0

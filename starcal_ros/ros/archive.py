@@ -36,7 +36,7 @@ from typing import Any
 from starcal_ros.errors import ArchiveError, BagError, errors_as, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.reader import read_observations
-from starcal_ros.formats.bag.writer import observations_bag
+from starcal_ros.formats.bag.typestore import observations_bag
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE

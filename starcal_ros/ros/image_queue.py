@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import os
 import threading
@@ -322,7 +321,7 @@ class Unmatched:
             question = (
                 tuple(self._images),
                 wire_attitudes(self._attitudes, self._setup.attitude.attitude_direction),
-                dataclasses.replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
+                replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
             )
             self._thread = threading.Thread(
                 target=self._ask, args=question, name='diagnose', daemon=True

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import threading
 from typing import TYPE_CHECKING
@@ -180,7 +179,7 @@ class CalibratorState:
         with self._disk:
             saved = self._archive.saved(ensemble) if self._archive else 0
         status = solving.ensemble_status(ensemble, self._setup)
-        return dataclasses.replace(status, images_saved=saved)
+        return replace(status, images_saved=saved)
 
     def solve(
         self,
@@ -203,7 +202,7 @@ class CalibratorState:
             return Answer(False, refused, calibration)
         if not calibration.accepted:
             why = (*calibration.reasons, 'activated by request despite the gate')
-            calibration = dataclasses.replace(calibration, reasons=why, forced=True)
+            calibration = replace(calibration, reasons=why, forced=True)
         if dry_run:
             return Answer(True, f'would be activated: {summary(calibration)}', calibration)
         with self._disk:
@@ -248,7 +247,7 @@ class CalibratorState:
                 )
             calibration = self._activate(before.number, earlier[0].before, before)
         answer = self._answer(f'activated again: {summary(calibration)}')
-        return dataclasses.replace(answer, calibration=calibration, active=True)
+        return replace(answer, calibration=calibration, active=True)
 
     def save(self) -> None:
         """Write the records to disk; returns at once where they are there."""
@@ -281,7 +280,7 @@ class CalibratorState:
         self, number: int, before: int, calibration: records.Calibration
     ) -> records.Calibration:
         """Activate a calibration from now on, and save it before anyone else can activate one."""
-        active = dataclasses.replace(calibration, number=number, active_since_ns=self._now_ns())
+        active = replace(calibration, number=number, active_since_ns=self._now_ns())
         record = records.Activation(self._next_event(), before, active)
         with self._records:
             self._history = (*self._history, record)[-_HISTORY:]

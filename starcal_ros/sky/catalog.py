@@ -18,10 +18,9 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.arrays import AnyArray, Codes, Floats, Indices, Mask, Rows
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, errors_as
 from starcal_ros.untrusted import read_archive
@@ -137,7 +136,7 @@ class StarCatalog:
     parallax_rad: Floats
     magnitude: Floats
     colour_bp_rp: Floats
-    motion_source: NDArray[np.uint8]
+    motion_source: Codes
     close_pair: Mask
     epoch_jyear: float
     digest: str
@@ -161,13 +160,13 @@ class StarCatalog:
         """Search tree of the directions."""
         return direction_tree(self.direction_icrs)
 
-    def near(self, direction_icrs: Floats, radius_rad: float) -> NDArray[np.intp]:
+    def near(self, direction_icrs: Floats, radius_rad: float) -> Rows:
         """Rows (m,), ascending, of the stars near any of some directions (n, 3), as `cone`."""
         chord = 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
         rows = self.tree.query_ball_point(direction_icrs, chord)
         return np.unique(np.fromiter(itertools.chain.from_iterable(rows), np.intp))
 
-    def select(self, rows: Mask | Indices | NDArray[np.intp] | slice) -> StarCatalog:
+    def select(self, rows: Mask | Indices | Rows | slice) -> StarCatalog:
         """Return the stars selected by a mask (n,), row numbers or a slice, in that order."""
         columns = {
             field.name: getattr(self, field.name)[rows]
@@ -176,7 +175,7 @@ class StarCatalog:
         }
         return replace(self, **columns)
 
-    def place_sigma_rad(self, rows: Indices | NDArray[np.intp], jyear: float) -> Floats:
+    def place_sigma_rad(self, rows: Indices | Rows, jyear: float) -> Floats:
         """
         1-sigma (m,) per axis of the places of stars in a Julian year, by their `MotionSource`.
 
@@ -198,7 +197,7 @@ class StarCatalog:
         return np.where(self.id[row] == identifiers, self.colour_bp_rp[row], np.nan)
 
 
-def column_digest(columns: Mapping[str, NDArray[np.generic]]) -> str:
+def column_digest(columns: Mapping[str, AnyArray]) -> str:
     """SHA-256 (hexadecimal) of the integer columns with their names, types and epoch."""
     digest = hashlib.sha256(f'starcal {CATALOG_FORMAT} J{CATALOG_EPOCH_JYEAR}'.encode())
     for name, kind in COLUMN_TYPES.items():
@@ -207,7 +206,7 @@ def column_digest(columns: Mapping[str, NDArray[np.generic]]) -> str:
     return digest.hexdigest()
 
 
-def _read_columns(path: Path) -> tuple[dict[str, NDArray[np.generic]], str]:
+def _read_columns(path: Path) -> tuple[dict[str, AnyArray], str]:
     with errors_as(CatalogError, f'{path}: star catalog'):
         entries = read_archive(path, ('format', 'digest', *COLUMN_TYPES))
     missing = [name for name in ('format', 'digest', *COLUMN_TYPES) if name not in entries]
@@ -269,7 +268,7 @@ def _read(path: Path, magnitude_limit: float | None) -> StarCatalog:
     return replace(catalog, deeper=deeper) if len(deeper) else catalog
 
 
-def _scaled(cut: Mapping[str, NDArray[np.generic]], digest: str) -> StarCatalog:
+def _scaled(cut: Mapping[str, AnyArray], digest: str) -> StarCatalog:
     """Catalog of integer columns."""
 
     def scaled(name: str, unit: float) -> Floats:
@@ -298,7 +297,7 @@ def cone(
     direction_icrs: Floats,
     radius_rad: float,
     magnitude_limit: float | None = None,
-) -> NDArray[np.intp]:
+) -> Rows:
     """
     Rows (m,), in ascending order, of all stars that can appear within a radius of a direction.
 

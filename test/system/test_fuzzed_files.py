@@ -30,7 +30,7 @@ from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, proj
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.writer import observations_bag
+from starcal_ros.formats.bag.typestore import observations_bag
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,

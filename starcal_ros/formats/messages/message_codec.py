@@ -35,9 +35,8 @@ import math
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.constants import MAX_STAMP_NS, NANOSECONDS_PER_SECOND
 from starcal_ros.record_fields import fields_of, FieldType, plain_record, read_record
 
@@ -134,7 +133,7 @@ def vector_to_message(xyz: Floats, make: Make) -> Message:
     return make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
 
 
-def flat_array(values: object, dtype: type[np.generic]) -> NDArray[Any]:
+def flat_array(values: object, dtype: type[np.generic]) -> AnyArray:
     """Numbers of any shape as a flat, contiguous array of the type of the field."""
     # Flat and contiguous: rclpy serialises a nested array as garbage without an error.
     return np.ascontiguousarray(values, dtype).reshape(-1)
@@ -256,8 +255,8 @@ def _value(kind: FieldType, value: Any) -> Any:
 
 
 def _shaped(
-    flat: NDArray[Any], kind: FieldType, field: str, sizes: Mapping[int | str, int]
-) -> NDArray[Any]:
+    flat: AnyArray, kind: FieldType, field: str, sizes: Mapping[int | str, int]
+) -> AnyArray:
     """A flat array of a message in its shape; unstated sizes follow from its length."""
     shape = [size if isinstance(size, int) else sizes.get(size, -1) for size in kind.dimensions]
     if shape.count(-1) == 1:

@@ -15,15 +15,14 @@ from typing import Any, NamedTuple, TypeVar
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, refused_image, StarObservations
 
-_MOST_PIXELS = 2**27  # 256 MB of 16 bit, for a camera that is not known
+MOST_PIXELS = 2**27  # of an image: 256 MB of 16 bit
 _SET_CHANNEL = 'is a colour image: set image_channel, e.g. to green'
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 CHANNELS = ('red', 'green', 'blue')
@@ -88,7 +87,7 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
         )
     dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if message.is_bigendian else '<u2')
     # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
-    rows: NDArray[Any] = np.ndarray(
+    rows: AnyArray = np.ndarray(
         (height, width, channels),
         dtype,
         buffer=flat,
@@ -97,7 +96,7 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
     rows = plane(rows, letters, channel) if letters else rows[:, :, 0]
     if encoding in BAYER_ENCODINGS:
         rows = of_mosaic(rows, BAYER_ENCODINGS[encoding][0], channel)
-    pixels: NDArray[Any] = np.ascontiguousarray(rows, dtype.newbyteorder('='))
+    pixels: AnyArray = np.ascontiguousarray(rows, dtype.newbyteorder('='))
     pixels.setflags(write=False)
     return Image(time_ns, pixels)
 
@@ -138,7 +137,7 @@ def jpeg_header(content: bytes) -> Header | None:
     return None
 
 
-def has_surplus(content: bytes, header: Header) -> bool:
+def _has_surplus(content: bytes, header: Header) -> bool:
     """
     True if a PNG inflates to far more than its pixels, which a decoder would throw away.
 
@@ -162,18 +161,40 @@ def has_surplus(content: bytes, header: Header) -> bool:
     return True
 
 
+def decoded(content: bytes, header: Header | None) -> AnyArray:
+    """
+    Values of an image file as stored, without the orientation of EXIF; colours as BGR.
+
+    A file of a few kilobytes can claim gigabytes of pixels, so the header is checked first.
+    Raises ValueError for a file that claims or holds too much, or that cannot be decoded.
+    """
+    if header is not None:
+        sides = header[:2]
+        if min(sides) < 1 or max(sides) > MAX_SIDE_PX or math.prod(sides) > MOST_PIXELS:
+            raise ValueError(f'its header claims {sides[0]} x {sides[1]} pixels')
+        if png_header(content) and _has_surplus(content, header):
+            raise ValueError('inflates to far more than its pixels')
+    import cv2  # slow to import, and few bags have compressed images
+
+    values = None
+    with contextlib.suppress(cv2.error):
+        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise ValueError('damaged, or in a format that OpenCV cannot read')
+    return np.asarray(values)
+
+
 def decode_compressed(
     data: Any, time_ns: int, size: tuple[int, int] | None = None, channel: str = ''
 ) -> Image:
     """
     Pixels of a PNG, 8 or 16 bit, or of a JPEG.
 
-    A PNG of a few kilobytes can claim gigabytes of pixels, so the header is checked first:
-    against ``size`` (width, height) where that is known, else against a limit for any camera.
-    ``channel`` as for `decode_image`.
+    The header is checked before anything is decoded, against ``size`` (width, height) where that
+    is known.  ``channel`` as for `decode_image`.
 
     Raises ImageRefused ``bad_encoding`` for another format; ``wrong_size``; ``bad_layout`` for an
-    image that cannot be decoded.
+    image that is not `decoded`.
     """
     content = bytes(data)
     png = png_header(content)
@@ -190,18 +211,10 @@ def decode_compressed(
         raise ImageRefused(
             'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*claimed, *size)
         )
-    if min(claimed) < 1 or max(claimed) > MAX_SIDE_PX or math.prod(claimed) > _MOST_PIXELS:
-        raise ImageRefused('bad_layout', f'the {kind} claims {claimed[0]} x {claimed[1]} px')
-    if png and has_surplus(content, header):
-        raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
-    import cv2  # slow to import, and few bags have compressed images
-
-    try:  # as stored: the orientation of EXIF is of a viewer
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise ImageRefused('bad_layout', f'{len(content)} bytes of {kind} cannot be decoded')
+    try:
+        pixels = decoded(content, header)
+    except ValueError as error:
+        raise ImageRefused('bad_layout', f'{kind}: {error}') from error
     if is_colour and pixels.ndim == 3:
         pixels = plane(pixels, 'bgr', channel)
     if pixels.shape != claimed[::-1] or pixels.dtype not in (np.uint8, np.uint16):
@@ -210,7 +223,7 @@ def decode_compressed(
             f'the {kind} is {pixels.dtype} of shape {pixels.shape}, not one channel',
         )
     pixels.setflags(write=False)
-    return Image(time_ns, pixels)  # type: ignore[arg-type]
+    return Image(time_ns, pixels)
 
 
 def image_from_message(
@@ -317,7 +330,7 @@ def refused_from_message(
 
 
 def image_to_message(
-    time_ns: int, pixels: NDArray[Any], frame_id: str, make: codec.Make
+    time_ns: int, pixels: AnyArray, frame_id: str, make: codec.Make
 ) -> codec.Message:
     """Return a sensor_msgs/Image, mono8 or mono16 of (height, width), bgr8 of (h, w, 3)."""
     pixels = np.ascontiguousarray(pixels)
@@ -333,12 +346,12 @@ def image_to_message(
     )
 
 
-def plane(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
+def plane(pixels: AnyArray, letters: str, channel: str) -> AnyArray:
     """Pixels (h, w) of a channel of an image (h, w, c) whose channels have these letters."""
     return np.ascontiguousarray(pixels[:, :, letters.index(channel[0])])
 
 
-def of_mosaic(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
+def of_mosaic(pixels: AnyArray, letters: str, channel: str) -> AnyArray:
     """
     Pixels (h // 2, w // 2) of a colour in a Bayer mosaic (h, w).
 

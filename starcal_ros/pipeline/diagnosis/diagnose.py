@@ -11,17 +11,15 @@ same for all images.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 import math
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Integers, Mask
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
@@ -69,7 +67,7 @@ _ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in rang
 class WireAttitudes:
     """Attitudes as received: stamps (n,), ns, and four numbers (n, 4) in the order received."""
 
-    time_ns: NDArray[np.int64]
+    time_ns: Integers
     quaternion: Floats
 
 
@@ -244,7 +242,7 @@ def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> 
     return [_ROLLS[turns] * rotation for turns in (0, 2, 1, 3) for rotation in read]
 
 
-def _agreed(quaternion: Floats) -> tuple[NDArray[np.int64], Floats, Rotation]:
+def _agreed(quaternion: Floats) -> tuple[Integers, Floats, Rotation]:
     """
     Counts (s,), scatters (s,) and means of the largest groups of alignments that agree.
 
@@ -267,8 +265,8 @@ def _agreed(quaternion: Floats) -> tuple[NDArray[np.int64], Floats, Rotation]:
 
 
 def _read_at(
-    attitudes: WireAttitudes, at_ns: NDArray[np.int64], way: tuple[str, str], setup: Setup
-) -> tuple[Rotation | None, NDArray[np.bool_]]:
+    attitudes: WireAttitudes, at_ns: Integers, way: tuple[str, str], setup: Setup
+) -> tuple[Rotation | None, Mask]:
     """
     Rotations ``icrf_from_star_tracker`` at the selected stamps of (n,).
 
@@ -292,7 +290,7 @@ def _read_at(
     return (sent.inv() if direction == 'inertial_to_st' else sent), usable
 
 
-def _to_icrf(axes: str, at_ns: NDArray[np.int64]) -> Rotation:
+def _to_icrf(axes: str, at_ns: Integers) -> Rotation:
     day_ns = 86400 * NANOSECONDS_PER_SECOND
     from_icrf = [_OTHER_AXES[axes](_UNIX_EPOCH_JD, float(ns) / day_ns) for ns in at_ns]
     return Rotation.from_matrix(np.array(from_icrf)).inv()
@@ -315,7 +313,7 @@ def _middle_of_best(tried: Sequence[Reading]) -> Reading:
         last += 1
     middle_s = 0.5 * (by_shift[first].shift_s + by_shift[last].shift_s)
     nearest = min(by_shift[first : last + 1], key=lambda r: abs(r.shift_s - middle_s))
-    return dataclasses.replace(nearest, shift_s=middle_s)
+    return replace(nearest, shift_s=middle_s)
 
 
 @dataclass(frozen=True)
@@ -486,7 +484,7 @@ def _held_against(case: Case, tried: int, shift_s: float) -> Diagnosis:
     )
     findings += [*_focal_length(focal_px, prior_px), *_tone_curve(solved, setup.catalog)]
     joined = _joined(findings, evidence)
-    return dataclasses.replace(joined, images=0 if reading is None else reading.agreeing)
+    return replace(joined, images=0 if reading is None else reading.agreeing)
 
 
 def _joined(findings: Sequence[Diagnosis], evidence: list[str]) -> Diagnosis:
@@ -498,7 +496,7 @@ def _joined(findings: Sequence[Diagnosis], evidence: list[str]) -> Diagnosis:
     for finding in findings:
         evidence += finding.evidence
     evidence += [f'besides: {finding.sentence}' for finding in others]
-    return dataclasses.replace(
+    return replace(
         first,
         evidence=tuple(evidence),
         mend=tuple(line for finding in findings for line in finding.mend),

@@ -20,7 +20,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import frames as frames_module
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag import writer as writer_module
+from starcal_ros.formats.bag import typestore as writer_module
 from starcal_ros.formats.bag.frames import Frame, read_frames, read_telemetry, Telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
 from starcal_ros.records import Image

@@ -27,7 +27,7 @@ from starcal_ground.bag_writer import BagWriter, image_to_message
 from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader as bag_reader
-from starcal_ros.formats.bag import writer as writer_module
+from starcal_ros.formats.bag import typestore as writer_module
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import Damage, Topics
 from starcal_ros.formats.bag.typestore import make_message, typestore

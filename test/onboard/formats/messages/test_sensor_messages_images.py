@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import array
+from pathlib import Path
 import struct
 import sys
 import tracemalloc
@@ -17,8 +18,9 @@ import pytest
 from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import image_to_message
-from starcal_ros.errors import ImageRefused
+from starcal_ros.errors import ImageRefused, IngestError
 from starcal_ros.formats.bag.typestore import make_message, typestore
+from starcal_ros.formats.image_files import read_image
 from starcal_ros.formats.messages.message_codec import (
     COMPRESSED_TYPE,
     IMAGE_TYPE,
@@ -183,6 +185,25 @@ def test_compressed_refusals(data: bytes, reason: str) -> None:
     with pytest.raises(ImageRefused) as refused:
         decode_compressed(array.array('B', data), TIME_NS)
     assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ('content', 'words'),
+    [
+        (png(60000, 60000), 'its header claims 60000 x 60000 pixels'),
+        (png(70000, 2), 'its header claims 70000 x 2 pixels'),
+        (png(4, 3, bytes(10**7)), 'inflates to far more than its pixels'),
+        (cv2.imencode('.png', RAMP)[1].tobytes()[:40], 'damaged, or in a format'),
+    ],
+)
+def test_files_and_messages_refuse_the_same_pictures(
+    tmp_path: Path, content: bytes, words: str
+) -> None:
+    with pytest.raises(ImageRefused, match=f'bad_layout: PNG: {words}'):
+        decode_compressed(content, TIME_NS)
+    (tmp_path / 'a.png').write_bytes(content)
+    with pytest.raises(IngestError, match=rf'a\.png: {words}'):
+        read_image(tmp_path / 'a.png')
 
 
 @pytest.mark.parametrize('ending', ['.png', '.jpg'])
