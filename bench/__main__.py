@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """``python -m bench [NAME...]``: run benches and print their tables."""
 
+from __future__ import annotations
+
 import argparse
 import importlib
 import json

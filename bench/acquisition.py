@@ -8,6 +8,8 @@ row `tracking.track_stars`.  Seeds are fixed; a match is wrong if more than one 
 identified as another one.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 import dataclasses
 from dataclasses import dataclass, field

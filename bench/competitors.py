@@ -6,6 +6,8 @@ Method 1 (`per_image`): eight camera parameters (fixed principal point) and the 
 every image.  SciPy gets the analytic derivatives of `camera.project_jacobians`.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
 

@@ -8,6 +8,8 @@ by the reported 1-sigma.  Mission k of a seed is the same for any count, and wit
 for the departures from the model that a sound mission lacks.
 """
 
+from __future__ import annotations
+
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal trend` over the simulated calibrations of a fleet, all of which its table has."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 import dataclasses
 from dataclasses import dataclass, field

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated frames and the set-up of `starcal calibrate` for them."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 import dataclasses
 from pathlib import Path

@@ -10,6 +10,8 @@ brightness anywhere.  The camera differs from its prior by up to what `lost_in_s
 not at all.  Seeds are fixed.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 import functools

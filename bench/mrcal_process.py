@@ -7,6 +7,8 @@ each star is two fixed points, one behind the other, because with one the place 
 be as good as its rotation or focal length.
 """
 
+from __future__ import annotations
+
 import sys
 import time
 from typing import Any

@@ -7,6 +7,8 @@ Nothing is stated: no attitudes, focal length, lens model, site or velocity.  A 
 where its lines of sight are off by more than five of their sigmas, and accepted.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 import dataclasses
 import math

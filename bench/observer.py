@@ -7,6 +7,8 @@ memory.  A few rendered frames are sent in turn, each with its own attitude and 
 stamp.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator
 import importlib.util

@@ -8,6 +8,8 @@ observed, at most four in flight.  And ten minutes at 10 Hz of 2592 x 2048, for 
 attitude.  The middleware is that of RMW_IMPLEMENTATION.
 """
 
+from __future__ import annotations
+
 import argparse
 from collections import Counter
 from collections.abc import Iterator

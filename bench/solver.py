@@ -6,6 +6,8 @@ About 80 stars per image with 0.1 px noise; the true skew is zero, because OpenC
 are from alternating runs in one process, memory from a separate process per solver.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial

@@ -10,6 +10,8 @@ the RMS of that ratio over the accepted calibrations is 0.7 to 1.5 and none exce
 gate refuses and names the cause.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator
 

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Comparison of two calibrations: parameters, alignment and lines of sight."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 import math
 

@@ -6,6 +6,8 @@ The first bytes decide, not the name.  Each kind that is not read names the comm
 readable file of it.
 """
 
+from __future__ import annotations
+
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path

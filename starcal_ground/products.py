@@ -6,6 +6,8 @@ The folder holds ``residuals.npz`` and, in place of a calibration that failed,
 ``not_calibrated.json``.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 import contextlib
 from dataclasses import dataclass, fields, replace

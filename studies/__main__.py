@@ -5,6 +5,8 @@
 ``paper`` instead simulates the night of the paper and compares the results with its figures.
 """
 
+from __future__ import annotations
+
 import argparse
 from collections.abc import Iterable, Sequence
 import dataclasses

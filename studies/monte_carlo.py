@@ -8,6 +8,8 @@ summarise them in the same way; they differ in their cells and in what is shown.
 pixels at the focal length (28 arcsec) unless the name has another unit.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass

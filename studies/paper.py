@@ -6,6 +6,8 @@ The 359 frames of the scenario `paper` are rendered and measured like any image.
 the results with those of the paper.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass

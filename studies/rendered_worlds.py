@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Rendered images of worlds with a fault of the lens, the detector or the star tracker."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 import dataclasses
 from dataclasses import dataclass

@@ -6,6 +6,8 @@ After each removal the rest is solved again from the last solution, with the sta
 the calibration with all terms, so that the rise of chi^2 is due to the removal alone.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
 

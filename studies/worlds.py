@@ -11,6 +11,8 @@ pixels (n, 2) of points ``x`` (n, 2) in half widths from the centre.  A generato
 gives the same lens.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass, field

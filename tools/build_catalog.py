@@ -24,6 +24,8 @@ Merging of the sources:
    fainter one without a Gaia counterpart is ignored: HIP 71502 is 31 arcsec from its star.
 """
 
+from __future__ import annotations
+
 import argparse
 from dataclasses import dataclass
 import hashlib

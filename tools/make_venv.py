@@ -9,6 +9,8 @@ Each has a stamp that holds the digest of what went into it, written when the st
 The Python package is installed editable, so its sources are live.
 """
 
+from __future__ import annotations
+
 import argparse
 from datetime import date
 import fcntl

@@ -5,6 +5,8 @@ Write requirements/hashes.txt: the digests of every file that PyPI has for a pin
 Run it after a change of a version in requirements/. `make setup` installs nothing else.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 import json

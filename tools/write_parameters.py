@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Write config/starcal.yaml, every parameter with its default, from the options dataclasses."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 import dataclasses
 from pathlib import Path

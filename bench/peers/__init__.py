@@ -6,6 +6,8 @@ Whole pipelines get the images, estimators the same identified stars.  The error
 lines of sight over the detector.  Each peer is scored by its best variant in each campaign.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from functools import partial
 import math

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Campaigns with known truth for all tools, and their results."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 import dataclasses
 from dataclasses import dataclass

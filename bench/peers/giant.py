@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """NASA GIANT 2.0: detection, identification with attitudes, and its calibration of the camera."""
 
+from __future__ import annotations
+
 from copy import deepcopy
 import dataclasses
 from datetime import datetime, timedelta

@@ -5,6 +5,8 @@ Source Extractor and SCAMP: one distortion of degree 3 and linear terms of each 
 The median over the images is the camera.  The settings are not tuned.
 """
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 import resource

@@ -6,6 +6,8 @@ SciPy gets starcal's camera with its derivatives.  Its sigma is computed here, f
 the minimum and scaled by the residuals.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 from pathlib import Path

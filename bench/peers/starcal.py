@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """starcal: the command from a bag to the products, and its estimator with all checks alone."""
 
+from __future__ import annotations
+
 from pathlib import Path
 import tempfile
 

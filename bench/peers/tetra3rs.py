@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """tetra3rs: detection, identification by patterns, and its calibration of the camera."""
 
+from __future__ import annotations
+
 import functools
 import importlib.util
 import math

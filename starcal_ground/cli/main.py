@@ -8,6 +8,8 @@ stderr; 130 interrupted.
 """
 
 # PYTHON_ARGCOMPLETE_OK: the shell's global completion looks for this word.
+from __future__ import annotations
+
 import argparse
 from collections.abc import Collection, Sequence
 import difflib

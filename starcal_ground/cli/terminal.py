@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Progress bars, tables and verdicts: drawn on a terminal, plain lines in a pipe or a file."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 import os

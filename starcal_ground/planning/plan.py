@@ -12,6 +12,8 @@ the stars do not show: its bound falls as stars are added (`forecast`).  So a fo
 nothing at random, never rises with an image, and does not depend on the order of the images.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 import dataclasses
 import math

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Figures over the detector and over the sky."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 import functools
 from pathlib import Path

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Figures of the report: residuals, terms, and the causes of the sigma."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 import functools
 import math

@@ -6,6 +6,8 @@ The report is made from the product files of a folder; a section whose file is m
 The page needs no network: styles, script and pictures are embedded.
 """
 
+from __future__ import annotations
+
 import base64
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

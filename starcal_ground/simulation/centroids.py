@@ -6,6 +6,8 @@ Simulated centroids without pixels, and Cramer-Rao bounds.
 `cramer_rao_covariance` is the bound of the camera parameters estimated from them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 import dataclasses
 import math

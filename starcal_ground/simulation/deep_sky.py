@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A sky with stars below the bundled catalog in one region, and the table of a star archive."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 

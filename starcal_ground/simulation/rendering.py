@@ -7,6 +7,8 @@ the camera during the exposure; photon, dark and read noise; hot pixels; cosmic 
 quantisation.  Not modelled: flat-field errors.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 import math
 

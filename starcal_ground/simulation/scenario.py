@@ -10,6 +10,8 @@ Modelled: proper motion and aberration of the catalog, and star-tracker errors: 
 or one of each sample.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 import functools

@@ -5,6 +5,8 @@ Writer of simulated scenarios: a bag, its truth, and the files to calibrate it.
 Deliberate mistakes of the set-up serve to practise their diagnosis.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 import dataclasses
 import json

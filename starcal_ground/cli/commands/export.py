@@ -20,6 +20,8 @@ C represent the whole camera, as do the tables of starcal lookup.
   starcal export newer --to c --table -o uplink
 """
 
+from __future__ import annotations
+
 import argparse
 import math
 from pathlib import Path

@@ -17,6 +17,8 @@ parameter file beside the bag.
   starcal simulate -o mirrored --scenario tiny --flip
 """
 
+from __future__ import annotations
+
 import argparse
 import dataclasses
 

@@ -14,6 +14,8 @@ time, steps and drifts with p-values, and the change that a recalibration would 
   starcal trend /data/fleet -o trend --params camera.yaml --scheduler tcp://host:8786
 """
 
+from __future__ import annotations
+
 import argparse
 from collections.abc import Iterator
 import contextlib

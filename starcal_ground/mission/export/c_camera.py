@@ -7,6 +7,8 @@ terms of the field (2 x uint16) and the covariance of the field (int16).  The CR
 after itself.  `starcal_load` in ``c/starcal_camera.c`` is its reader.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 import hashlib
 from importlib import resources

@@ -14,6 +14,8 @@ line of sight) and ISIS (CameraDistortionMap: ``OD_K``; CameraFocalPlaneMap: ``I
 ``ITRANSL``).  The first pixel has its centre at (0.5, 0.5) in an ISD, at (1, 1) in ISIS.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 

@@ -6,6 +6,8 @@ With its origin they are the comment of an exported file.  Names and reasons hol
 comment, and each text in a format without escapes, passes `ascii_line`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

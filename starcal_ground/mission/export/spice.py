@@ -10,6 +10,8 @@ own, so that nothing is interpolated from one to the next.  Sources: NAIF's Fram
 to frame coordinates) and the specification of GETFOV.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

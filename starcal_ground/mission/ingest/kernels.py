@@ -6,6 +6,8 @@ SPICE's frame J2000 is the ICRF.  Times go through the leap seconds kernel that 
 they are those of the tools that made the other kernels.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 import contextlib
 from datetime import datetime, timezone

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attitudes and velocities from files of any format that is read here."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -10,6 +10,8 @@ of the residuals, but at least that of the sigmas; the p-value of a step is mult
 number of places that it could stand at (Bonferroni).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 import itertools

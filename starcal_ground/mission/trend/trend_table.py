@@ -8,6 +8,8 @@ default and not the write-ahead log, whose index is memory shared by all process
 file open: between machines on a network file system there is none.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 import contextlib
 from dataclasses import dataclass
