@@ -31,8 +31,6 @@ _MOST_STARS = 150  # stars used; more take longer and add little
 _CUTS = 48  # rows tested; one or two stars on the wrong side do not hide a jump
 _AGREE = 0.7  # share of the stars of a side that must follow the jump
 _LEAST_PX = 0.5  # whole rows or columns are lost
-# Of waves over the rows, as a line of sight that swings or hot air make them: cycles.
-_WAVES = np.linspace(0.5, 8.0, 16)
 # Rise of chi^2 without the jump.  290 intact frames stayed below 10 after outliers had lost their
 # weight; normal noise reaches 40 at one of the cuts once in 10^7.
 _LEAST_RISE = 40.0
@@ -47,8 +45,7 @@ def find_line_loss(
 
     ``predicted_px``, ``measured_px`` (n, 2) of the good stars, ``sigma_px`` (n,) noise per axis.
     For each tested row, a robust fit of the residuals with a polynomial in u and v and a step.  A
-    smooth error of the prior, even a large one, is not a jump; nor is what a wave over the rows
-    fits better.
+    smooth error of the prior, even a large one, is not a jump.
     """
     # The smooth part can take up half of a jump.
     away_px = np.hypot(*(measured_px - predicted_px).T) - 2.0 * sigma_px
@@ -76,11 +73,10 @@ def find_line_loss(
     root = 1.0 / np.hypot(sigma_px, _FLOOR_PX)
     weight = root
     for power in (0.5, 1.0, 1.0, 1.0):
-        weights = weight[:, None]
-        Q, _ = np.linalg.qr(smooth * weights)
-        left = (measured_px - predicted_px) * weights
+        Q, _ = np.linalg.qr(smooth * weight[:, None])
+        left = (measured_px - predicted_px) * weight[:, None]
         left = left - Q @ (Q.T @ left)
-        jump = steps * weights
+        jump = steps * weight[:, None]
         jump = jump - Q @ (Q.T @ jump)
         size2 = (jump**2).sum(axis=0)
         off_px = (jump.T @ left) / np.maximum(size2, 1e-9)[:, None]
@@ -94,11 +90,6 @@ def find_line_loss(
     agree = off_sigma < 4.0 * scatter
     side = steps[:, k] == (2.0 * steps[:, k].mean() < 1.0)  # the side with fewer stars
     if np.hypot(*off_px[k]) < _LEAST_PX or agree[side].mean() < _AGREE:
-        return None
-    angle = 2.0 * np.pi * np.outer(_WAVES, predicted_px[:, 1] / height)
-    waves = np.stack([np.sin(angle), np.cos(angle)], axis=2) * weights
-    waves, _ = np.linalg.qr(waves - Q @ (Q.T @ waves))
-    if rise[k] < ((waves.transpose(0, 2, 1) @ left) ** 2).sum(axis=(1, 2)).max():
         return None
     return round(float(rows[k])), off_px[k]
 

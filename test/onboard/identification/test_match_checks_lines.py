@@ -113,18 +113,6 @@ def test_wrong_stars_on_one_side_make_no_tear() -> None:
         assert find_line_loss(xy, measured, sigma, SHAPE) is None
 
 
-@pytest.mark.parametrize('cycles', [1.0, 2.1, 3.3, 6.2, 7.7])
-@pytest.mark.parametrize('size_px', [0.3, 2.0])
-def test_a_wave_over_the_rows_is_no_jump(cycles: float, size_px: float) -> None:
-    """As of a line of sight that swings while a rolling shutter reads out."""
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        xy, sigma = places(150, seed), np.full(150, 0.05)
-        wave = size_px * np.sin(2.0 * np.pi * cycles * xy[:, 1] / SHAPE[0] + rng.uniform(0.0, 6.3))
-        measured = xy + 0.05 * rng.normal(size=(150, 2)) + np.outer(wave, [0.8, 0.6])
-        assert find_line_loss(xy, measured, sigma, SHAPE) is None
-
-
 def test_columns_that_are_shifted_are_told() -> None:
     rng = np.random.default_rng(4)
     xy, sigma = places(100), np.full(100, 0.1)
