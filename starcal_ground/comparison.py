@@ -104,7 +104,8 @@ class Comparison:
 
     Examples
     --------
-    >>> import dataclasses, starcal_ground, starcal_ros
+    >>> from dataclasses import replace
+    >>> import starcal_ground, starcal_ros
     >>> a = starcal_ros.read_calibration('out')
     >>> longer = a.geometry.camera.replace(fx=a.geometry.camera.camera_matrix[0, 0] + 0.5)
     >>> b = replace(a, geometry=replace(a.geometry, camera=longer))

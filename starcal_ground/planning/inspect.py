@@ -226,7 +226,7 @@ def cause_of(
     refused: Sequence[Refused],
     images: int,
 ) -> Diagnosis | None:
-    """The cause for which images are refused, by a diagnosis where all are; None: none is."""
+    """The cause for which images are refused, by a diagnosis where all are; None if none shows."""
     if setup is None or not requested.image or sum(group.count for group in refused) < images:
         return bags.of_refusals(refused, images)
     try:

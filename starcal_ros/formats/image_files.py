@@ -182,6 +182,8 @@ def decoded(path: Path, content: bytes) -> AnyArray:
     """Values of an image file of one image, by `sensor_messages.decoded`; raises IngestError."""
     header = sensor_messages.png_header(content) or tiff_header(content)
     with errors_as(IngestError, path):
+        if header and math.prod(header) > MOST_VALUES:
+            raise ValueError(f'its header claims {header.width} x {header.height} pixels')
         if header and tiff_header(content, 1) == header:
             raise ValueError('several images: write each image to its own file')
         return sensor_messages.decoded(content, header)

@@ -91,7 +91,7 @@ def test_a_library_that_is_loaded_later_has_one_thread_too() -> None:
     assert done.stdout.split()[1:] == ['1'], done.stdout + done.stderr
 
 
-def test_all_of_a_calibration_from_python_is_on_one_thread() -> None:
+def test_the_estimate_of_a_calibration_from_python_is_on_one_thread() -> None:
     libraries = ThreadpoolController().select(user_api='blas').lib_controllers
     numbers: set[int] = set()
 

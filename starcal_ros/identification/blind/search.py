@@ -437,17 +437,22 @@ def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
 def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
     if radius_rad < _TABLED_RAD:
-        stars = _bright_stars(catalog, math.ceil(math.degrees(radius_rad)))
+        stars = _bright_stars(catalog, _rounded_up(radius_rad))
         return pattern_index.brightest_within(stars, axes, radius_rad, count)
     points, rows = _bright_everywhere(catalog, radius_rad, count)
     return np.asarray(rows[points.query(axes)[1]])
 
 
+def _rounded_up(radius_rad: float) -> float:
+    """The next power of the root of two, so that discs of nearly one size have one search tree."""
+    return float(2.0 ** (math.ceil(2.0 * math.log2(radius_rad)) / 2.0))
+
+
 @functools.lru_cache(maxsize=8)
-def _bright_stars(catalog: StarCatalog, radius_deg: int) -> cKDTree:
+def _bright_stars(catalog: StarCatalog, radius_rad: float) -> cKDTree:
     """Search tree of the stars that discs of a radius need."""
     # The emptiest discs hold half of the mean number, which is still most of the stars tested.
-    sky_by_disc = 2.0 / (1.0 - math.cos(math.radians(radius_deg)))
+    sky_by_disc = 2.0 / (1.0 - math.cos(min(radius_rad, math.pi)))
     return pattern_index.tree_of_brightest(catalog, int(5 * _TESTED * sky_by_disc))
 
 
@@ -457,7 +462,7 @@ def _bright_everywhere(
 ) -> tuple[cKDTree, Indices]:
     """Search tree of points all over the sky, and rows (p, count) of `_bright_about` for them."""
     points = pattern_index.sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    stars = _bright_stars(catalog, math.ceil(math.degrees(radius_rad)))
+    stars = _bright_stars(catalog, _rounded_up(radius_rad))
     # It holds the disc about each axis that is nearest to the point.
     wider_rad = min(1.25 * radius_rad, math.pi)
     return direction_tree(points), pattern_index.brightest_within(stars, points, wider_rad, count)

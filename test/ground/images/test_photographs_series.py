@@ -249,13 +249,16 @@ def test_damaged_and_strange_files_are_one_line(tmp_path: Path) -> None:
 
 
 def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path: Path) -> None:
-    _, png = cv2.imencode('.png', np.zeros((9, 9), np.uint8))
-    content = bytearray(png.tobytes())
-    content[16:24] = struct.pack('>II', 60000, 60000)  # width and height of its header
-    content[29:33] = struct.pack('>I', zlib.crc32(content[12:29]))
-    (tmp_path / 'a.png').write_bytes(content)
-    with pytest.raises(IngestError, match=r'a\.png: its header claims 60000 x 60000 pixels'):
-        look(tmp_path / 'a.png', PLAIN)
+    for side, shape in ((60000, (9, 9)), (11585, (9, 9, 4))):
+        _, png = cv2.imencode('.png', np.zeros(shape, np.uint16))
+        content = bytearray(png.tobytes())
+        content[16:24] = struct.pack('>II', side, side)  # width and height of its header
+        content[29:33] = struct.pack('>I', zlib.crc32(content[12:29]))
+        (tmp_path / 'a.png').write_bytes(content)
+        with pytest.raises(
+            IngestError, match=rf'a\.png: its header claims {side} x {side} pixels'
+        ):
+            look(tmp_path / 'a.png', PLAIN)
     tiled = fits.CompImageHDU(np.zeros((9, 9), np.uint8))
     tiled.writeto(tmp_path / 'a.fits')
     content = bytearray((tmp_path / 'a.fits').read_bytes())

@@ -27,7 +27,7 @@ from starcal_ground.bag_writer import BagWriter, image_to_message
 from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader as bag_reader
-from starcal_ros.formats.bag import typestore as writer_module
+from starcal_ros.formats.bag import typestore as typestore_module
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import Damage, Topics
 from starcal_ros.formats.bag.typestore import make_message, typestore
@@ -86,7 +86,7 @@ def test_round_trip(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType, name: str
 ) -> None:
     """Records survive writing and reading, as a folder and as a file, however compressed."""
-    monkeypatch.setattr(writer_module, '_COMPRESSION', compression)
+    monkeypatch.setattr(typestore_module, '_COMPRESSION', compression)
     path = write_bag(tmp_path / name)
     assert (tmp_path / name).is_file() == name.endswith('.mcap')
     images = images_of(path)
@@ -303,7 +303,7 @@ def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
 def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag of many small chunks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writer_module, '_CHUNK_BYTES', 800)
+        patch.setattr(typestore_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
     return next(folder.glob('*.mcap'))
 
