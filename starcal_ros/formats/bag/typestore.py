@@ -31,7 +31,7 @@ _CHUNK_BYTES = 4 << 20  # an image or two: lost in a crash, and held in memory b
 
 
 def make_message(type_name: str, /, **fields: Any) -> message_codec.Message:
-    """Return a rosbags message: the ``make`` argument of the functions in ``messages`."""
+    """Return a rosbags message, for the functions that take a ``make``."""
     return typestore().types[type_name](**fields)
 
 
