@@ -263,12 +263,13 @@ class StarObserver(StarcalNode):
         self._queue.call(functools.partial(self.guarded(function), *arguments))
 
     def _measure_all(self) -> None:
-        heard_by_s = math.inf
+        ready_by_s = math.inf
         while (waiting := self._queue.take()) is not None:
             # Where all nodes start at once, the first image may be faster than the discovery of
-            # the calibrator, and its observations would reach nobody.
-            heard_by_s = min(heard_by_s, time.monotonic() + _DISCOVERY_S)
-            while not self._is_heard() and time.monotonic() < heard_by_s:
+            # the calibrator, and its observations would reach nobody; or than the velocity, which
+            # would then be an unknown of the calibration.
+            ready_by_s = min(ready_by_s, time.monotonic() + _DISCOVERY_S)
+            while not (self._is_heard() and self._is_told()) and time.monotonic() < ready_by_s:
                 time.sleep(0.02)  # rclpy cannot wait for a match
             try:
                 self._measure(waiting)
@@ -287,6 +288,16 @@ class StarObserver(StarcalNode):
             return True
         known = self.count_subscribers(self._observations.topic_name)
         return bool(known) and self._observations.get_subscription_count() >= known
+
+    def _is_told(self) -> bool:
+        """Return True if velocity and temperature have come, where the graph has a publisher."""
+        return all(
+            self.taken(callback) or not self.count_publishers(self.resolve_topic_name(topic))
+            for topic, callback in (
+                ('velocity', self._on_velocity),
+                ('temperature', self._on_temperature),
+            )
+        )
 
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:

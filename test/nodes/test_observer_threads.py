@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import dataclasses
 from pathlib import Path
 import threading
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pytest
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
+from geometry_msgs.msg import TwistStamped
 from node_inputs import in_this_process  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag import reader
@@ -24,6 +26,9 @@ from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
 from starcal_ros.ros.image_queue import Waiting
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
+
+if TYPE_CHECKING:
+    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 
@@ -55,6 +60,18 @@ def test_the_worker_alone_changes_prediction_and_counts(
     go_on.set()
     assert done.wait(240.0)
     assert observer._geometry is not prior
+
+
+def test_the_first_image_awaits_a_velocity_that_has_a_publisher(
+    observer: StarObserver, client: Client
+) -> None:
+    assert observer._is_told()
+    client.publisher(TwistStamped, observer.resolve_topic_name('velocity'))
+    client.until(lambda: not observer._is_told())
+    message = TwistStamped()
+    message.header.frame_id = 'icrf'
+    observer.taking(observer._on_velocity)(message)
+    assert observer._is_told()
 
 
 def test_a_refusal_has_the_cause_once_it_is_known(observer: StarObserver, tiny_bag: Path) -> None:
