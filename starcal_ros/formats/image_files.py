@@ -22,7 +22,7 @@ from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.untrusted import regular_file
 
 _RGB, _GREY = 3, 2
-MOST_VALUES = sensor_messages.MOST_PIXELS  # per image, all planes of a FITS file
+MOST_VALUES = sensor_messages.MOST_PIXELS  # per image: of all channels, or planes of FITS
 MOST_BYTES = 2**29  # a larger file is not decoded
 _START_BYTES = 512
 _BLOCK_BYTES = 2**20  # bzip2 gives its first byte after a block of 900 kB

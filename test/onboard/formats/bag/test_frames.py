@@ -228,8 +228,8 @@ def test_an_error_of_reading_reaches_the_caller(tmp_path: Path) -> None:
         list(read_frames([file], TOPICS, OPTIONS))
 
 
-# An image at a time is read ahead: whether all that may be in memory is there already after
-# fifteen images, or later, depends on the threads.
+# Whether all that may be read ahead is in memory already after fifteen images, or later, depends
+# on the threads.
 MEMORY = """
 import resource, sys
 from starcal_ros.formats.bag import frames
