@@ -96,7 +96,8 @@ def observations_of(
         Temperature of the camera; NaN if not measured.
     star_tracker_rate_rad_s, star_tracker_rate_sigma_rad_s : (3,)
         Angular rate at that time about the axes of the star tracker, and its 1-sigma; NaN if not
-        known.  A time of read-out or an offset of the stamps is estimated only with a rate.
+        known.  Without one in any image, what a camera can turn while it is read out is in the
+        sigma: state it, or ``shutter='global'``.
     velocity_sigma_m_s : float
         1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: not
         known.

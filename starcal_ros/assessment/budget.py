@@ -160,6 +160,11 @@ def _to_state(
     if cause == 'velocity' and options.velocity_sigma_m_s < 0:
         velocity = 'observer_velocity_m_s, or record the topic velocity'
         return velocity, 'known to 10 m/s', (10.0 / layout['velocity'].sigma[0]) ** 2
+    if cause == 'read-out' and len(layout['readout']) > 1:  # no image has a rate
+        rates = 'star_tracker_rate_rad_s of the images'
+        if options.shutter == 'unknown':
+            return f'shutter, or {rates}', 'global, or known', 0.0
+        return rates, 'known', 0.0
     if cause == 'read-out' and options.shutter == 'unknown':
         return 'shutter (and readout_s)', 'global, or rolling with a known readout_s', 0.0
     if cause == 'refraction':
@@ -285,7 +290,7 @@ def _unknowns(
             'velocity': _of_velocity(sigma, options),
             'refraction': f'site not given: {significant(sigma, 3)} arcsec at 45 degrees assumed',
             'readout': _of_readout(layout[name].labels[0], sigma, options),
-            'stamps': f'{significant(1e3 * sigma, 3)} ms assumed',
+            'stamps': _of_stamps(layout[name].labels[0], sigma),
             'field': _estimated(_field_px(estimate), field.likelihood_ratio),
             'mountings': f'{significant(sigma / ARCSECOND_RAD, 3)}″ per angle assumed',
         }.get(name, 'estimated, no prior')
@@ -359,11 +364,15 @@ def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
 
 
 def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:
+    if options.shutter != 'unknown' and not label.endswith('_rad'):
+        return f'{significant(1e3 * sigma, 3)} ms stated'
+    return 'shutter unknown: ' * (options.shutter == 'unknown') + _of_stamps(label, sigma)
+
+
+def _of_stamps(label: str, sigma: float) -> str:
     if label.endswith('_rad'):  # of a rate that is not known
-        angle_arcsec = significant(sigma / ARCSECOND_RAD, 3)
-        return f'rate not known: {angle_arcsec}″ per axis within an image assumed'
-    size = f'{significant(1e3 * sigma, 3)} ms'
-    return f'shutter unknown: {size} assumed' if options.shutter == 'unknown' else f'{size} stated'
+        return f'rate not known: {significant(sigma / ARCSECOND_RAD, 3)}″ per axis assumed'
+    return f'{significant(1e3 * sigma, 3)} ms assumed'
 
 
 def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:

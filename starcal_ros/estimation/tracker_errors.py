@@ -288,7 +288,10 @@ def _restricted(
     return -0.5 * (error.shape[1] * log_det + squared), (1.0 / alone) @ ones**2
 
 
-UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit
+_UNKNOWN_RATE_RAD_S = 6.4e-4  # of each axis: that of a low orbit, 1.1e-3, about any of them
+# Images so near in time show how fast a camera turns: a tenth of a low orbit, in which it neither
+# comes round nor often turns away and back.
+_NEAR_S = 600.0
 _SHORTEST_GAP_S = 0.1  # between the samples of a rate whose sender states neither sigma nor gap
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
 _FEWEST_RATES = 3  # whose scatter bounds the sigma that a sender does not state
@@ -304,7 +307,7 @@ class Rates:
     Attributes
     ----------
     rad_s : (m, 3)
-        NaN where no image has one.
+        NaN where no image has one: the errors are then those of one rate of all images.
     root_rad_s : (m, 3, 3)
     readout_s : float
         Root mean square of the time of read-out.
@@ -330,7 +333,8 @@ def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats
     the images are not lowered for it: together they are the error of the mean.
 
     A sigma that is not stated is that of two samples of a star tracker of sigma (3,), at most the
-    scatter of the rates.
+    scatter of the rates.  Where no image has a rate, the camera is assumed to turn about as fast
+    as it does from image to image, at most as in a low orbit.
     """
     m = len(images)
     rate = np.array([image.star_tracker_rate_rad_s for image in images])
@@ -338,7 +342,7 @@ def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats
     gap_s = np.array([image.attitude_gap_s for image in images])
     known = np.isfinite(rate).all(axis=1)
     if not known.any():
-        return Rates(rate, np.zeros((m, 3, 3)))
+        return Rates(rate, np.tile(_rate_between_rad_s(images) * np.eye(3), (m, 1, 1)))
     several = np.count_nonzero(known) > 1
     scatter = np.cov(rate[known].T) if several else np.zeros((3, 3))
     between = math.sqrt(2.0) * tracker_sigma_rad / np.fmax(gap_s, _SHORTEST_GAP_S)[:, None]
@@ -349,7 +353,7 @@ def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats
     likely = 1.0 + 2.0 * math.sqrt(2.0 / max(np.count_nonzero(known) - 1, 1))
     values, vectors = np.linalg.eigh(scatter - likely * own[known].mean(axis=0))
     without_errors = (vectors * values.clip(0.0)) @ vectors.T
-    own[~known] = without_errors + UNKNOWN_RATE_RAD_S**2 * np.eye(3)
+    own[~known] = without_errors + _UNKNOWN_RATE_RAD_S**2 * np.eye(3)
     weight = known / (np.trace(without_errors) + np.einsum('mii->m', own) + _LEAST_RAD2_S2)
     mean = (weight @ np.where(known[:, None], rate, 0.0)) / weight.sum()
     off = np.where(known[:, None], rate - mean, 0.0)
@@ -357,6 +361,16 @@ def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats
     shrunk = np.linalg.solve(total, off[:, :, None])[:, :, 0] @ without_errors
     root = np.asarray(np.linalg.cholesky(own + _LEAST_RAD2_S2 * np.eye(3)))
     return Rates(mean + shrunk, root)
+
+
+def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:
+    """Return the middle rate at which images follow each other, at most that of an orbit."""
+    ordered = sorted(images, key=lambda image: image.time_ns)
+    attitudes = Rotation.from_quat([image.icrf_from_star_tracker_xyzw for image in ordered])
+    apart_s = np.diff([image.time_ns for image in ordered]) / NANOSECONDS_PER_SECOND
+    near = (apart_s > 0) & (apart_s < _NEAR_S)
+    rates = (attitudes[:-1].inv() * attitudes[1:]).magnitude()[near] / apart_s[near]
+    return min(float(np.median(rates)), _UNKNOWN_RATE_RAD_S) if near.any() else _UNKNOWN_RATE_RAD_S
 
 
 @dataclass(frozen=True)

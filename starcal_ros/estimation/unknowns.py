@@ -47,7 +47,7 @@ from starcal_ros.estimation.problem import (
     turn_derivatives,
     turns_chain,
 )
-from starcal_ros.estimation.tracker_errors import Rates, UNKNOWN_RATE_RAD_S
+from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.records import ALIGNMENT_NAMES
 from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
 
@@ -416,27 +416,22 @@ def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:
 
 def _of_timing(rates: Rates, height: int, assumed: Assumptions) -> list[Unknown]:
     """Return the entries of the read-out and of the stamps: what a camera that turns shows."""
-    mean_s, sigma_s = assumed.readout_s
-    rates_rad_s = rates.rad_s
-    if not np.isfinite(rates_rad_s).all():
-        # A rolling shutter by its data sheet, at a rate that no image has.
-        turn_rad = abs(mean_s) * UNKNOWN_RATE_RAD_S
-        axes: Floats = np.broadcast_to(np.eye(3), (len(rates_rad_s), 3, 3))
-        labels = ('readout_x_rad', 'readout_y_rad', 'readout_z_rad')
-        readout = Unknown('readout', labels, np.full(3, turn_rad), np.zeros(3))
-        readout = dataclasses.replace(readout, turn=functools.partial(_by_readout, axes, height))
-        return [readout] if turn_rad else []
-    if not rates_rad_s.any():
+    (mean, readout), stamps = assumed.readout_s, assumed.stamp_s
+    by_time = rates.rad_s[:, :, None]
+    labels: tuple[tuple[str, ...], ...] = ('readout_s',), ('stamp_offset_s',)
+    if not np.isfinite(by_time).all():  # the turns by one rate that all images may have
+        rate_rad_s = float(np.linalg.norm(rates.root_rad_s[0, 0]))
+        by_time = np.broadcast_to(np.eye(3), (len(by_time), 3, 3))
+        mean, readout, stamps = 0.0, rate_rad_s * math.hypot(mean, readout), rate_rad_s * stamps
+        labels = tuple(tuple(f'{of}_{k}_rad' for k in 'xyz') for of in ('readout', 'stamp_offset'))
+    if not by_time.any():
         return []
-    entries = []
-    by_time = rates_rad_s[:, :, None]
-    if sigma_s > 0:
+    entries, one = [], np.ones(by_time.shape[2])
+    if readout > 0:
         turn = functools.partial(_by_readout, by_time, height)
-        value = np.array([-mean_s])
-        entries.append(Unknown('readout', ('readout_s',), np.array([sigma_s]), value, turn=turn))
-    if assumed.stamp_s > 0:
-        sigma = np.array([assumed.stamp_s])
-        entries.append(Unknown('stamps', ('stamp_offset_s',), sigma, np.zeros(1), tracker=by_time))
+        entries.append(Unknown('readout', labels[0], readout * one, -mean * one, turn=turn))
+    if stamps > 0:
+        entries.append(Unknown('stamps', labels[1], stamps * one, 0.0 * one, tracker=by_time))
     return entries
 
 
@@ -447,7 +442,7 @@ def _errors_of_rates(rates: Rates, height: int) -> list[Unknown]:
     In units of their priors.
     """
     turns = rates.readout_s * rates.root_rad_s
-    if np.abs(turns).max() < _NO_TURN_RAD:
+    if np.abs(turns).max() < _NO_TURN_RAD or not np.isfinite(rates.rad_s).all():
         return []
     turn = functools.partial(_by_readout, turns, height)
     labels = ('rate_error_x', 'rate_error_y', 'rate_error_z')

@@ -262,7 +262,8 @@ def test_what_is_not_assumed_or_not_known_is_no_unknown() -> None:
     size, rates_rad_s = (WIDTH, HEIGHT), given.rates.rad_s
 
     def layout_of(rates_rad_s: Floats, assumed: Assumptions) -> Layout:
-        rates = Rates(rates_rad_s, np.zeros((IMAGES, 3, 3)), TURN_S)
+        root = (1e-3 if np.isnan(rates_rad_s).all() else 0.0) * np.eye(3)
+        rates = Rates(rates_rad_s, np.tile(root, (IMAGES, 1, 1)), TURN_S)
         return unknowns_of(given.problem, given.state, rates, size, assumed)
 
     def names(rates_rad_s: Floats, assumed: Assumptions) -> list[str]:
@@ -273,11 +274,15 @@ def test_what_is_not_assumed_or_not_known_is_no_unknown() -> None:
     still, unknown = np.zeros((IMAGES, 3)), np.full((IMAGES, 3), np.nan)
     assert names(rates_rad_s, none) == basic
     assert names(still, ASSUMED) == ['camera', 'alignment', 'velocity', 'field', 'shape']
-    # A rolling shutter turns by an unknown constant rate over its read-out; any other is left out.
-    assert names(unknown, ASSUMED)[2:4] == ['velocity', 'readout']
-    assert names(unknown, Assumptions(0.0, (0.0, 0.02), 0.005)) == basic
+    # No rate is known: turns over the read-out by one that all images may have.
+    assert names(unknown, ASSUMED)[2:5] == ['velocity', 'readout', 'stamps']
+    late = layout_of(unknown, Assumptions(0.0, (0.0, 0.02), 0.005))
+    assert [e.name for e in late.entries] == [*basic[:2], 'readout', 'stamps', *basic[2:]]
+    assert late['stamps'].sigma == pytest.approx(np.full(3, 0.005 * 1e-3))
+    assert late['stamps'].tracker == pytest.approx(np.tile(np.eye(3), (IMAGES, 1, 1)))
+    assert names(unknown, Assumptions(0.0, (0.0, 0.0), 0.0)) == basic
     readout = layout_of(unknown, ASSUMED)['readout']
-    assert readout.sigma == pytest.approx(np.full(3, 0.004 * 1e-3))
+    assert readout.sigma == pytest.approx(np.full(3, math.hypot(0.004, 0.02) * 1e-3))
     assert not readout.offset.any() and readout.turn is not None
     pixels = np.array([[3.0, 3.0], [-0.5, HEIGHT - 0.5]])
     turns = readout.turn(pixels, np.zeros((3, 2)), np.array([0, 2]))

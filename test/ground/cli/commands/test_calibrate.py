@@ -154,8 +154,8 @@ def test_rates_that_no_image_has_are_said(
     bag = str(tmp_path / OBSERVATIONS_FILE)
     assert main.main(['calibrate', bag, '--params', params, '-o', out, '--no-report']) == 0
     said = ' '.join(capsys.readouterr().out.split())
-    assert ('as if the camera did not turn' in said) == np.isnan(rate)
-    assert ('read out within 20 ms' in said) != np.isnan(rate)
+    assert ('turning as in a low orbit at most' in said) == np.isnan(rate)
+    assert 'read out within 20 ms' in said
 
 
 @pytest.mark.slow
