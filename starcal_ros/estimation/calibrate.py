@@ -211,7 +211,7 @@ def estimate_calibration(
         stated_rad,
         prior,
         options,
-        measured_rates(ensemble.images, stated_rad),
+        measured_rates(ensemble.images),
         _assumed(ensemble, options),
         observation_groups(table.measured_px, table.star, prior.camera.width),
     )

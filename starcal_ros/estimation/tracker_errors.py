@@ -292,7 +292,6 @@ _UNKNOWN_RATE_RAD_S = 6.4e-4  # of each axis: that of a low orbit, 1.1e-3, about
 # Images so near in time show how fast a camera turns: a tenth of a low orbit, in which it neither
 # comes round nor often turns away and back.
 _NEAR_S = 600.0
-_SHORTEST_GAP_S = 0.1  # between the samples of a rate whose sender states neither sigma nor gap
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
 _FEWEST_RATES = 3  # whose scatter bounds the sigma that a sender does not state
 
@@ -323,7 +322,7 @@ class Rates:
         return Rates(self.rad_s @ matrix.T, matrix @ self.root_rad_s, readout_s)
 
 
-def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats) -> Rates:
+def measured_rates(images: Sequence[StarObservations]) -> Rates:
     """
     Return the rates of images in the frame of the star tracker, with their errors.
 
@@ -332,23 +331,22 @@ def measured_rates(images: Sequence[StarObservations], tracker_sigma_rad: Floats
     as much as its error is of their scatter; an image without a rate has the mean.  The errors of
     the images are not lowered for it: together they are the error of the mean.
 
-    A sigma that is not stated is that of two samples of a star tracker of sigma (3,), at most the
-    scatter of the rates.  Where no image has a rate, the camera is assumed to turn about as fast
-    as it does from image to image, at most as in a low orbit.
+    A sigma that is not stated is the scatter of the rates: one by a data sheet of the star tracker
+    leaves errors that seem to be differences.  Where no image has a rate, the camera is assumed to
+    turn about as fast as it does from image to image, at most as in a low orbit.
     """
     m = len(images)
     rate = np.array([image.star_tracker_rate_rad_s for image in images])
     sigma = np.array([image.star_tracker_rate_sigma_rad_s for image in images])
-    gap_s = np.array([image.attitude_gap_s for image in images])
     known = np.isfinite(rate).all(axis=1)
     if not known.any():
         return Rates(rate, np.tile(_rate_between_rad_s(images) * np.eye(3), (m, 1, 1)))
     several = np.count_nonzero(known) > 1
     scatter = np.cov(rate[known].T) if several else np.zeros((3, 3))
-    between = math.sqrt(2.0) * tracker_sigma_rad / np.fmax(gap_s, _SHORTEST_GAP_S)[:, None]
+    unstated = np.full(3, _UNKNOWN_RATE_RAD_S)
     if np.count_nonzero(known) >= _FEWEST_RATES:
-        between = np.minimum(between, np.sqrt(np.diag(scatter)))
-    own = np.where(sigma > 0, sigma, between)[:, :, None] ** 2 * np.eye(3)
+        unstated = np.sqrt(np.diag(scatter))
+    own = np.where(sigma > 0, sigma, unstated)[:, :, None] ** 2 * np.eye(3)
     # What their errors may make of the scatter at 2 sigma is no difference between rates.
     likely = 1.0 + 2.0 * math.sqrt(2.0 / max(np.count_nonzero(known) - 1, 1))
     values, vectors = np.linalg.eigh(scatter - likely * own[known].mean(axis=0))
