@@ -135,7 +135,10 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             if not is_clear and math.isinf(entry.usual):
                 # Below the default limit by more than rounding.
                 apart2 = max(apart2, (off / (0.99 * _CLEAR_SIGMA)) ** 2)
-            prior = float(problem.prior_parameters[k - camera[0]]) if k in camera else 0.0
+            # What is not in the state is zero there, so far from its prior mean.
+            prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
+            if k in camera:
+                prior = float(problem.prior_parameters[k - camera[0]])
             name, unit = layout.labels[k], 1.0
             head = (k - first) // 3 + 1
             if 1 <= head < len(estimate.star_trackers):

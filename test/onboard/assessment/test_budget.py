@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.posterior import with_shared_errors
-from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, Ensemble, SigmaPart
 from studies.worlds import Campaign, simulate, World
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
@@ -156,6 +157,34 @@ def test_a_statement_gives_the_sigma_of_an_estimate_that_has_it(
     after = getattr(parts(world, **stated)['total'], of)
     assert row.after_arcsec == pytest.approx(after, rel=0.1)
     assert f'state {row.option}: {scope} ' in str(row) and f'if it is {row.value}' in str(row)
+
+
+def test_without_rates_the_shutter_is_asked_for_or_where_it_rolls_the_rates() -> None:
+    made, unknown = campaign(World()), np.full(3, np.nan)
+    images = [
+        dataclasses.replace(image, star_tracker_rate_rad_s=unknown)
+        for image in made.ensemble.images
+    ]
+    made = dataclasses.replace(made, ensemble=Ensemble(tuple(images)))
+
+    def estimated(**stated: Any) -> tuple[Estimate, CalibrationOptions]:
+        sigma = made.scenario.star_tracker_sigma_arcsec
+        chosen = CalibrationOptions(star_tracker_sigma_arcsec=sigma, **stated)
+        return estimate_calibration(made.ensemble, made.scenario.prior, chosen), chosen
+
+    def total(found: tuple[Estimate, CalibrationOptions]) -> SigmaPart:
+        return next(part for part in sigma_budget(*found) if part.cause == 'total')
+
+    still = total(estimated(shutter='global')).map_arcsec
+    rates = 'star_tracker_rate_rad_s of the images'
+    for stated, option in (
+        ({}, f'shutter, or {rates}'),
+        ({'shutter': 'rolling', 'readout_s': 0.02}, rates),
+    ):
+        found = estimated(**stated)
+        row = next(r for r in statements(sigma_budget(*found), *found) if r.option == option)
+        assert row.scope == 'camera' and row.before_arcsec > 3.0 * row.after_arcsec
+        assert row.after_arcsec == pytest.approx(still, rel=0.1)  # as of other statements
 
 
 def test_what_is_stated_is_not_asked_for() -> None:

@@ -120,6 +120,21 @@ def test_a_velocity_that_is_wrong_beyond_its_prior_is_in_the_sigma_and_named() -
     assert max(term.significance for term in terms) > 4 * LIMIT_SIGMA
 
 
+def test_a_time_of_readout_that_is_stated_wrong_is_named_beside_that_of_the_stars() -> None:
+    """The record had the difference of both, and 0 as what is assumed."""
+    world = worlds.World(rate_deg_s=0.42, row_s=20e-6, tracker_arcsec=5.0)
+    made = worlds.simulate(world, 2)
+    sigma = made.scenario.star_tracker_sigma_arcsec
+    stated: dict[str, Any] = {'shutter': 'rolling', 'readout_s': -0.02}
+    options = CalibrationOptions(star_tracker_sigma_arcsec=sigma, **stated)
+    found = estimate_calibration(made.ensemble, made.scenario.prior, options)
+    readout = held(model_checks(found), 'readout_s')
+    assert readout.assumed == -0.02
+    # By stars that know it to some milliseconds: 1024 rows of 20 us.
+    assert readout.estimated == pytest.approx(0.0205, abs=0.005)
+    assert readout.significance > 4.0
+
+
 def test_the_step_the_field_and_the_predictions_are_in_the_record() -> None:
     given = of_random_pointings(6)
 
