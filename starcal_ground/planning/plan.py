@@ -458,6 +458,8 @@ def _expected(
         flux_dn=unknown,
         snr=unknown,
         velocity_sigma_m_s=last.velocity_sigma_m_s,
+        zenith_icrf=last.zenith_icrf,
+        refraction_arcsec=last.refraction_arcsec,
         temperature_degc=last.temperature_degc,
         # A camera at rest, where the rates of the images are known.
         star_tracker_rate_rad_s=0.0 * last.star_tracker_rate_rad_s,

@@ -32,6 +32,7 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.posterior import common_shape, ErrorParts, TRACKER_NOISE, TRACKER_SLOW
+from starcal_ros.estimation.unknowns import Layout
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, Statement, TOTAL
 from starcal_ros.text import significant
 
@@ -167,7 +168,7 @@ def _to_state(
         return rates, 'known', 0.0
     if cause == 'read-out' and options.shutter == 'unknown':
         return 'shutter (and readout_s)', 'global, or rolling with a known readout_s', 0.0
-    if cause == 'refraction':
+    if cause == 'refraction' and not _is_sited(layout):
         return 'latitude_deg and longitude_deg', 'known', 0.0
     if option := _SIGMAS.get(cause):
         return option, significant(0.1 * getattr(options, option), 2), 0.01
@@ -288,7 +289,8 @@ def _unknowns(
         sigma = float(layout[name].sigma[0])
         return {
             'velocity': _of_velocity(sigma, options),
-            'refraction': f'site not given: {significant(sigma, 3)} arcsec at 45 degrees assumed',
+            'refraction': f'{"weather" if _is_sited(layout) else "site"} not given:'
+            f' {significant(sigma, 3)} arcsec at 45 degrees assumed',
             'readout': _of_readout(layout[name].labels[0], sigma, options),
             'stamps': _of_stamps(layout[name].labels[0], sigma),
             'field': _estimated(_field_px(estimate), field.likelihood_ratio),
@@ -350,6 +352,11 @@ def _of_stars(estimate: Estimate) -> str:
     variance = estimate.covariance_px2[estimate.kept][:, [0, 2]].mean()
     rms_px = significant(math.sqrt(variance), 2)
     return f'estimated: {rms_px} px rms of {int(estimate.kept.sum())} centroids'
+
+
+def _is_sited(layout: Layout) -> bool:
+    """Return True if the site of a camera on the ground is stated."""
+    return 'site' in layout and layout['site'].sigma[0] < layout['site'].widest
 
 
 def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:

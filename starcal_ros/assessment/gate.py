@@ -368,7 +368,10 @@ def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-    is_departure = kind in ('assumed velocity', 'assumed stamp', 'assumed mounting')
+    is_departure = kind in (
+        *('assumed velocity', 'assumed stamp', 'assumed mounting'),
+        *('assumed latitude', 'assumed sidereal'),
+    )
     note = f'{estimated} by the stars, {assumed} assumed'
     return (
         f'the stars add {estimated} to it' if is_departure else note,
@@ -597,6 +600,8 @@ REMEDIES: Mapping[str, str] = {
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
     'assumed velocity': 'correct the velocity so; on the ground state the site',
+    'assumed latitude': 'check the site, and that the stamps are UTC',
+    'assumed sidereal': 'check the site, and that the stamps are UTC',
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',

@@ -22,7 +22,7 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
 
-_STATED = ('camera', 'mountings', 'velocity', 'readout', 'stamps')  # entries with a prior
+_STATED = ('camera', 'mountings', 'velocity', 'site', 'readout', 'stamps')  # entries with a prior
 _CLEAR_SIGMA = 5.0  # from a prior; as a ratio of evidence e^12.5
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for

@@ -69,7 +69,9 @@ from starcal_ros.estimation.unknowns import (
     Layout,
     moved,
     Refraction,
+    STATED_SITE_RAD,
     unknowns_of,
+    ZENITH_SIGMA_RAD,
 )
 from starcal_ros.estimation.weights import (
     agree,
@@ -345,7 +347,10 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
     if np.isfinite(zenith).all():  # all images state one
         size, sigma = np.array([image.refraction_arcsec for image in ensemble.images]).max(axis=0)
         stamps = np.array([image.time_ns for image in ensemble.images], np.int64)
-        refraction = Refraction(stamps, zenith, float(size), float(sigma))
+        # The velocity of a stated site is exact; a zenith by the stars comes with no date.
+        is_stated = all(image.velocity_sigma_m_s == 0 for image in ensemble.images)
+        site_rad = STATED_SITE_RAD if is_stated else ZENITH_SIGMA_RAD
+        refraction = Refraction(stamps, zenith, float(size), float(sigma), site_rad)
     stamp_s = options.stamp_sigma_s
     return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, usual_m_s)
 

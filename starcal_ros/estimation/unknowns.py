@@ -16,9 +16,9 @@ alignment does, and the rotation of an image.
 To add an unknown, add its entry in `unknowns_of`.
 
 Refraction has three: its size, the latitude of the site and the sidereal time of each image.  They
-are there where the observations state a zenith, which is then not known exactly
-(`sky.astrometry`).  All images are of one site: their zeniths have one declination.  Where they
-run as the stamps do, the sidereal times have one error.
+are there where the observations state a zenith, by a site and its clock or by the stars
+(`sky.astrometry`).  All images are of one site: their zeniths have one declination.  Where the
+site is stated, or they run as the stamps do, the sidereal times have one error.
 """
 
 from __future__ import annotations
@@ -407,10 +407,10 @@ def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:
     sizes, q = np.array([air.sigma_arcsec]), len(air.labels)
     by_size = functools.partial(air.by_size, camera_from_icrf)
     by_site = functools.partial(air.by_site, camera_from_icrf)
-    site = np.full(q, ZENITH_SIGMA_RAD)
+    site = np.full(q, air.site_sigma_rad)
     return [
         Unknown('refraction', ('refraction_arcsec',), sizes, np.zeros(1), turn=by_size),
-        Unknown('site', air.labels, site, np.zeros(q), turn=by_site),
+        Unknown('site', air.labels, site, np.zeros(q), turn=by_site, widest=ZENITH_SIGMA_RAD),
     ]
 
 
@@ -531,6 +531,7 @@ def _next_lens_term(width: int, height: int) -> Floats:
 
 
 ZENITH_SIGMA_RAD = 1.0  # of latitude and sidereal time: anywhere above the horizon
+STATED_SITE_RAD = 0.01  # of a site and a clock that are stated: 60 km, and two minutes
 _ONE_CLOCK_RAD = 1e-6
 _MOST_TIMES = 40  # images beyond it share the error of a sidereal time with their neighbours
 
@@ -540,13 +541,15 @@ class Refraction:
     """
     Stamps (m,) and zeniths (m, 3) of images, and the size of refraction with its 1-sigma.
 
-    The size is that at a zenith distance of 45 degrees.
+    The size is that at a zenith distance of 45 degrees; ``site_sigma_rad`` is the 1-sigma of
+    latitude and sidereal time.
     """
 
     time_ns: NDArray[np.int64]
     zenith_icrf: Floats
     size_arcsec: float
     sigma_arcsec: float
+    site_sigma_rad: float = ZENITH_SIGMA_RAD
 
     @functools.cached_property
     def times(self) -> Indices:
@@ -555,7 +558,8 @@ class Refraction:
         right_ascension = np.arctan2(self.zenith_icrf[:, 1], self.zenith_icrf[:, 0])
         late_s = (self.time_ns - self.time_ns[0]) / NANOSECONDS_PER_SECOND
         off = np.exp(1j * (right_ascension - right_ascension[0] - SIDEREAL_RAD_S * late_s))
-        if np.abs(off - 1.0).max() < _ONE_CLOCK_RAD:
+        is_stated = self.site_sigma_rad < ZENITH_SIGMA_RAD
+        if is_stated or np.abs(off - 1.0).max() < _ONE_CLOCK_RAD:
             return np.zeros(m, np.int64)
         return np.arange(m) * min(m, _MOST_TIMES) // m
 

@@ -36,7 +36,7 @@ from starcal_ros.identification.prediction import (
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
-from starcal_ros.sky.astrometry import EARTH, julian_year, SiteOptions, Velocity
+from starcal_ros.sky.astrometry import air_above, EARTH, julian_year, SiteOptions, Velocity
 from starcal_ros.sky.catalog import sky_circle, StarCatalog
 from starcal_ros.stars import detection
 from starcal_ros.stars.centroiding import (
@@ -284,6 +284,7 @@ def _observations(
         good = np.zeros_like(good)
     sigma_rad = catalog.place_sigma_rad(index[good], julian_year(exposure.image.time_ns))
     place_px2 = (sigma_rad * prediction.px_per_rad) ** 2
+    zenith_icrf, refraction_arcsec = air_above(exposure.image.time_ns, exposure.site)
     return StarObservations(
         time_ns=exposure.image.time_ns,
         width=width,
@@ -309,6 +310,8 @@ def _observations(
         catalog_digest=catalog.digest,
         temperature_degc=exposure.temperature_degc,
         velocity_sigma_m_s=exposure.velocity.sigma_m_s,
+        zenith_icrf=zenith_icrf,
+        refraction_arcsec=refraction_arcsec,
     )
 
 

@@ -187,8 +187,8 @@ class StarObservations(fields.Record):
         the ground, NaN if not known: none was given and that of the Earth was used, or one that
         may be about the Earth.
     zenith_icrf : (3,)
-        Zenith of the refraction in ``direction_icrf`` if it was found from the stars; NaN in space
-        and for a known site.
+        Zenith of the refraction in ``direction_icrf``, by the site and the stamp or found from the
+        stars; NaN in space.
     refraction_arcsec : (2,)
         Refraction at a zenith distance of 45 degrees for that zenith, and its 1-sigma; else zeros.
 

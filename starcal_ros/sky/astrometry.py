@@ -19,11 +19,12 @@ import erfa
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
+from starcal_ros.constants import ARCSECOND_RAD, AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.options import option
 from starcal_ros.sky.catalog import StarCatalog
 
 SIDEREAL_RAD_S = 7.292115e-5  # GRS 1980, rotation of the Earth
+_WEATHER = 0.055  # of the refraction at a site: 15 of 283 K and 20 of 1013 hPa
 LEAST_COSINE = 0.17  # 80 degrees of zenith distance, where A tan z + B tan^3 z is off by 1 arcsec
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 _DAY_S = 86400
@@ -238,25 +239,46 @@ def through_the_air(
     to 15 degrees of elevation.
     """
     tt_jd = tt_julian_date(time_unix_ns)
-    day, in_day_ns = divmod(int(time_unix_ns), _DAY_S * NANOSECONDS_PER_SECOND)
-    utc_jd = (_UNIX_EPOCH_JD + day, in_day_ns / (_DAY_S * NANOSECONDS_PER_SECOND))
     cirs_from_icrf = erfa.c2i06a(*tt_jd)
-    pressure_hpa = site.air_pressure_hpa or standard_pressure_hpa(
-        site.height_m, site.air_temperature_degc
-    )
-    refraction = erfa.refco(
-        pressure_hpa, site.air_temperature_degc, RELATIVE_HUMIDITY, WAVELENGTH_UM
-    )
     local = erfa.apio(
         erfa.sp00(*tt_jd),
-        erfa.era00(*utc_jd),
+        _earth_rotation_rad(time_unix_ns),
         math.radians(site.longitude_deg),
         math.radians(site.latitude_deg),
         site.height_m,
         0.0,
         0.0,
-        *refraction,
+        *_refraction_rad(site),
     )
     place = erfa.c2s(direction_icrf @ cirs_from_icrf.T)
     _, zenith_distance, _, dec, ra = erfa.atioq(*place, local)
     return np.asarray(erfa.s2c(ra, dec) @ cirs_from_icrf), np.asarray(np.pi / 2 - zenith_distance)
+
+
+def air_above(time_unix_ns: int, site: SiteOptions) -> tuple[Floats, Floats]:
+    """
+    Zenith (3,) of a site, ICRF, and refraction (2,) 45 degrees from it with its 1-sigma, arcsec.
+
+    NaN and zeros in space.  The 1-sigma is that of 15 degrees and 20 hPa of weather.
+    """
+    if site.observer != 'ground':
+        return np.full(3, math.nan), np.zeros(2)
+    right_ascension = _earth_rotation_rad(time_unix_ns) + math.radians(site.longitude_deg)
+    zenith_cirs = erfa.s2c(right_ascension, math.radians(site.latitude_deg))
+    size_arcsec = sum(_refraction_rad(site)) / ARCSECOND_RAD
+    zenith_icrf = zenith_cirs @ erfa.c2i06a(*tt_julian_date(time_unix_ns))
+    return np.asarray(zenith_icrf), size_arcsec * np.array([1.0, _WEATHER])
+
+
+def _earth_rotation_rad(time_unix_ns: int) -> float:
+    day, in_day_ns = divmod(int(time_unix_ns), _DAY_S * NANOSECONDS_PER_SECOND)
+    in_day = in_day_ns / (_DAY_S * NANOSECONDS_PER_SECOND)
+    return float(erfa.era00(_UNIX_EPOCH_JD + day, in_day))
+
+
+def _refraction_rad(site: SiteOptions) -> tuple[float, float]:
+    """Return A and B of ``A tan z + B tan^3 z``."""
+    temperature_degc = site.air_temperature_degc
+    pressure_hpa = site.air_pressure_hpa or standard_pressure_hpa(site.height_m, temperature_degc)
+    a, b = erfa.refco(pressure_hpa, temperature_degc, RELATIVE_HUMIDITY, WAVELENGTH_UM)
+    return float(a), float(b)

@@ -16,13 +16,17 @@ from starcal_ground.images.from_stars import ideal_camera, options_of
 from starcal_ground.images.unknown_air import refracted, with_air, zenith_of
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.gate import GateOptions
+from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.camera import project
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.unknowns import Refraction
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.sky.astrometry import (
+    air_above,
     apparent_directions,
+    MIN_ELEVATION_DEG,
     SiteOptions,
     standard_pressure_hpa,
     through_the_air,
@@ -33,6 +37,7 @@ SITE = SiteOptions(observer='ground', latitude_deg=47.0, longitude_deg=11.0, hei
 CAMERA = ideal_camera((1200, 900), 2000.0).replace(k1=-0.05, cx=611.0, p1=4e-4)
 START_NS = 1_700_000_000_000_000_000
 NOISE_PX = 0.08
+LIMIT_SIGMA = GateOptions().max_held_term_sigma
 
 
 def seen_from(site: SiteOptions, seed: int, wrong_clock: bool = False) -> list[StarObservations]:
@@ -78,6 +83,47 @@ def estimate(images: list[StarObservations]) -> Estimate:
     used = tuple(one for one in images if not one.refusal)
     prior = CameraGeometry(CAMERA, np.array([0.0, 0.0, 0.0, 1.0]))
     return estimate_calibration(Ensemble(used), prior, options)
+
+
+def from_the_stated_site(seed: int, late_s: int = 0) -> list[StarObservations]:
+    """Observations that a clock which is late by so much gives, with the site stated."""
+    found = []
+    for one in seen_from(SITE, seed):
+        time_ns = one.time_ns - late_s * 10**9
+        air_icrf, elevation_rad = through_the_air(one.direction_icrf, time_ns, SITE)
+        zenith_icrf, refraction_arcsec = air_above(time_ns, SITE)
+        stated = dataclasses.replace(
+            one,
+            time_ns=time_ns,
+            direction_icrf=air_icrf,
+            velocity_sigma_m_s=0.0,
+            zenith_icrf=zenith_icrf,
+            refraction_arcsec=refraction_arcsec,
+        )
+        found.append(stated.select(elevation_rad > math.radians(MIN_ELEVATION_DEG)))
+    return found
+
+
+def off_sigma(found: Estimate) -> float:
+    """Largest distance of a number of the site from what was stated, in sigma."""
+    numbers = ('latitude_rad', 'sidereal_time_1_rad')
+    terms = [term for term in model_checks(found).held if term.name in numbers]
+    assert len(terms) == len(numbers)
+    return max(term.significance for term in terms)
+
+
+@pytest.mark.slow
+def test_a_clock_wrong_by_an_hour_is_named_and_a_minute_is_in_the_sigma() -> None:
+    given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
+    for late_s, is_right in ((0, True), (60, True), (-3600, False), (3600, False), (21600, False)):
+        found = [estimate(from_the_stated_site(seed, late_s)) for seed in range(4)]
+        off = [off_sigma(each) for each in found]
+        if is_right:
+            assert max(off) < LIMIT_SIGMA
+            errors = [honesty(given, each, unmoved)[0] for each in found]
+            assert np.sqrt(np.mean(np.square(errors))) < 1.3
+        else:
+            assert min(off) > LIMIT_SIGMA
 
 
 def unmoved(pixels: Floats) -> Floats:

@@ -30,7 +30,7 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
-from starcal_ros.sky.astrometry import apparent_directions, through_the_air
+from starcal_ros.sky.astrometry import air_above, apparent_directions, through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
 
 S = 1_000_000_000
@@ -91,6 +91,9 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     # What is recorded is the bent direction, so that a calibration from the record is the same.
     recorded = [place[number][1] for number in found.catalog_id.tolist()]
     np.testing.assert_allclose(found.direction_icrf, recorded, rtol=0, atol=1e-12)
+    zenith_icrf, refraction_arcsec = air_above(drawn.time_ns, made.site)
+    np.testing.assert_array_equal(found.zenith_icrf, zenith_icrf)
+    np.testing.assert_array_equal(found.refraction_arcsec, refraction_arcsec)
     # Ten degrees lower, half of the stars are too near to the horizon.
     low = load_setup(
         values(

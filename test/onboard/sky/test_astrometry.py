@@ -13,6 +13,7 @@ import pytest
 
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.sky.astrometry import (
+    air_above,
     apparent_directions,
     earth_velocity_c,
     SiteOptions,
@@ -243,6 +244,28 @@ def test_refraction_is_towards_the_zenith_and_nothing_there():
     assert (bent[far] < 0).all()
     # A tan 2 degrees is 1.5 arcsec.
     assert angle_between(through_the_air(up[None], TIME_NS, site)[0][0], up) < 3 * ARCSECOND_RAD
+
+
+def test_the_air_above_a_site_is_that_which_its_stars_are_seen_through():
+    site = SiteOptions('ground', -33.5, -70.7, 550.0)
+    zenith_icrf, (size_arcsec, sigma_arcsec) = air_above(TIME_NS, site)
+    _, directions, elevation_rad = zenith(dataclasses.replace(site, air_pressure_hpa=1e-9))
+    # Without air the heights are of that zenith, but for 0.3 arcsec of aberration.
+    high = elevation_rad > 0.2
+    off_rad = np.arcsin(directions[high] @ zenith_icrf) - elevation_rad[high]
+    assert np.abs(off_rad).max() < 0.5 * ARCSECOND_RAD
+    near = np.abs(np.degrees(elevation_rad) - 45.0) < 0.2
+    bent = angle_between(through_the_air(directions[near], TIME_NS, site)[0], directions[near])
+    # 0.2 degrees change a tangent there by 0.7 %; aberration adds 0.3 arcsec.
+    assert np.median(bent) / ARCSECOND_RAD == pytest.approx(size_arcsec, rel=0.01)
+    assert sigma_arcsec == pytest.approx(0.055 * size_arcsec)
+    # Ten degrees and 20 hPa beside those assumed are within the 1-sigma.
+    cold = dataclasses.replace(site, air_temperature_degc=0.0)
+    warm = dataclasses.replace(site, air_temperature_degc=20.0)
+    for other in (cold, warm):
+        assert abs(air_above(TIME_NS, other)[1][0] - size_arcsec) < sigma_arcsec
+    nowhere, none = air_above(TIME_NS, SiteOptions())
+    assert np.isnan(nowhere).all() and not none.any()
 
 
 def test_the_turning_earth_moves_stars_east():
