@@ -145,7 +145,8 @@ def separate(
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
     # The search for lost lines also uses the stars measured far from their predictions.
-    measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
+    reason = centroids.refusal
+    measured = (reason == StarRefusal.NONE) | (reason == StarRefusal.NOT_DETECTED)
     deeper_px, deeper_magnitude = deeper
     pulls = neighbour_pulls(
         np.concatenate([prediction.xy_px, deeper_px]),

@@ -419,7 +419,8 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
 
     Raises ImageRefused ``incomplete``.
     """
-    good = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
+    reason = centroids.refusal
+    good = (reason == StarRefusal.NONE) | (reason == StarRefusal.NOT_DETECTED)
     loss = find_line_loss(
         predicted_px[good], centroids.xy_px[good], centroids.sigma_px[good], shape
     )
