@@ -119,7 +119,7 @@ class BagWriter:
                     'type': type_name,
                     'serialization_format': 'cdr',
                     'offered_qos_profiles': [bag_types.offered_qos()],
-                    'type_description_hash': bag_types.typestore().hash_rihs01(type_name),
+                    'type_description_hash': bag_types.described(type_name)[1],
                 },
                 'message_count': self._counts[topic],
             }

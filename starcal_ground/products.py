@@ -15,6 +15,7 @@ import io
 import json
 import os
 from pathlib import Path
+import zipfile
 
 import numpy as np
 import yaml
@@ -117,7 +118,12 @@ def write_observations(
 def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
-    np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **record_fields.plain_record(residuals))
+    columns = {'format': _RESIDUALS_FORMAT, **record_fields.plain_record(residuals)}
+    # As `np.savez_compressed`, whose level takes twice the time for 3 % fewer bytes.
+    with zipfile.ZipFile(memory, 'w', zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, column in columns.items():
+            with archive.open(f'{name}.npy', 'w') as file:
+                np.save(file, column, allow_pickle=False)
     product_files.write_atomically(path, memory.getvalue())
 
 
@@ -187,7 +193,7 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         numbers = np.array(untrusted.json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
-        camera = replace(camera, parameters=numbers[:count])
+        camera = replace(camera, parameters=numbers[:count], field=None)
         check_plausible(camera)
         prior = CameraGeometry(camera, numbers[count:])
         check_drawable(prior)

@@ -95,12 +95,15 @@ def calibrate_into(
         pictures: tuple[thumbnails.Thumbnail, ...] = ()
         with drawings.kind('pictures of images'):
             pictures = thumbnails.ordered(drawn.result())
-    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    products.write_products(made.calibration, folder, made.residuals)
-    page, report, path = '', '', folder / products.REPORT_FILE
-    if with_report:
-        with drawings.kind('report'):
-            page, report = _drawn(made, pictures, folder)
+        # The disk is waited for, twice a picture, while the report is drawn.
+        places = pictures, folder / thumbnails.THUMBNAILS_FOLDER
+        written = thread.submit(thumbnails.write_thumbnails, *places)
+        products.write_products(made.calibration, folder, made.residuals)
+        page, report, path = '', '', folder / products.REPORT_FILE
+        if with_report:
+            with drawings.kind('report'):
+                page, report = _drawn(made, pictures, folder)
+        written.result()
     if page:
         product_files.write_atomically(path, page)
     else:  # one that is there is of the products that were replaced

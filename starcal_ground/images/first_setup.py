@@ -21,8 +21,6 @@ import textwrap
 import numpy as np
 import yaml
 
-from starcal_ground.images import night_sky
-from starcal_ground.images.from_stars import FEWEST_IMAGES
 from starcal_ground.images.photographs import image_paths
 from starcal_ground.products import make_folder, write_camera_info
 from starcal_ros.errors import OptionError
@@ -31,8 +29,6 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.campaign import Source, source_of, ThroughAir
-from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
-from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.setup import (
     aligned,
     files_of,
@@ -226,6 +222,8 @@ def first_setup(
     """
     files = list(filter(None, [given.params]))
     if given.is_by_stars:
+        from starcal_ground.images import night_sky  # the search of the sky is seldom needed, slow
+
         with given.with_place():
             sky, images = night_sky.from_images(
                 given.paths, given.topics, given.options, bag_folder, given.lens, on_notes
@@ -243,6 +241,10 @@ def first_setup(
 
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     """Setup of bags with attitudes whose camera is not stated, and sentences on it."""
+    from starcal_ground.images import from_stars, night_sky  # as in `first_setup`
+    from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
+    from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
+
     if choose_topics(given.paths, given.topics).observations:
         raise OptionError(
             f'camera_info_url: not stated, and {OBSERVATIONS_TYPE} shows no camera: give the'
@@ -251,7 +253,7 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     topic = choose_image_topic(given.paths, given.topics)
     # The gate counts all images of the bags; these are the first ones.
     stated = option_groups(given.options)['calibration'].min_images
-    few = {**given.options, 'min_images': min(stated, FEWEST_IMAGES)}
+    few = {**given.options, 'min_images': min(stated, from_stars.FEWEST_IMAGES)}
     stars = night_sky.camera_of_bags(given.paths, topic, few, _LOOKED_AT, given.lens)
     make_folder(folder)
     write_camera_info(stars.camera, folder / CAMERA_FILE)

@@ -230,7 +230,8 @@ def _rows(
     linear = Linearisation(problem, state, layout, measurements, table.measured_px)
     _, J = whitened_attitude_errors(problem, state)
     turning, turns = tracker_turns(layout)
-    for chunk, by_shared, by_own, _ in star_rows(linear):
+    whole = np.arange(layout.count), np.zeros(layout.count)
+    for chunk, by_shared, by_own, _ in star_rows(linear, *whole):
         _, stars, b = by_own.shape
         # Of the star tracker, and of the prior of the shape.
         shared = np.pad(by_shared, ((0, 0), (0, b), (0, 0)))

@@ -217,15 +217,14 @@ def _images(
     """Yield rows, columns (2 n, d), own columns (2 n, b) and residuals (2 n,) of each image."""
     equations = estimate.posterior.equations
     of_images = equations.own - equations.back @ mean
-    for chunk, shared, own, residual in star_rows(estimate.linear):
-        left = residual - shared @ mean
-        left -= np.einsum('mij,mj->mi', own, of_images[chunk.image])
+    for chunk, shared, own, residual in star_rows(estimate.linear, part, mean):
+        left = residual - np.einsum('mij,mj->mi', own, of_images[chunk.image])
         m, _, n = chunk.direction_icrf.shape
         real = chunk.whitener[0].reshape(m, n) > 0
         for i, rows in enumerate(chunk.row.reshape(m, n)):
             used = np.flatnonzero(np.tile(real[i], 2))
             # The rows lie star by star: whole columns are copied.
-            columns = shared[i].T[np.ix_(part, used)].T
+            columns = shared[i].T[:, used].T
             yield rows[real[i]], columns, own[i, used], left[i, used]
 
 

@@ -36,7 +36,6 @@ from starcal_ros.estimation.star_equations import (
 )
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout
 
-_ROWS_STARS = 1024  # of a part of a chunk: 8 MB of derivatives
 
 
 @dataclass(frozen=True)
@@ -162,37 +161,47 @@ def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
         yield chunk, J[:, :-1]
 
 
-def star_rows(linear: Linearisation) -> Iterator[tuple[Chunk, Floats, Floats, Floats]]:
+def star_rows(
+    linear: Linearisation, part: Indices, mean: Floats
+) -> Iterator[tuple[Chunk, Floats, Floats, Floats]]:
     """
-    Yield the images of each chunk, a few at a time, with their whitened derivatives and residuals.
+    Yield each chunk with its whitened derivatives and residuals, u before v.
 
-    Derivatives (m, 2 n, P) by the shared unknowns and (m, 2 n, b) by those of each image, and the
-    residuals (m, 2 n), u before v.  The layout has a field.
+    Derivatives (m, 2 n, d) by a part (d,) of the shared unknowns, in ascending order, and (m, 2 n,
+    b) by those of each image, and the residuals (m, 2 n) that the mean (P,) of all shared ones
+    leaves.  The layout has a field.
     """
     layout = linear.layout
     E = chain(linear.problem, layout, linear.measurements.image_count).transpose(0, 2, 1)
     at, field = seen_by_stars(layout), layout.of(['field'])
     functions = layout['field'].functions
     assert functions is not None
-    of_u, of_v = np.split(field, 2)
-    for whole, Z in star_columns(linear):
-        m, _, n = whole.direction_icrf.shape
-        # The rows of a whole chunk by all functions of the field would take more memory than all
-        # sums of the estimate.
-        several = max(1, _ROWS_STARS // n)
-        for some in (slice(first, first + several) for first in range(0, m, several)):
-            chunk = whole.select(some)
-            k = len(chunk.image)
-            by_image = Z.reshape(2, -1, m, n)[:, :, some].transpose(2, 1, 0, 3)
-            rows = E[chunk.image] @ by_image.reshape(k, -1, 2 * n)
-            # Star by star: what is written and read along the stars takes a third of the time.
-            shared = np.zeros((k, layout.count, 2 * n))
-            shared[:, at] = rows[:, : len(at)]
-            phi = functions(linear.predicted_px[chunk.row].T)
-            wuu, wuv, wvv = ((phi * w).reshape(-1, k, n).swapaxes(0, 1) for w in chunk.whitener)
-            shared[:, of_u, :n], shared[:, of_v, :n], shared[:, of_v, n:] = wuu, wuv, wvv
-            own = rows[:, len(at) : -1].transpose(0, 2, 1)
-            yield chunk, shared.transpose(0, 2, 1), own, rows[:, -1]
+    (seen, to), (of_u, to_u), (of_v, to_v) = (
+        (places := np.flatnonzero(np.isin(of, part)), np.searchsorted(part, of[places]))
+        for of in (at, *np.split(field, 2))
+    )
+    for chunk, Z in star_columns(linear):
+        m, _, n = chunk.direction_icrf.shape
+        by_image = Z.reshape(2, -1, m, n).transpose(2, 1, 0, 3).reshape(m, -1, 2 * n)
+        rows = E[chunk.image] @ by_image
+        phi = functions(linear.predicted_px[chunk.row].T)
+        u, v = (mean[field].reshape(2, -1) @ phi).reshape(2, m, n)
+        wuu, wuv, wvv = (w.reshape(m, n) for w in chunk.whitener)
+        residual = rows[:, -1] - mean[at] @ rows[:, : len(at)]
+        residual -= np.concatenate([wuu * u + wuv * v, wvv * v], axis=1)
+        # Star by star: what is written and read along the stars takes a third of the time.
+        shared = np.zeros((m, len(part), 2 * n))
+        shared[:, to] = rows[:, seen]
+        phi = phi.reshape(-1, m, n)
+        shared[:, to_u, :n] = (phi[of_u] * wuu).transpose(1, 0, 2)
+        shared[:, to_v, :n] = (phi[of_v] * wuv).transpose(1, 0, 2)
+        shared[:, to_v, n:] = (phi[of_v] * wvv).transpose(1, 0, 2)
+        yield (
+            chunk,
+            shared.transpose(0, 2, 1),
+            rows[:, len(at) : -1].transpose(0, 2, 1),
+            residual,
+        )
 
 
 def weighted_rows_by(

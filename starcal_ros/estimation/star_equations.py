@@ -86,18 +86,6 @@ class Chunk:
     measured_px: Floats  # (2, m n)
     whitener: Floats  # (3, m n): upper triangle, uu, uv, vv
 
-    def select(self, images: slice) -> Chunk:
-        """Return some of the images."""
-        n = self.direction_icrf.shape[2]
-        stars = slice(images.start * n, images.stop * n)
-        return Chunk(
-            self.image[images],
-            self.row[stars],
-            self.direction_icrf[images],
-            self.measured_px[:, stars],
-            self.whitener[:, stars],
-        )
-
 
 @dataclass(frozen=True)
 class Measurements:

@@ -15,7 +15,6 @@ import json
 import math
 import os
 from pathlib import Path
-import warnings
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -89,10 +88,12 @@ def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> boo
         return True
     lines, directions = lines[exists], observations.direction_icrf[some][exists]
     spread = float(np.sqrt(((lines - lines.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore', UserWarning)  # of stars on one line
-        _, rssd = Rotation.align_vectors(lines, directions)
-    return float(rssd) / math.sqrt(len(lines)) <= _MOST_OFF * spread
+    # What the best rotation leaves (Kabsch 1976), without the rotation; a mirror image is none.
+    product = lines.T @ directions
+    fit = np.linalg.svd(product, compute_uv=False)
+    fit[2] = math.copysign(fit[2], np.linalg.det(product))
+    off2 = float((lines**2).sum() + (directions**2).sum() - 2.0 * fit.sum())
+    return math.sqrt(max(off2, 0.0) / len(lines)) <= _MOST_OFF * spread
 
 
 def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:

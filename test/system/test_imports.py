@@ -28,7 +28,8 @@ BLOCKS = ('body', 'orelse', 'handlers', 'finalbody')  # of an if, a try, a class
 
 def test_a_calibration_does_not_wait_for_what_it_seldom_needs() -> None:
     """scipy.stats alone would make the start, one second, a third longer."""
-    show = 'import sys; from starcal_ground.cli import into_folder; print(*sys.modules)'
+    show = 'import sys; from starcal_ground.cli import into_folder;'
+    show += ' from starcal_ground.images import first_setup; print(*sys.modules)'
     done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert 'scipy.special' in loaded and 'starcal_ros.pipeline.solve' in loaded

@@ -525,12 +525,16 @@ def _files_of_folder(folder: Path) -> list[Path]:
 def _metadata(path: Path) -> tuple[list[str], str]:
     """Names of the files of a bag and its compression, both empty without valid metadata."""
     try:
-        metadata = yaml_value(read_text(path, METADATA_BYTES))
-        information = metadata['rosbag2_bagfile_information']
-        names = information['relative_file_paths']
-        compression = information.get('compression_mode')
+        return _listed_files(read_text(path, METADATA_BYTES))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return [], ''  # a recorder that was killed leaves no valid metadata
+
+
+@functools.lru_cache(maxsize=16)
+def _listed_files(metadata: str) -> tuple[list[str], str]:
+    """Return the same of a text, which a command asks for ten times."""
+    information = yaml_value(metadata)['rosbag2_bagfile_information']
+    names, compression = information['relative_file_paths'], information.get('compression_mode')
     if not isinstance(names, list) or not all(map(_is_inside, names)):
         names = []
     known = isinstance(compression, str) and re.fullmatch(r'\w{1,20}', compression)
