@@ -36,14 +36,12 @@ def profile(name: str) -> contextlib.AbstractContextManager[None]:
     return environment(**values)
 
 
-def start(
-    name: str, params: Path, log: Path, *values: str, node: str = ''
-) -> subprocess.Popen[bytes]:
+def start(name: str, params: Path, log: Path, *values: str) -> subprocess.Popen[bytes]:
     """Start a node process with parameters."""
     arguments = ['-m', 'starcal_ros.entry_points', name]
     arguments += ['--ros-args', '--params-file', str(params)]
     arguments += [word for value in values for word in ('-p', value)]
-    arguments += ['-r', f'__node:={node or name}', '--log-level', 'warn']
+    arguments += ['--log-level', 'warn']
     with log.open('ab') as output:
         return subprocess.Popen(
             [sys.executable, *arguments],

@@ -8,6 +8,7 @@ from pathlib import Path
 import time
 from typing import Any
 
+from forked_process import ForkedNode  # type: ignore[import-not-found]
 from node_campaign import Campaign  # type: ignore[import-not-found]
 import numpy as np
 
@@ -156,10 +157,12 @@ class Flight:
     def _start(self, name: str) -> None:
         # A new name for each process: a dead node stays in the graph for 20 s.
         self._names[name] = f'{name}{self.kills[name]}'
-        campaign, node = self._campaign, self._names[name]
-        self._running[name] = graph.start(
-            name, campaign.params, campaign.log, *self._values[name], node=node
-        )
+        log = self._campaign.log
+        log.touch()
+        arguments = ['--ros-args', '--params-file', str(self._campaign.params)]
+        arguments += [word for value in self._values[name] for word in ('-p', value)]
+        arguments += ['-r', f'__node:={self._names[name]}', '--log-level', 'warn']
+        self._running[name] = ForkedNode(name, arguments, log)
 
     def _observer_is_ready(self) -> bool:
         """Return True once it is matched and answers; earlier images do not count as lost."""

@@ -110,4 +110,4 @@ def _run(name: str, arguments: list[str], log: str, environment: Mapping[str, st
         os.close(opened)
     faulthandler.enable()
     sys.argv = [name, *arguments]
-    sys.exit(getattr(entry_points, name)())
+    sys.exit(entry_points._run(name))

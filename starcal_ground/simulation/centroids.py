@@ -16,7 +16,7 @@ import numpy as np
 
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import pixel_stamps
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, project_jacobians, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Ensemble, StarObservations
@@ -149,16 +149,15 @@ def centroid_bound(
     sigma_px = detector.psf_sigma_at(pixels_px, shape)
     path_px = np.zeros_like(pixels_px) if path_px is None else path_px
     reach_px = math.ceil(0.5 * float(np.abs(path_px).max(initial=0.0)))
-    count = 8 * reach_px + 1  # parts of the path, a quarter of a pixel each
     flux = np.asarray(flux_electrons, np.float64)[:, None, None]
-    shape_of_star, by_u, by_v = np.zeros((3, 1, 1, 1))
-    for part in (np.arange(count) + 0.5) / count - 0.5:
-        off_u, off_v = part * path_px.T
-        u, share_u, slope_u = pixel_stamps(pixels_px[:, 0], sigma_px, off_u, reach_px)
-        v, share_v, slope_v = pixel_stamps(pixels_px[:, 1], sigma_px, off_v, reach_px)
-        shape_of_star = shape_of_star + share_v[:, :, None] * share_u[:, None, :] / count
-        by_u = by_u + share_v[:, :, None] * slope_u[:, None, :] / count
-        by_v = by_v + slope_v[:, :, None] * share_u[:, None, :] / count
+    (u, share_u, slope_u), (v, share_v, slope_v) = (
+        _stamps_along(pixels_px[:, k], sigma_px, path_px[:, k], reach_px) for k in (0, 1)
+    )
+    # Of all parts of the path together: products of matrices.
+    count = share_u.shape[1]
+    shape_of_star = share_v.transpose(0, 2, 1) @ share_u / count
+    by_u = share_v.transpose(0, 2, 1) @ slope_u / count
+    by_v = slope_v.transpose(0, 2, 1) @ share_u / count
     # By log flux, which keeps the matrix well scaled.
     gradients = flux[:, None] * np.stack([by_u, by_v, shape_of_star], axis=1)
     mean = flux * shape_of_star
@@ -171,6 +170,17 @@ def centroid_bound(
     # The last term keeps stars without any information invertible.
     covariance = np.linalg.inv(information + 1e-6 * np.eye(3))
     return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
+
+
+def _stamps_along(
+    centers_px: Floats, sigma_px: Floats, path_px: Floats, reach_px: int
+) -> tuple[Indices, Floats, Floats]:
+    """`pixel_stamps` in the p parts of paths (n,) on one axis: shares and slopes (n, p, m)."""
+    count = 8 * reach_px + 1  # parts of a quarter of a pixel
+    parts = (np.arange(count) + 0.5) / count - 0.5
+    of_parts = [pixel_stamps(centers_px, sigma_px, part * path_px, reach_px) for part in parts]
+    pixels, shares, slopes = zip(*of_parts, strict=True)
+    return pixels[0], np.stack(shares, axis=1), np.stack(slopes, axis=1)
 
 
 def cramer_rao_covariance(

@@ -112,9 +112,11 @@ def test_nodes_and_interface_calibrate_a_bag(
 ) -> None:
     """The same calibration from the messages of a player and from the bag; with a state folder."""
     for name in BOTH:
-        start_node(name, ros=(*parameters(tiny_bag, f'state_dir:={tmp_path}/kept'), *REMAPS))
+        ros = (*parameters(tiny_bag, f'state_dir:={tmp_path}/kept'), *REMAPS)
+        start_node(name, ros=ros, forked=False)
     client.until_listened()
-    player = start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
+    ros = ('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0')
+    player = start_node('bag_player', ros=ros, forked=False)
     assert player.wait() == 0, player.said()
     client.until_images(10, 'images_saved')
     answer = client.call(Trigger, '/calibrator/calibrate')

@@ -156,7 +156,9 @@ WRITING: dict[str, str] = {
         ' thumbnails/image_1.jpg not_calibrated.json'
     ),
     'report HERE/o': 'report.html',
-    'calibrate HERE/bag -o HERE/o': 'params.yaml camera.yaml',
+    'calibrate HERE/bag --focal-length-mm 18 --pixel-size-um 10 -o HERE/o': (
+        'params.yaml camera.yaml'
+    ),
     f'plan {_OF_BAG} --images 1 -o HERE/o/plan.csv': 'plan.csv',
     'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
     'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
@@ -288,7 +290,10 @@ def test_ctrl_c_in_the_first_two_seconds() -> None:
     code = 'import sys; from starcal_ground.cli.entry_point import main; sys.exit(main())'
     command = [sys.executable, '-c', code, 'inspect', str(BAG)]
     for _ in range(many(6)):
+        # The background of a shell ignores SIGINT, and what is started there inherits that.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        signal.signal(signal.SIGINT, before)
         try:
             process.communicate(timeout=draw.uniform(0.2, 2.0))
         except subprocess.TimeoutExpired:
