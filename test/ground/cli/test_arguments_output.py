@@ -156,9 +156,7 @@ WRITING: dict[str, str] = {
         ' thumbnails/image_1.jpg not_calibrated.json'
     ),
     'report HERE/o': 'report.html',
-    'calibrate HERE/bag --focal-length-mm 18 --pixel-size-um 10 -o HERE/o': (
-        'params.yaml camera.yaml'
-    ),
+    'calibrate HERE/bag -o HERE/o': 'params.yaml camera.yaml',
     f'plan {_OF_BAG} --images 1 -o HERE/o/plan.csv': 'plan.csv',
     'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
     'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',

@@ -115,7 +115,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
     ('kind', 'options'),
     [
         ('', []),
-        (ODOMETRY, ['--focal-length-mm', '18', '--pixel-size-um', '10']),
+        (ODOMETRY, []),
         ('', ['PARAMS']),
         (TF, ['PARAMS', '--camera-alone']),
     ],
