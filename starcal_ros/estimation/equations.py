@@ -37,7 +37,6 @@ from starcal_ros.estimation.star_equations import (
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout
 
 
-
 @dataclass(frozen=True)
 class Linearisation:
     """
