@@ -17,10 +17,8 @@ dy up vp, k1 k2 k3 p1 p2); note that ROS orders D as k1 k2 p1 p2 k3.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import functools
-import math
 
 import numpy as np
 
@@ -507,41 +505,20 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         J = project_jacobians(moved(x), directions[visible])[1]
         return np.concatenate([J[..., free].reshape(-1, len(free)), held_px])
 
-    found = _least_squares(
-        residual, jacobian, start.parameters[free], 1e-9 if len(held_px) else 1e-15
+    # MINPACK scales the parameters by their columns and bounds the step.
+    from scipy.optimize import least_squares  # a third of the start of a short command
+
+    solution = least_squares(
+        residual,
+        start.parameters[free],
+        jacobian,
+        method='lm',
+        x_scale='jac',
+        ftol=1e-9 if len(held_px) else 1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+        max_nfev=200,
     )
-    fitted = moved(found)
+    fitted = moved(solution.x)
     error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
     return fitted, float(np.where(np.isnan(error), np.inf, error).max(initial=0.0))
-
-
-def _least_squares(
-    residual: Callable[[Floats], Floats],
-    jacobian: Callable[[Floats], Floats],
-    x: Floats,
-    least_gain: float,
-) -> Floats:
-    """
-    Least squares from a start, until no step gains more than a part of the sum.
-
-    Marquardt's damping of parameters in units of their columns, by orthogonal steps as in MINPACK:
-    to import `scipy.optimize` takes as long as ten of these fits.
-    """
-    off, damping = residual(x), 1e-3
-    for _ in range(200):
-        J = jacobian(x)
-        length = np.linalg.norm(J, axis=0)
-        length[length == 0] = 1.0
-        gain = math.nan
-        while not gain > 0:
-            rows = np.concatenate([J / length, math.sqrt(damping) * np.eye(len(x))])
-            right = np.concatenate([off, np.zeros(len(x))])
-            step = -np.linalg.lstsq(rows, right, rcond=None)[0] / length
-            change = J @ step
-            if -change @ (2.0 * off + change) <= least_gain * (off @ off):
-                return x
-            left = residual(x + step)
-            gain = float(off @ off - left @ left)
-            damping *= 0.1 if gain > 0 else 10.0
-        x, off = x + step, left
-    return x
