@@ -320,9 +320,12 @@ def cone(
         Omit stars fainter than this V.
     """
     axis = np.asarray(direction_icrs / np.linalg.norm(direction_icrs))
-    # Cosines in single precision, good to 3e-7: less is read of the whole catalog.
-    least = math.cos(min(radius_rad + CONE_MARGIN_RAD, math.pi)) - 1e-6
-    rows = np.flatnonzero(axis.astype(np.float32) @ catalog.directions_single >= least)
+    # A cosine does not resolve angles below 1e-8 rad; the margin is 1.6e-3.
+    least = math.cos(min(radius_rad + CONE_MARGIN_RAD, math.pi))
+    # First in single precision, good to 3e-7: less is read of the whole catalog.
+    near = axis.astype(np.float32) @ catalog.directions_single >= least - 1e-6
+    rows = np.flatnonzero(near)
+    rows = rows[catalog.direction_icrs[rows] @ axis >= least]
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
     return rows
