@@ -103,11 +103,11 @@ def calibrate_into(
         if with_report:
             with drawings.kind('report'):
                 page, report = _drawn(made, pictures, folder)
+        if page:
+            product_files.write_atomically(path, page)
+        else:  # one that is there is of the products that were replaced
+            path.unlink(missing_ok=True)
         written.result()
-    if page:
-        product_files.write_atomically(path, page)
-    else:  # one that is there is of the products that were replaced
-        path.unlink(missing_ok=True)
     return made, report
 
 

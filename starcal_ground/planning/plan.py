@@ -34,7 +34,13 @@ from starcal_ros.estimation.problem import Problem, State, whitened_attitude_err
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
+from starcal_ros.estimation.unknowns import (
+    Assumptions,
+    IMAGE_ROTATION,
+    Refraction,
+    STATED_SITE_RAD,
+    unknowns_of,
+)
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.campaign import Campaign
 from starcal_ros.pipeline.setup import Setup
@@ -182,7 +188,8 @@ def prospect(
     Return what candidate images add.
 
     They hold the stars that an image would show, at the pixels of the calibrated camera, with the
-    covariances to expect.  The velocity of the observer acts on them as on the images.
+    covariances to expect.  The velocity of the observer, the air, and the turn of a camera whose
+    rate is not known act on them as on the images.
     """
     covariance = estimate.posterior.covariance
     size = np.sqrt(np.diag(covariance))
@@ -218,13 +225,20 @@ def _rows(
     The squares of rows are the information of an image, its own unknowns eliminated.
     """
     problem, state = _as_estimated(estimate, candidates, options)
-    camera = estimate.geometry.camera
-    # The columns of what is in the list.
-    velocity_m_s = float('velocity' in estimate.linear.layout)
-    assumed = Assumptions(velocity_m_s, (0.0, 0.0), 0.0)
-    at_rest = Rates(np.zeros((len(candidates), 3)), np.zeros((len(candidates), 3, 3)))
-    layout = unknowns_of(problem, state, at_rest, (camera.width, camera.height), assumed)
-    place = [estimate.linear.layout.labels.index(label) for label in layout.labels]
+    camera, known, count = estimate.geometry.camera, estimate.linear.layout, len(candidates)
+    rates = Rates(np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)))  # a camera at rest
+    readout, stamps = (float(len(known.of([name])) > 1) for name in ('readout', 'stamps'))
+    if readout or stamps:  # three turns, since no image has a rate
+        rates = dataclasses.replace(rates, rad_s=np.full((count, 3), np.nan))
+    air = None
+    if len(known.of(['site'])) == 2:  # latitude and one clock
+        zenith = np.array([image.zenith_icrf for image in candidates])
+        size = float(candidates[0].refraction_arcsec[0])
+        air = Refraction(np.zeros(count, np.int64), zenith, size, 1.0, STATED_SITE_RAD)
+    # The columns of what is in the list; the information of its priors is in the estimate.
+    assumed = Assumptions(float('velocity' in known), (0.0, readout), stamps, air)
+    layout = unknowns_of(problem, state, rates, (camera.width, camera.height), assumed)
+    place = [known.labels.index(label) for label in layout.labels]
     table = star_table(candidates)
     measurements = arrange(table, np.ones(len(table), bool), table.covariance_px2)
     linear = Linearisation(problem, state, layout, measurements, table.measured_px)

@@ -289,7 +289,7 @@ def _unknowns(
         sigma = float(layout[name].sigma[0])
         return {
             'velocity': _of_velocity(sigma, options),
-            'refraction': f'{"weather" if _is_sited(layout) else "site"} not given:'
+            'refraction': f'{"air at the site" if _is_sited(layout) else "site not given"}:'
             f' {significant(sigma, 3)} arcsec at 45 degrees assumed',
             'readout': _of_readout(layout[name].labels[0], sigma, options),
             'stamps': _of_stamps(layout[name].labels[0], sigma),

@@ -368,10 +368,8 @@ def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-    is_departure = kind in (
-        *('assumed velocity', 'assumed stamp', 'assumed mounting'),
-        *('assumed latitude', 'assumed sidereal'),
-    )
+    departures = 'velocity', 'stamp', 'mounting', 'latitude', 'sidereal'
+    is_departure = kind.removeprefix('assumed ') in departures
     note = f'{estimated} by the stars, {assumed} assumed'
     return (
         f'the stars add {estimated} to it' if is_departure else note,
@@ -567,6 +565,7 @@ def requirement_answers(calibration: Calibration) -> tuple[str, ...]:
     )
 
 
+_OF_SITE = 'check the site, and that the stamps are UTC; for images alone leave out the site'
 REMEDIES: Mapping[str, str] = {
     # Reasons to refuse images (`IMAGE_REFUSALS`).
     'bad_encoding': 'record images of one channel, 8 or 16 bit, raw, as PNG or JPEG',
@@ -600,8 +599,8 @@ REMEDIES: Mapping[str, str] = {
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
     'assumed velocity': 'correct the velocity so; on the ground state the site',
-    'assumed latitude': 'check the site, and that the stamps are UTC',
-    'assumed sidereal': 'check the site, and that the stamps are UTC',
+    'assumed latitude': _OF_SITE,
+    'assumed sidereal': _OF_SITE,
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',

@@ -195,7 +195,7 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     sigma_px = entry.sigma * np.exp(posterior.field.log_px)[entry.octave]
     term, precision = np.zeros(layout.count), layout.prior_precision.copy()
     term[field], precision[field] = entry.term * np.exp(posterior.term.log_px[0]), sigma_px**-2.0
-    # The sidereal time of an image that is left out is not known from the others: kept as found.
+    # Kept as found: each image may have a sidereal time of its own, which the others do not show.
     # Coefficients of the field that their prior holds at zero say nothing of an image.
     shown = (sigma_px**2 + term[field] ** 2) * np.diag(given.information)[field]
     kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])

@@ -344,7 +344,9 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
     if options.lens_residual_px:
         lens = math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA
     zenith = np.array([image.zenith_icrf for image in ensemble.images])
-    if np.isfinite(zenith).all():  # all images state one
+    is_known = np.isfinite(zenith).all(axis=1)
+    if is_known.any():  # where none is stated, as in older recordings, the air turns no star
+        zenith = np.where(is_known[:, None], zenith, 0.0)
         size, sigma = np.array([image.refraction_arcsec for image in ensemble.images]).max(axis=0)
         stamps = np.array([image.time_ns for image in ensemble.images], np.int64)
         # The velocity of a stated site is exact; a zenith by the stars comes with no date.

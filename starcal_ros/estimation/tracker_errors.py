@@ -288,7 +288,7 @@ def _restricted(
     return -0.5 * (error.shape[1] * log_det + squared), (1.0 / alone) @ ones**2
 
 
-_UNKNOWN_RATE_RAD_S = 6.4e-4  # of each axis: that of a low orbit, 1.1e-3, about any of them
+_UNKNOWN_RATE_RAD_S = 6.4e-4  # of each axis: 1.1e-3, a low orbit, about an axis not known
 # Images so near in time show how fast a camera turns: a tenth of a low orbit, in which it neither
 # comes round nor often turns away and back.
 _NEAR_S = 600.0
@@ -331,8 +331,9 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     as much as its error is of their scatter; an image without a rate has the mean.  The errors of
     the images are not lowered for it: together they are the error of the mean.
 
-    A sigma that is not stated is the scatter of the rates: one by a data sheet of the star tracker
-    leaves errors that seem to be differences.  Where no image has a rate, the camera is assumed to
+    A sigma that is not stated is the scatter of the rates, since a data sheet that is too good
+    would leave errors that seem to be differences; of less than three, the turn of a low orbit.
+    Where no image has a rate, the camera is assumed to
     turn about as fast as it does from image to image, at most as in a low orbit.
     """
     m = len(images)

@@ -83,7 +83,9 @@ def test_one_takes_over_from_another(
     client.until(lambda: found)
     first, other = calibration_from_message(found[0]).star_trackers
     assert (first.frame, other.frame) == ('star_tracker', 'other')
-    assert first.images + other.images == len(images()) and 0 < first.images < other.images
+    assert first.images + other.images == len(images())
+    # Of an image that has both, the one whose next sample comes first: three have the other alone.
+    assert 0 < first.images <= 0.7 * len(images())
 
 
 def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(

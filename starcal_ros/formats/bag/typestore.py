@@ -57,14 +57,14 @@ def typestore() -> Typestore:
 
 
 def store_with(type_name: str) -> Typestore:
-    """Return types with this one, of which there are few if it is often used, else `typestore`."""
+    """Return the few types that are often used if this is one of them, else `typestore`."""
     few = _few_types()
     return few if type_name in few.types else typestore()
 
 
 @functools.lru_cache(maxsize=1)
 def _few_types() -> Typestore:
-    """Types that most commands need, in a tenth of the time of all those of ROS 2, 0.1 s."""
+    """Types that most commands need: made in 0.01 s, where all those of ROS 2 take 0.1 s."""
     store, types = get_typestore(Stores.EMPTY), _own_types('StarObservations')
     for name, definition in _FEW_TYPES.items():
         types |= get_types_from_msg(definition, name)

@@ -154,7 +154,7 @@ def test_rates_that_no_image_has_are_said(
     bag = str(tmp_path / OBSERVATIONS_FILE)
     assert main.main(['calibrate', bag, '--params', params, '-o', out, '--no-report']) == 0
     said = ' '.join(capsys.readouterr().out.split())
-    assert ('turning as in a low orbit at most' in said) == np.isnan(rate)
+    assert ('the turn of a low orbit in the sigma' in said) == np.isnan(rate)
     assert 'read out within 20 ms' in said
 
 
