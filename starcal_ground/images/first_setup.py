@@ -194,8 +194,8 @@ def _assumed_shutter(ensemble: Ensemble | None) -> str:
     if any(np.isfinite(image.star_tracker_rate_rad_s).all() for image in ensemble.images):
         return 'unknown, read out within 20 ms'
     return (
-        'unknown, read out within 20 ms; with the turn of a low orbit in the sigma, since no image has'
-        ' an angular rate: state the shutter, or record attitudes more often'
+        'unknown, read out within 20 ms; with the turn of a low orbit in the sigma, since no image'
+        ' has an angular rate: state the shutter, or record attitudes more often'
     )
 
 

@@ -324,7 +324,7 @@ def cone(
     least = math.cos(min(radius_rad + CONE_MARGIN_RAD, math.pi))
     # First in single precision, good to 3e-7: less is read of the whole catalog.
     near = axis.astype(np.float32) @ catalog.directions_single >= least - 1e-6
-    rows = np.flatnonzero(near)
+    rows: Rows = np.flatnonzero(near)
     rows = rows[np.asarray(catalog.direction_icrs[rows] @ axis >= least)]
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
