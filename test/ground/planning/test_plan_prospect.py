@@ -48,6 +48,18 @@ def test_added_images_lower_the_sigma_as_the_estimator_says(
         assert sigma[2] == pytest.approx(reported, rel=0.15)  # noise and amplitudes found again
 
 
+def test_the_turn_of_a_camera_without_rates_stays_in_the_sigma(whole: Ensemble) -> None:
+    """All images share it: more of them do not take it away, as was promised before."""
+    nowhere = np.full(3, np.nan)
+    images = tuple(dataclasses.replace(o, star_tracker_rate_rad_s=nowhere) for o in whole.images)
+    few = _estimate(dataclasses.replace(whole, images=images[:8]))
+    found, wanted = prospect(few, images[8:], _OPTIONS), target(few, 'fy')
+    after = _estimate(dataclasses.replace(whole, images=images))
+    reported = target(after, 'fy').sigma(after.posterior.covariance)
+    expected = np.sqrt(found.variances([0, 1], wanted.squares))[2]
+    assert expected == pytest.approx(reported, rel=0.15)  # as above
+
+
 def test_the_best_candidate_is_the_one_whose_variance_is_least(
     whole: Ensemble, first: Estimate
 ) -> None:
