@@ -34,10 +34,11 @@ SERVICE = '/opnav/set_camera_info'
 # Keeps the camera that it receives in a file, as drivers do; SIGTERM ends it.
 DRIVER = """
 from pathlib import Path
+import signal
 import sys
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.srv import SetCameraInfo
 
 def keep(request, response):
@@ -47,14 +48,14 @@ def keep(request, response):
     response.success = True
     return response
 
-rclpy.init()
+ended = []
+# A handler of rclpy ends the context between the check of a spin and its wait, which then fails.
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
 node = rclpy.create_node('camera_driver')
 node.create_service(SetCameraInfo, sys.argv[2], keep)
-try:
-    while rclpy.ok():  # rmw_fastrtps may lose the wake-up by a signal: wait for half a second
-        rclpy.spin_once(node, timeout_sec=0.5)
-except ExternalShutdownException:
-    pass
+while not ended:
+    rclpy.spin_once(node, timeout_sec=0.5)
 node.destroy_node()
 """
 
