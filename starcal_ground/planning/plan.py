@@ -34,13 +34,7 @@ from starcal_ros.estimation.problem import Problem, State, whitened_attitude_err
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import (
-    Assumptions,
-    IMAGE_ROTATION,
-    Refraction,
-    STATED_SITE_RAD,
-    unknowns_of,
-)
+from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, Refraction, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.campaign import Campaign
 from starcal_ros.pipeline.setup import Setup
@@ -234,7 +228,7 @@ def _rows(
     if len(known.of(['site'])) == 2:  # latitude and one clock
         zenith = np.array([image.zenith_icrf for image in candidates])
         size = float(candidates[0].refraction_arcsec[0])
-        air = Refraction(np.zeros(count, np.int64), zenith, size, 1.0, STATED_SITE_RAD)
+        air = Refraction(np.zeros(count, np.int64), zenith, size, 1.0)
     # The columns of what is in the list; the information of its priors is in the estimate.
     assumed = Assumptions(float('velocity' in known), (0.0, readout), stamps, air)
     layout = unknowns_of(problem, state, rates, (camera.width, camera.height), assumed)
