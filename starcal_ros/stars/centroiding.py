@@ -23,11 +23,14 @@ from starcal_ros.robust_statistics import centre_and_scatter, medians
 from starcal_ros.stars import detection, psf_fit
 from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import (
+    BRIGHT_SNR,
     CentroidOptions,
+    FEWEST_BRIGHT,
     ImageModel,
     Instrument,
     MAX_SHAPE_CHANGE,
     PsfWidth,
+    SHOWN_SNR,
     width_basis,
 )
 from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
@@ -39,8 +42,6 @@ _MIN_MASK_PIXELS = 4
 _MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their neighbours
 SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
 _NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
-_BRIGHT_SNR, _FEWEST_BRIGHT = 15.0, 5  # stars that show a common change of shape, or the PSF
-_SHOWN_SNR = 8.0  # of stars that show a common change of shape where too few are bright
 _MOST = 60  # the brightest stars that show the PSF; fainter ones add almost nothing
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
 _COMMON_CHANGE = 0.5 * MAX_SHAPE_CHANGE
@@ -265,10 +266,10 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     if measured.fit is None:
         return False
     # Few stars of a narrow field are bright, and light spread along streaks has more noise.
-    for least_snr in (_BRIGHT_SNR, _SHOWN_SNR):
+    for least_snr in (BRIGHT_SNR, SHOWN_SNR):
         shown = measured.fit.snr > least_snr
         change = measured.fit.shape_change[shown]
-        if len(change) >= _FEWEST_BRIGHT:
+        if len(change) >= FEWEST_BRIGHT:
             noise = _OF_MEDIAN * medians(measured.fit.shape_sigma[shown]) / math.sqrt(len(change))
             departure = np.abs(medians(change) - model.shape_median)
             return bool((departure > np.maximum(_COMMON_CHANGE, 4.0 * noise)).any())
@@ -469,9 +470,11 @@ def learn(
     if measured.fit is None:
         return before
     stars = np.flatnonzero(usable[measured.fitted])
-    bright = stars[measured.fit.snr[stars] > _BRIGHT_SNR][:_MOST]
-    if len(bright) < _FEWEST_BRIGHT:
-        return before
+    # Few stars of a narrow field are bright.
+    for least_snr in (BRIGHT_SNR, SHOWN_SNR):
+        bright = stars[measured.fit.snr[stars] > least_snr][:_MOST]
+        if len(bright) >= FEWEST_BRIGHT:
+            break
     # Fainter stars show no PSF error, so that it can be separated from photon noise.
     shown = stars[:_MOST]
     noise = psf_fit.noise_sums(
@@ -479,6 +482,13 @@ def learn(
         measured.noise_dn[measured.fitted[shown]],
         model.pixel_noise,
     )
+    if before is not None:  # a decaying weight follows a change of focus
+        noise = NoiseSums(
+            noise.normal + _MEMORY * before.noise.normal,
+            noise.right + _MEMORY * before.noise.right,
+        )
+    if len(bright) < FEWEST_BRIGHT:
+        return None if before is None else dataclasses.replace(before, noise=noise)
     fit, row = psf_fit.select(measured.fit, bright), measured.fitted[bright]
     variance = measured.psf_sigma_px[row] ** 2
     median, scatter = centre_and_scatter(fit.shape_change)
@@ -492,13 +502,9 @@ def learn(
     weighted = basis * weight[:, None]
     normal, right = weighted.T @ basis, weighted.T @ (variance * (1.0 + change))
     if before is not None:
-        # A decaying weight follows a change of focus.
-        keep = _MEMORY
-        normal, right = normal + keep * before.width_normal, right + keep * before.width_right
-        noise = NoiseSums(
-            noise.normal + keep * before.noise.normal, noise.right + keep * before.noise.right
-        )
-        median = median + keep * (before.shape_median - median)
-        scatter = scatter + keep * (before.shape_scatter - scatter)
+        normal = normal + _MEMORY * before.width_normal
+        right = right + _MEMORY * before.width_right
+        median = median + _MEMORY * (before.shape_median - median)
+        scatter = scatter + _MEMORY * (before.shape_scatter - scatter)
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return Instrument(width, height, normal, right, noise, median, scatter, shown_dn)

@@ -24,6 +24,8 @@ from starcal_ros.stars.pixel_noise import blurred_px, NoiseSums, PixelNoise
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums, stamp_radius_px
 from starcal_ros.stars.streak import refined, Streak
 
+# Stars that show the PSF; the second where fewer are so bright, as in a narrow field.
+BRIGHT_SNR, SHOWN_SNR, FEWEST_BRIGHT = 15.0, 8.0, 5
 MAX_SHAPE_CHANGE = 0.35  # departure of second moments from the PSF's, a fraction: a blend
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
 _BRIGHTEST = 60  # stars that may show the level of saturation
@@ -213,18 +215,25 @@ def model_image(
     unknown = ImageModel(
         background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
-    least_snr = 15.0 if streak is None else 8.0  # the peak of a streak is lower than its light
+    apart_px = _ISOLATED_PX + (streak.longest_px if streak else 0.0)
 
-    def bright(of: detection.Sources) -> Floats:
+    def bright(of: detection.Sources, least_snr: float) -> Floats:
         xy_px = of.xy_px[of.snr > least_snr]
         nearest = np.rint(xy_px).astype(np.int64)
         return xy_px[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
 
-    apart_px, xy = _ISOLATED_PX + (streak.longest_px if streak else 0.0), bright(sources)[:400]
-    crowd = cKDTree(bright(neighbours or sources))
-    xy = xy[crowd.query_ball_point(xy, apart_px, return_length=True) == 1][:80]
+    def alone(least_snr: float) -> Floats:
+        xy_px = bright(sources, least_snr)[:400]
+        crowd = cKDTree(bright(neighbours or sources, least_snr))
+        is_alone = crowd.query_ball_point(xy_px, apart_px, return_length=True) == 1
+        return np.asarray(xy_px[is_alone][:80])
+
+    xy = alone(BRIGHT_SNR)
+    # The peak of a streak is lower than its light, and a short exposure has few bright stars.
+    if streak is not None or len(xy) < FEWEST_BRIGHT:
+        xy = alone(SHOWN_SNR)
     sigma = 1.2
-    if len(xy) < 5:
+    if len(xy) < FEWEST_BRIGHT:
         return unknown
     noise_model = PixelNoise(gain or 1.0, 0.02)
     for _ in range(6):
@@ -235,7 +244,7 @@ def model_image(
         stamps = detection.windows_about(pixels, centre, radius).astype(np.float64)
         clean = stamps.max(axis=(1, 2)) < saturation_dn
         xy, centre, stamps = xy[clean], centre[clean], stamps[clean]
-        if len(xy) < 5:
+        if len(xy) < FEWEST_BRIGHT:
             return unknown
         noise_dn = background.noise_at(xy)
         paths_px = streak.at(xy) if streak else None

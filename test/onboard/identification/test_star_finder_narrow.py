@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bench.lost_in_space import find_sky
 from bench.narrow import scenario_of
 from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import Scenario, Scene, scene
+from starcal_ground.simulation.scenario import Scenario, scenario, Scene, scene
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.blind.bright_sources import bright_sources
@@ -26,6 +26,7 @@ from starcal_ros.identification.star_finder import (
     observe_stars,
     StarSearch,
 )
+from starcal_ros.identification.tracking import start_tracking, track_stars
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
@@ -153,6 +154,41 @@ def test_the_psf_is_that_of_stars_not_of_cosmic_rays(
     assert found.psf_sigma_px == pytest.approx(given(0.5).detector.psf_sigma_px, rel=0.1)
     assert len(found) >= 14
     assert wrong(found, one) == 0
+
+
+def faint(psf_sigma_px: float, zero_point_electrons: float, index: int) -> tuple[Exposure, Scene]:
+    """An image of a short exposure: fewer than five of its stars are over 15 sigma."""
+    of_small = scenario('small', 1)
+    detector = dataclasses.replace(
+        of_small.detector,
+        psf_sigma_px=psf_sigma_px,
+        zero_point_electrons=zero_point_electrons,
+    )
+    campaign = dataclasses.replace(of_small, detector=detector)
+    one = scene(campaign, index)
+    image = render(campaign, one, index)
+    return Exposure(image, one.icrf_from_star_tracker_xyzw, 0.0), one
+
+
+def test_few_faint_stars_show_the_psf() -> None:
+    truth, search = scenario('small', 1).truth, StarSearch(load_catalog())
+    for index in (2, 5, 6):
+        exposure, one = faint(0.95, 1.5e4, index)
+        found, _ = observe_stars(exposure, truth, search)
+        assert found.refusal == '' and len(found) >= 8
+        assert wrong(found, one) == 0
+        # Eight stars of 10 sigma show it to 3 %.
+        assert found.psf_sigma_px == pytest.approx(0.95, rel=0.1)
+
+
+def test_the_noise_is_learned_from_stars_too_faint_for_the_psf() -> None:
+    truth, search = scenario('small', 1).truth, StarSearch(load_catalog())
+    exposure, _ = faint(0.4, 1e4, 0)
+    before = start_tracking(truth, *observe_stars(exposure, truth, search))
+    assert before is not None
+    after = track_stars(faint(0.4, 1e4, 2)[0], before, search)[1].instrument
+    assert (after.width_normal == before.instrument.width_normal).all()
+    assert after.noise.normal[0, 0] > 1.5 * before.instrument.noise.normal[0, 0]
 
 
 def test_a_catalog_of_another_region_is_said_to_be() -> None:
