@@ -44,11 +44,12 @@ class Prediction:
 
     def select(self, stars: Mask) -> Prediction:
         """Return the stars of a mask (n,)."""
+        rows = np.flatnonzero(stars)  # `take` needs a tenth of the time of a mask
         return Prediction(
-            self.catalog_index[stars],
-            self.direction_icrf[stars],
-            self.direction_camera[stars],
-            self.xy_px[stars],
+            self.catalog_index.take(rows),
+            self.direction_icrf.take(rows, axis=0),
+            self.direction_camera.take(rows, axis=0),
+            self.xy_px.take(rows, axis=0),
             self.camera,
         )
 
@@ -128,9 +129,9 @@ def visible(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Catalog rows (m,) above the elevation limit, and apparent ICRF directions (m, 3)."""
     if site.observer != 'ground':
-        return index, astrometry.apparent_directions(catalog.select(index), time_ns, velocity_m_s)
+        return index, astrometry.apparent_directions(catalog, time_ns, velocity_m_s, index)
     direction_icrf, elevation_rad = astrometry.through_the_air(
-        astrometry.apparent_directions(catalog.select(index), time_ns), time_ns, site
+        astrometry.apparent_directions(catalog, time_ns, rows=index), time_ns, site
     )
     high = elevation_rad >= math.radians(astrometry.MIN_ELEVATION_DEG)
     return index[high], direction_icrf[high]

@@ -13,12 +13,13 @@ rotated back to the axes of the ICRS.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import functools
 import math
 
 import erfa
 import numpy as np
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Rows
 from starcal_ros.constants import ARCSECOND_RAD, AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.options import option
 from starcal_ros.sky.catalog import StarCatalog
@@ -115,6 +116,7 @@ def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
     return Velocity(measured_m_s, math.nan if is_slow else GIVEN_SIGMA_M_S)
 
 
+@functools.lru_cache(maxsize=16)  # several functions ask for the time of an image
 def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
     """
     Terrestrial time as a two-part Julian date (day at 0h, fraction), accurate to 0.1 ns.
@@ -155,7 +157,10 @@ def earth_velocity_c(time_unix_ns: int) -> Floats:
 
 
 def apparent_directions(
-    stars: StarCatalog, time_unix_ns: int, observer_velocity_m_s: Floats | None = None
+    stars: StarCatalog,
+    time_unix_ns: int,
+    observer_velocity_m_s: Floats | None = None,
+    rows: Rows | slice = slice(None),
 ) -> Floats:
     """
     Apparent directions of catalog stars: unit vectors (n, 3) along the axes of the ICRS.
@@ -170,11 +175,12 @@ def apparent_directions(
     Parameters
     ----------
     stars : StarCatalog
-        n stars.
     time_unix_ns : int
         As for `tt_julian_date`.
     observer_velocity_m_s : (3,), optional
         Barycentric velocity of the observer, axes of the ICRS; default: that of the Earth.
+    rows : (n,), optional
+        Rows of the catalog; default: all.
     """
     day_jd, rest_days = tt_julian_date(time_unix_ns)
     heliocentric, barycentric = erfa.epv00(day_jd, rest_days)
@@ -189,12 +195,12 @@ def apparent_directions(
             )
     sun_distance_au = float(np.linalg.norm(heliocentric['p']))
     natural = erfa.pmpx(
-        stars.ra_rad,
-        stars.dec_rad,
+        stars.ra_rad[rows],
+        stars.dec_rad[rows],
         # ERFA takes the proper motion in right ascension as a coordinate rate.
-        stars.pm_ra_cosdec_rad_per_year / np.cos(stars.dec_rad),
-        stars.pm_dec_rad_per_year,
-        stars.parallax_rad / erfa.DAS2R,  # only parallax is in arcseconds
+        stars.pm_ra_cosdec_rad_per_year[rows] / np.cos(stars.dec_rad[rows]),
+        stars.pm_dec_rad_per_year[rows],
+        stars.parallax_rad[rows] / erfa.DAS2R,  # only parallax is in arcseconds
         0.0,
         julian_year(time_unix_ns) - stars.epoch_jyear,
         barycentric['p'],

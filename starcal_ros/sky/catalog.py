@@ -58,6 +58,7 @@ DEEPER_MAG = 2.0
 # Margin of a cone: 35 years of motion of the fastest star (8.7 arcsec a year) and 20 arcsec of
 # aberration.
 CONE_MARGIN_RAD = 330 * ARCSECOND_RAD
+_STEP_RAD = 0.05  # of directions whose surroundings are kept: 0.87 of it to the farthest
 
 
 # 1-sigma of the proper motion of a star of V = 9 per axis, and its factor for each magnitude
@@ -320,15 +321,30 @@ def cone(
         Omit stars fainter than this V.
     """
     axis = np.asarray(direction_icrs / np.linalg.norm(direction_icrs))
+    reach_rad = radius_rad + CONE_MARGIN_RAD
+    middle = np.round(axis / _STEP_RAD).astype(int)
+    about, direction_icrs = _surroundings(catalog, tuple(middle.tolist()), reach_rad + _STEP_RAD)
     # A cosine does not resolve angles below 1e-8 rad; the margin is 1.6e-3.
-    least = math.cos(min(radius_rad + CONE_MARGIN_RAD, math.pi))
-    # First in single precision, good to 3e-7: less is read of the whole catalog.
-    near = axis.astype(np.float32) @ catalog.directions_single >= least - 1e-6
-    rows: Rows = np.flatnonzero(near)
-    rows = rows[np.asarray(catalog.direction_icrs[rows] @ axis >= least)]
+    rows: Rows = about[np.asarray(direction_icrs @ axis >= math.cos(min(reach_rad, math.pi)))]
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
     return rows
+
+
+@lru_cache(maxsize=4)
+def _surroundings(
+    catalog: StarCatalog, middle: tuple[int, ...], radius_rad: float
+) -> tuple[Rows, Floats]:
+    """
+    Rows (m,) and directions (m, 3) of the stars about a direction (3,), in steps.
+
+    Kept for the next images: few cameras turn far from one to the next.
+    """
+    axis = np.array(middle) / np.linalg.norm(middle)
+    # In single precision, good to 3e-7: less is read of the whole catalog.
+    least = math.cos(min(radius_rad, math.pi)) - 1e-6
+    rows = np.flatnonzero(axis.astype(np.float32) @ catalog.directions_single >= least)
+    return rows, catalog.direction_icrs.take(rows, axis=0)
 
 
 def sky_circle(direction_icrs: Floats, radius_rad: float) -> str:

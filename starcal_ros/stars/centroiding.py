@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
@@ -225,8 +224,7 @@ def _windows(
     level_dn = psf_fit.border_level_dn(stamps)
     hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
     # The first guess uses all pixels; the fit leaves these out.
-    if hot.any():
-        stamps[hot] = level_dn[np.nonzero(hot)[0]]
+    np.copyto(stamps, level_dn[:, None, None], where=hot)
     out = saturated | hot | outside | invalid
     return _Windows(
         psf_fit.Stamps(
@@ -246,8 +244,7 @@ def _slopes(background: detection.Background, centre: Indices, radius: int) -> F
     """Slope of the background in windows about pixels (n, 2), DN, zero in their middles."""
     side = 2 * radius + 1
     slopes = [
-        detection.sample_mesh(slope, background.shape, centre)
-        for slope in detection.mesh_slope(background.level_mesh, background.shape)
+        detection.sample_mesh(slope, background.shape, centre) for slope in background.slope_meshes
     ]
     places = np.indices((side, side), np.float64).reshape(2, -1) - radius
     return np.asarray((np.stack(slopes, axis=-1) @ places).reshape(-1, side, side))
@@ -302,7 +299,7 @@ def _without_neighbours(
         return stamps, parameters, done, modelled
     # The wing of a star outside the stamp adds light to it.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px + 0.5 * streak_px
-    pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
+    pairs = detection.near_pairs(centre, reach_px)
     apart_px = psf_fit.apart_px(
         predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]],
         sigma_px[pairs[:, 0]],

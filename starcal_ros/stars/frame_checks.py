@@ -283,17 +283,18 @@ def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> 
     return _SLOPE_LEFT * median(third) / _noise_dn(sample, everywhere) if third.size else 0.0
 
 
-def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
+def _sorted_cells(rows: Pixels, step: int) -> Singles:
     """Every second pixel of square cells of sampled rows (down, across, n), ascending in each."""
     segments = _segments(rows)[:, :, ::2]
     k, m, length = segments.shape
     per_cell = max(1, min(_SEGMENT_PX // step, k))
     down = k // per_cell
     cells = segments[: down * per_cell].reshape(down, per_cell, m, length).transpose(0, 2, 1, 3)
-    return np.sort(cells.reshape(down, m, -1), axis=2)
+    # NumPy takes four times as long to sort integers of 16 bits.
+    return np.sort(cells.reshape(down, m, -1).astype(np.float32), axis=2)
 
 
-def _middle_mean(ascending: NDArray[Any]) -> Singles:
+def _middle_mean(ascending: Singles) -> Singles:
     """Means (down, across) of the middle half of each cell, free of stars and dead columns."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])

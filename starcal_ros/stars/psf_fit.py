@@ -117,11 +117,11 @@ class Stamps:
         if len(stars) == len(self):
             return self
         return Stamps(
-            self.data_dn[stars],
-            self.sigma_px[stars],
-            self.noise2_dn2[stars],
-            None if self.out is None else self.out[stars],
-            None if self.streak_px is None else self.streak_px[stars],
+            self.data_dn.take(stars, axis=0),
+            self.sigma_px.take(stars),
+            self.noise2_dn2.take(stars, axis=0),
+            None if self.out is None else self.out.take(stars, axis=0),
+            None if self.streak_px is None else self.streak_px.take(stars, axis=0),
         )
 
 
