@@ -119,11 +119,14 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
     columns = {'format': _RESIDUALS_FORMAT, **record_fields.plain_record(residuals)}
-    # As `np.savez_compressed`, whose level takes twice the time for 3 % fewer bytes.
-    with zipfile.ZipFile(memory, 'w', zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    # As `np.savez_compressed`, in a tenth of the time for 11 % more bytes: pixels and covariances
+    # are noise, which hardly deflates.
+    with zipfile.ZipFile(memory, 'w') as archive:
         for name, column in columns.items():
-            with archive.open(f'{name}.npy', 'w') as file:
-                np.save(file, column, allow_pickle=False)
+            kind = zipfile.ZIP_DEFLATED if np.ndim(column) < 2 else zipfile.ZIP_STORED
+            np.save(file := io.BytesIO(), column, allow_pickle=False)
+            # A name alone would get the time of the clock: each run writes the same bytes.
+            archive.writestr(zipfile.ZipInfo(f'{name}.npy'), file.getvalue(), kind, 1)
     product_files.write_atomically(path, memory.getvalue())
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 import dataclasses
-import functools
 import hashlib
 import json
 import math
@@ -53,10 +52,18 @@ _ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
 def ensemble_of(observations: Iterable[StarObservations], setup: Setup) -> Ensemble:
-    """The ensemble of some images, each added by `add_to_ensemble`."""
-    return functools.reduce(
-        lambda ensemble, image: add_to_ensemble(ensemble, image, setup), observations, Ensemble()
-    )
+    """
+    The ensemble of some images, each checked as by `add_to_ensemble`.
+
+    The least informative are dropped once there are twice as many as are kept, and at the end: to
+    weigh all images again for each further one would take longer than to measure it.
+    """
+    ensemble = Ensemble()
+    for image in observations:
+        ensemble = ensemble.add(_checked(image, setup))
+        if len(ensemble.images) >= 2 * setup.calibration.max_images:
+            ensemble = within_limit(ensemble, setup)
+    return within_limit(ensemble, setup)
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
@@ -66,12 +73,17 @@ def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: S
     An image whose size differs from the prior camera's is counted as refused: it is from another
     camera.  So is one whose stars no rotation brings near their pixels, as negated directions.
     """
+    return within_limit(ensemble.add(_checked(observations, setup)), setup)
+
+
+def _checked(observations: StarObservations, setup: Setup) -> StarObservations:
+    """Return the observations, refused if they cannot be of the prior camera."""
     size, camera = (observations.width, observations.height), setup.prior.camera
     if not observations.refusal and size != (camera.width, camera.height):
         observations = dataclasses.replace(observations, refusal='wrong_size')
     if not observations.refusal and not _shows_its_stars(observations, camera):
         observations = dataclasses.replace(observations, refusal='bad_observations')
-    return within_limit(ensemble.add(observations), setup)
+    return observations
 
 
 def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> bool:

@@ -62,6 +62,7 @@ MAGIC = b'\x89MCAP0\r\n'
 _MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
 _SUFFIXES = ('.mcap', '.db3') if rosbag2.READS_BAGS else ('.mcap',)
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
+_DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
 _LONGEST_NAME = 4096  # Linux has no longer path
@@ -86,6 +87,17 @@ def read_summary(file: Path) -> Summary | None:
             return make_reader(stream).get_summary() or Summary()
         except Exception:
             return None
+
+
+def _lacks_checksum(stream: IO[bytes]) -> bool:
+    """True if the end of the data says so, as in recordings of rosbag2: only chunks have one."""
+    try:
+        end = stream.seek(-(_FOOTER.size + len(MAGIC)), os.SEEK_END)
+        start = _FOOTER.unpack(stream.read(_FOOTER.size))[2] or end
+        stream.seek(start - _DATA_END.size)
+        return _DATA_END.unpack(stream.read(_DATA_END.size)) == (Opcode.DATA_END, 4, 0)
+    except (OSError, ValueError, OverflowError, struct.error):
+        return False
 
 
 def read_messages(
@@ -170,19 +182,21 @@ class _Pieces:
 
     def __iter__(self) -> Iterator[McapRecord]:
         with regular_file(self._file) as stream:
+            # A sum over the whole file would take a tenth of the time of reading it.
+            has_checksum = not _lacks_checksum(stream)
             start: int | None = 0
             while start is not None:
                 stream.seek(start)
-                start = yield from self._run(stream, start)
+                start = yield from self._run(stream, start, has_checksum)
 
-    def _run(self, stream: IO[bytes], start: int) -> Any:
+    def _run(self, stream: IO[bytes], start: int, has_checksum: bool) -> Any:
         """Pieces after an offset; returns the offset to continue at after damage, or None."""
         size = os.fstat(stream.fileno()).st_size
         reader = StreamReader(
             stream,
             skip_magic=start > 0,
             emit_chunks=True,
-            validate_crcs=True,
+            validate_crcs=has_checksum,
             record_size_limit=size,
         )
         read_to, chunk_is_sound = start, True

@@ -299,6 +299,22 @@ def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
                 np.testing.assert_array_equal(image.pixels, sound[k])
 
 
+@pytest.mark.parametrize('is_stated', [True, False])
+def test_a_checksum_of_all_data_is_compared(tmp_path: Path, is_stated: bool) -> None:
+    """A bit outside all messages: what a file states is checked, most recorders state none."""
+    path = tmp_path / 'b.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream, enable_data_crcs=is_stated)
+        writer.start('ros2', 'recorder')
+        writer.finish()
+    told: list[str] = []
+    assert list(bag_reader.read_messages(path, None, told.append)) == []
+    assert told == []
+    path.write_bytes(path.read_bytes().replace(b'recorder', b'recordes'))
+    assert list(bag_reader.read_messages(path, None, told.append)) == []
+    assert len(told) == is_stated
+
+
 @pytest.fixture(scope='module')
 def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag of many small chunks."""
