@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
+import functools
 import math
 
 import erfa
@@ -40,7 +42,10 @@ NOISE_PX = 0.08
 LIMIT_SIGMA = GateOptions().max_held_term_sigma
 
 
-def seen_from(site: SiteOptions, seed: int, wrong_clock: bool = False) -> list[StarObservations]:
+@functools.cache
+def seen_from(
+    site: SiteOptions, seed: int, wrong_clock: bool = False
+) -> tuple[StarObservations, ...]:
     """Images of one night, at elevations above 35 degrees of the site, with apparent places."""
     rng = np.random.default_rng(seed)
     catalog = load_catalog(None, 6.5)
@@ -72,10 +77,10 @@ def seen_from(site: SiteOptions, seed: int, wrong_clock: bool = False) -> list[S
                 snr=np.full(n, 20.0, np.float32),
             )
         )
-    return found
+    return tuple(found)
 
 
-def estimate(images: list[StarObservations]) -> Estimate:
+def estimate(images: Sequence[StarObservations]) -> Estimate:
     known = {f.name for f in dataclasses.fields(CalibrationOptions)}
     options = CalibrationOptions(
         **{k: v for k, v in options_of({}).items() if k in known}  # type: ignore[arg-type]
@@ -154,7 +159,7 @@ def test_in_space_no_ground_is_found_and_the_sigma_is_honest() -> None:
 
 
 def test_an_image_of_another_shape_is_refused() -> None:
-    images = seen_from(SITE, 3)
+    images = [*seen_from(SITE, 3)]
     middle = np.array([600.0, 450.0])
     off = images[4].measured_px - middle
     sheared = images[4].measured_px + 0.004 * off[:, 1:] * [1.0, 0.0]
