@@ -37,6 +37,7 @@ from starcal_ros.sky.catalog import load_catalog
 
 SITE = SiteOptions(observer='ground', latitude_deg=47.0, longitude_deg=11.0, height_m=500.0)
 CAMERA = ideal_camera((1200, 900), 2000.0).replace(k1=-0.05, cx=611.0, p1=4e-4)
+GIVEN = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
 START_NS = 1_700_000_000_000_000_000
 NOISE_PX = 0.08
 LIMIT_SIGMA = GateOptions().max_held_term_sigma
@@ -119,13 +120,12 @@ def off_sigma(found: Estimate) -> float:
 
 @pytest.mark.slow
 def test_a_clock_wrong_by_an_hour_is_named_and_a_minute_is_in_the_sigma() -> None:
-    given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
     for late_s, is_right in ((0, True), (60, True), (-3600, False), (3600, False), (21600, False)):
         found = [estimate(from_the_stated_site(seed, late_s)) for seed in range(4)]
         off = [off_sigma(each) for each in found]
         if is_right:
             assert max(off) < LIMIT_SIGMA
-            errors = [honesty(given, each, unmoved)[0] for each in found]
+            errors = [honesty(GIVEN, each, unmoved)[0] for each in found]
             assert np.sqrt(np.mean(np.square(errors))) < 1.3
         else:
             assert min(off) > LIMIT_SIGMA
@@ -144,8 +144,7 @@ def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: 
         assert text.startswith('observer: ground: ')
         declination = math.degrees(math.asin(images[0].zenith_icrf[2]))
         assert abs(declination - SITE.latitude_deg) < 8.0
-        given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
-        errors.append(honesty(given, estimate(images), unmoved)[0])
+        errors.append(honesty(GIVEN, estimate(images), unmoved)[0])
     assert np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
@@ -154,8 +153,7 @@ def test_in_space_no_ground_is_found_and_the_sigma_is_honest() -> None:
     for seed in range(4):
         images, text = with_air(seen_from(SiteOptions(), seed), CAMERA)
         assert not text.startswith('observer: ground: ')
-        given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
-        assert honesty(given, estimate(images), unmoved)[0] < 2.0
+        assert honesty(GIVEN, estimate(images), unmoved)[0] < 2.0
 
 
 def test_an_image_of_another_shape_is_refused() -> None:
