@@ -72,7 +72,7 @@ def find_sky(
     xy_px: Floats, prior: CameraModel, catalog: StarCatalog, try_mirrored: bool = False
 ) -> SkyMatch | None:
     """Identified stars among sources (n, 2), or None."""
-    return find_in_any([xy_px], prior, catalog, (False, True)[: 1 + try_mirrored])[0]
+    return find_in_any([xy_px], [prior], catalog, (False, True)[: 1 + try_mirrored])[0]
 
 
 def found(catalog: StarCatalog, count: int) -> Table:
@@ -127,7 +127,7 @@ def random_points(count: int) -> Table:
 def _searched(points: Floats, width_deg: float, ranges: Ranges) -> tuple[bool, float]:
     """True if points (n, 2) are taken for stars, and processor time, s."""
     catalog, prior = load_catalog(), camera(width_deg)
-    search = functools.partial(find_in_any, [points], prior, catalog, ranges=ranges)
+    search = functools.partial(find_in_any, [points], [prior], catalog, ranges=ranges)
     (sky, _), took_s = timed(search)
     return isinstance(sky, SkyMatch), took_s
 

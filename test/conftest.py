@@ -42,16 +42,17 @@ START_S = 240.0  # a node starts in 2 s; much slower on two busy cores
 SLOW_S = 5.0  # of processor time: more than a test of one second takes on most machines
 FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
-# Files of ten seconds and more, longest first: at the end, one of them would keep one worker while
-# the others wait.
+# Files of eight seconds and more, longest first: at the end, one of them would keep one worker
+# while the others wait.
 LONGEST = (
     *('test_colcon', 'test_bench', 'test_calibrate', 'test_night_sky', 'test_monte_carlo'),
-    *('test_first_setup', 'test_docs', 'test_diagnose', 'test_kills', 'test_campaign'),
-    *('test_arguments_output', 'test_c_camera', 'test_problem_temperature', 'test_trend'),
-    *('test_problem_mountings', 'test_series_overview', 'test_object_store'),
-    *('test_topics_camera_alone', 'test_plan', 'test_mission_records_guard', 'test_state'),
-    *('test_hostile_state', 'test_simulated_bag_mistakes', 'test_worlds', 'test_set_up_mistakes'),
-    *('test_ros_tools', 'test_hostile_messages', 'test_calibrator_camera_driver'),
+    *('test_problem_temperature', 'test_arguments_output', 'test_first_setup', 'test_campaign'),
+    *('test_docs', 'test_problem_mountings', 'test_motion', 'test_deep_catalog', 'test_kills'),
+    *('test_worlds', 'test_processes', 'test_search', 'test_trust', 'test_set_up_mistakes'),
+    *('test_lens_models', 'test_object_store', 'test_end_to_end', 'test_unknown_air'),
+    *('test_centroiding', 'test_c_camera', 'test_series_overview', 'test_trend', 'test_state'),
+    *('test_hostile_state', 'test_ros_tools', 'test_hostile_messages', 'test_plan'),
+    *('test_calibrator_camera_driver', 'test_paper', 'test_examples'),
 )
 
 

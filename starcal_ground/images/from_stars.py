@@ -258,15 +258,16 @@ def _first_match(
     ordered = sorted(seen, key=lambda one: -one.stars)
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
-        for camera in cameras:
-            finder = ImageSearch(camera, catalog, deadline_s)
-            if sky := finder.look_up(one.rankings, search.ROUNDS[:1]):
-                better = _of_better_lens(sky, one.rankings[finder.ranking], catalog)
-                found = ImageSearch(camera, catalog)
-                found.take(better, finder.ranking)
-                return found, better.camera_from_icrf
-            if finder.is_over():
-                return None
+        sky, ranking = search.find_in_any(
+            one.rankings, cameras, catalog, (False, True), search.ROUNDS[:1], deadline_s
+        )
+        if sky:
+            better = _of_better_lens(sky, one.rankings[ranking], catalog)
+            found = ImageSearch(better.camera, catalog)
+            found.take(better, ranking)
+            return found, better.camera_from_icrf
+        if time.thread_time() > deadline_s:
+            break
     return None
 
 

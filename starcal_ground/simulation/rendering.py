@@ -22,6 +22,8 @@ from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import project
 from starcal_ros.records import Image
 
+_TOGETHER = 4000  # stars whose pixels are summed at once: 5 MB, which a cache holds
+
 
 def pixel_stamps(
     centers_px: Floats,
@@ -60,11 +62,12 @@ def star_electrons(
     height, width = shape
     u, share_u, _ = pixel_stamps(pixels_px[:, 0], psf_sigma_px)
     v, share_v, _ = pixel_stamps(pixels_px[:, 1], psf_sigma_px)
-    light = flux_electrons[:, None, None] * share_v[:, :, None] * share_u[:, None, :]
-    v_all, u_all = np.broadcast_arrays(v[:, :, None], u[:, None, :])
-    inside = (u_all >= 0) & (u_all < width) & (v_all >= 0) & (v_all < height)
-    cells = v_all[inside] * width + u_all[inside]
-    electrons = np.bincount(cells, light[inside], height * width).reshape(height, width)
+    light_u = share_u * ((u >= 0) & (u < width))
+    light_v = flux_electrons[:, None] * share_v * ((v >= 0) & (v < height))
+    light = light_v[:, :, None] * light_u[:, None, :]
+    # Pixels beyond an edge, which have no light, stand for those at the edge.
+    cells = (v.clip(0, height - 1) * width)[:, :, None] + u.clip(0, width - 1)[:, None, :]
+    electrons = np.bincount(cells.ravel(), light.ravel(), height * width).reshape(height, width)
     return np.asarray(electrons, np.float64)
 
 
@@ -119,27 +122,28 @@ def render(
     rng = synthetic.random_stream(scenario.seed, synthetic.PIXEL_STREAM, index)
     mean = fixed_pattern(scenario) if pattern is None else pattern
     places_px = _places_px(scenario, shown)
-    for place_px in places_px:
-        flux_electrons = shown.flux_electrons / len(places_px)
-        sigma_px = detector.psf_sigma_at(place_px, shape)
-        mean = mean + star_electrons(place_px, flux_electrons, sigma_px, shape)
+    flux_electrons = shown.flux_electrons / len(places_px)
+    for some_px in np.array_split(places_px, math.ceil(places_px[..., 0].size / _TOGETHER) or 1):
+        flat_px = some_px.reshape(-1, 2)
+        sigma_px = detector.psf_sigma_at(flat_px, shape)
+        flux = np.tile(flux_electrons, len(some_px))
+        mean = mean + star_electrons(flat_px, flux, sigma_px, shape)
     mean += cosmic_ray_electrons(detector, shape, rng)
     return Image(shown.time_ns, expose(mean, detector, rng))
 
 
-def _places_px(scenario: synthetic.Scenario, shown: synthetic.Scene) -> list[Floats]:
-    """Places (n, 2) of the stars in equal parts of the exposure, a quarter of a pixel apart."""
+def _places_px(scenario: synthetic.Scenario, shown: synthetic.Scene) -> Floats:
+    """Places (parts, n, 2) of stars in equal parts of the exposure, a quarter of a pixel apart."""
     camera, turn_rad = scenario.truth.camera, np.array(scenario.turn_rad)
     if not turn_rad.any():
-        return [shown.pixel_px]
+        return shown.pixel_px[None]
     at_corner = np.array([1.0, 1.0, 0.5 * math.hypot(camera.width, camera.height)])
     at_corner[:2] = camera.parameters[0]
     count = math.ceil(4.0 * float(np.abs(turn_rad) @ at_corner))
     in_camera = shown.direction_icrf @ shown.camera_from_icrf.T
-    return [
-        project(camera, Rotation.from_rotvec(part * turn_rad).inv().apply(in_camera))
-        for part in (np.arange(count) + 0.5) / count - 0.5
-    ]
+    parts = (np.arange(count) + 0.5) / count - 0.5
+    turns = Rotation.from_rotvec(-parts[:, None] * turn_rad)
+    return np.stack([project(camera, turn.apply(in_camera)) for turn in turns])
 
 
 def images(scenario: synthetic.Scenario) -> Iterator[Image]:

@@ -140,7 +140,9 @@ class Derivatives:
     def covariance_rad2(self, covariance: MapCovariance, J: Floats) -> Floats:
         """Return the covariances (n, 3, 3) of the directions in the camera frame; J as here."""
         by_pixel = covariance.unresolved_px * self.by_pixel
-        parts = J @ covariance.matrix @ J.swapaxes(1, 2), by_pixel @ by_pixel.swapaxes(1, 2)
+        # One product for all pixels: NumPy would multiply the matrix once for each.
+        rows = (J.reshape(-1, J.shape[-1]) @ covariance.matrix).reshape(J.shape)
+        parts = rows @ J.swapaxes(1, 2), by_pixel @ by_pixel.swapaxes(1, 2)
         return np.asarray(sum(parts))
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import subprocess
@@ -27,13 +28,16 @@ def hostile(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a program in a folder, with the packages of this tree."""
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     'start',
-    [
-        [sys.executable, '-m', TOOL],
-        module_command(TOOL),
-    ],
+    [[sys.executable, '-m', TOOL], module_command(TOOL)],
     ids=['python -m', 'child process'],
 )
 @pytest.mark.parametrize(
@@ -55,14 +59,7 @@ def hostile(tmp_path: Path) -> Path:
 def test_modules_of_the_current_folder_are_not_run(
     hostile: Path, start: list[str], arguments: list[str]
 ) -> None:
-    done = subprocess.run(
-        [*start, *arguments],
-        cwd=hostile,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run([*start, *arguments], hostile)
     assert done.returncode == 0, done.stderr
     assert not (hostile / 'marks').exists(), (hostile / 'marks').read_text()
 
@@ -77,12 +74,5 @@ def test_other_programs_keep_their_path(tmp_path: Path) -> None:
     (tmp_path / 'program.py').write_text('import starcal_ros, beside; print(beside.NAME)')
     (tmp_path / 'beside.py').write_text("NAME = 'beside'")
     for command in (['-m', 'program'], ['program.py']):
-        done = subprocess.run(
-            [sys.executable, *command],
-            cwd=tmp_path,
-            env={**os.environ, 'PYTHONPATH': str(ROOT)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = run([sys.executable, *command], tmp_path)
         assert done.stdout == 'beside\n', done.stderr

@@ -78,17 +78,17 @@ class ImageSearch:
         self,
         rankings: Sequence[Floats],
         rounds: Sequence[tuple[int, int]] = search.ROUNDS,
-        scale: float = 1.0,
+        scales: Sequence[float] = (1.0,),
     ) -> SkyMatch | None:
-        """Match of an image anywhere; ``scale`` of the focal length until there is a match."""
-        camera, rows = self.camera, self._order(rankings)
+        """Match of an image anywhere; ``scales`` of the focal length until there is a match."""
+        cameras, rows = [self.camera], self._order(rankings)
         if len(self.mirrored) > 1:
-            fx, fy = (scale * float(camera.parameters[k]) for k in (0, 2))
-            camera = camera.replace(fx=fx, fy=fy)
+            fx, fy = self.camera.parameters[[0, 2]].tolist()
+            cameras = [self.camera.replace(fx=scale * fx, fy=scale * fy) for scale in scales]
         for ranges in self.ranges:
             sky, row = search.find_in_any(
                 [rankings[row] for row in rows],
-                camera,
+                cameras,
                 self.catalog,
                 self.mirrored,
                 rounds,
@@ -184,10 +184,8 @@ def identify_images(
                 solved.append(Solved(**vars(bright), sky=sky))
             else:
                 pending.append(bright)
-            if len(pending) == _FEW:
-                for scale in _OTHER_SCALES:
-                    if not solved:
-                        pending = _look_up(finder, pending, solved, search.ROUNDS[0], scale)
+            if len(pending) == _FEW and not solved:
+                pending = _look_up(finder, pending, solved, search.ROUNDS[0], _OTHER_SCALES)
         if len(solved) == _IMAGES or searched == _SEARCHED or finder.is_over():
             break
     for later in search.ROUNDS[1:]:
@@ -201,14 +199,14 @@ def _look_up(
     pending: Sequence[_Sources],
     solved: list[Solved],
     searched: tuple[int, int],
-    scale: float = 1.0,
+    scales: Sequence[float] = (1.0,),
 ) -> list[_Sources]:
     """The images that a round of the search does not identify; ``solved`` gets the others."""
     unsolved = []
     for bright in pending:
         sky = None
         if len(solved) < _FEW and not finder.is_over():
-            sky = finder.look_up([bright.sources.xy_px], [searched], scale)
+            sky = finder.look_up([bright.sources.xy_px], [searched], scales)
         if sky:
             solved.append(Solved(**vars(bright), sky=sky))
         else:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
+import itertools
 import math
 import time
 from typing import NamedTuple
@@ -92,7 +93,7 @@ class SkyMatch:
 
 def find_in_any(
     rankings: Sequence[Floats],
-    camera: CameraModel,
+    cameras: Sequence[CameraModel],
     catalog: StarCatalog,
     mirrored: Sequence[bool] = (False,),
     rounds: Sequence[tuple[int, int]] = ROUNDS,
@@ -102,20 +103,23 @@ def find_in_any(
     """
     Identified stars of an image and the row of their selection; None if there are none.
 
-    ``rankings`` are selections (n, 2) of its sources, brightest first.  ``camera`` is the prior,
-    within ``ranges``: by default focal length within 25 %, principal point within 5 % of the
-    width, distortion within 3 % of the radius.  The catalog is sorted by magnitude.  ``mirrored``
-    are the ways that each is tried, ``rounds`` a part of `ROUNDS`.  The search ends when the
-    processor time of the thread reaches ``deadline_s``.
+    ``rankings`` are selections (n, 2) of its sources, brightest first.  ``cameras`` are priors,
+    one of them within ``ranges``: by default focal length within 25 %, principal point within 5 %
+    of the width, distortion within 3 % of the radius.  The catalog is sorted by magnitude.
+    ``mirrored`` are the ways that each is tried, ``rounds`` a part of `ROUNDS`.  The search ends
+    when the processor time of the thread reaches ``deadline_s``.
     """
     views = [
-        _View(_image(xy_px, camera, turned, ranges), turned, k)
-        for k, xy_px in enumerate(rankings)
-        if len(xy_px) >= _FEWEST_SOURCES
-        for turned in mirrored
+        [
+            _View(_image(xy_px, camera, turned, ranges), turned, k)
+            for k, xy_px in enumerate(rankings)
+            if len(xy_px) >= _FEWEST_SOURCES
+            for turned in mirrored
+        ]
+        for camera in cameras
     ]
     for before, sources in rounds:
-        chosen = [view for view in views if len(view.image.xy_px) > before]
+        chosen = [[view for view in group if len(view.image.xy_px) > before] for group in views]
         for view, candidates in _candidates(chosen, catalog, before, sources):
             for fit in _fits(view.image, catalog, candidates):
                 log10_p, radius_px = sky_fit.log10_p_value(view.image, catalog, fit)
@@ -136,16 +140,18 @@ def _image(xy_px: Floats, camera: CameraModel, mirrored: bool, ranges: Ranges) -
 
 
 def _candidates(
-    views: Sequence[_View], catalog: StarCatalog, before: int, sources: int
+    groups: Sequence[Sequence[_View]], catalog: StarCatalog, before: int, sources: int
 ) -> Iterator[tuple[_View, list[_Candidate]]]:
     """
     Candidates of all look-ups: first the almost certain ones of each, then the others.
 
-    To refine a false candidate costs half as much as a look-up, and there may be 32 of them; of a
+    Each group has the views of one camera, whose focal length itself is tried before others.  To
+    refine a false candidate costs half as much as a look-up, and there may be 32 of them; of a
     camera that is known there are few, and they cost less than the index of another scale.
     """
     others = []
-    for focal_scale in _focal_scales(views[0].image) if views else ():
+    scales = [[(views, k) for k in _focal_scales(views[0].image)] for views in groups if views]
+    for views, focal_scale in filter(None, itertools.chain(*itertools.zip_longest(*scales))):
         scaled = [dataclasses.replace(view, focal_scale=focal_scale) for view in views]
         patterns = [view.patterns(before, sources) for view in scaled]
         for scale in pattern_index.scales_for(views[0].image.half_diagonal_rad / focal_scale):

@@ -32,10 +32,10 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope='module')
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag with its files, and the products of an earlier calibration of it in ``out/``."""
+def campaign(tmp_path_factory: pytest.TempPathFactory, few_images: Path) -> Path:
+    """A bag with its files, and the products of an earlier calibration in ``out/``."""
     folder = tmp_path_factory.mktemp('campaign')
-    shutil.copytree(BAG, folder / 'bag')
+    shutil.copytree(few_images, folder / 'bag')
     write_product_folder(folder / 'out')
     (folder / 'out/report.html').write_text('a page')
     return folder

@@ -24,20 +24,21 @@ SCENARIO = scenario('tiny', seed=8)
 FOCAL_PX = float(SCENARIO.truth.camera.parameters[0])
 CORNER_PX = 410.0
 SEARCH = StarSearch(load_catalog(None, 9.0))
-SHARP = np.zeros(3)
+Turn = tuple[float, float, float]  # rad, of an exposure
+SHARP: Turn = (0.0, 0.0, 0.0)
 LEAST = 0.45  # of the stars of a sharp image: streaks lie over each other and in their noise
 
 
-def turned(u_px: float, v_px: float, roll_px: float) -> np.ndarray:
-    """Turn, rad, that moves stars by pixels in the middle and, by roll, in the corners."""
-    return np.array([v_px / FOCAL_PX, u_px / FOCAL_PX, roll_px / CORNER_PX])
+def turned(u_px: float, v_px: float, roll_px: float) -> Turn:
+    """Turn that moves stars by pixels in the middle and, by roll, in the corners."""
+    return v_px / FOCAL_PX, u_px / FOCAL_PX, roll_px / CORNER_PX
 
 
+@functools.cache
 def exposed(
-    turn_rad: np.ndarray, index: int = 1, detector: Detector = SCENARIO.detector
+    turn_rad: Turn, index: int = 1, detector: Detector = SCENARIO.detector
 ) -> tuple[Scene, Exposure]:
-    turn = tuple(turn_rad.tolist())
-    moving = dataclasses.replace(SCENARIO, turn_rad=turn, detector=detector)
+    moving = dataclasses.replace(SCENARIO, turn_rad=turn_rad, detector=detector)
     shown = scene(moving, index)
     image = render(moving, shown, index)
     return shown, Exposure(image, shown.icrf_from_star_tracker_xyzw, 0.5)
@@ -69,7 +70,7 @@ def errors_sigma(shown: Scene, observations: StarObservations) -> np.ndarray:
     ids=['3 px', '6 px', 'diagonal', '9.5 px', 'roll', 'turn and roll'],
 )
 @pytest.mark.parametrize('tracked', [False, True])
-def test_streaks_are_measured_at_their_middle(turn_rad: np.ndarray, tracked: bool) -> None:
+def test_streaks_are_measured_at_their_middle(turn_rad: Turn, tracked: bool) -> None:
     before, instrument = sharp()
     shown, image = exposed(turn_rad)
     if tracked:

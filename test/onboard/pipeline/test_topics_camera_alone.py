@@ -66,9 +66,9 @@ def attitude(kind: str, time_ns: int, xyzw: np.ndarray) -> Message:
 
 
 def write_bag(path: Path, kind: str) -> Path:
-    """Write the tiny bag with its attitudes in messages of a type; none for an empty one."""
+    """Write four images with the attitudes in messages of a type; none for an empty one."""
     with BagWriter(path) as writer:
-        for image in reader.read_images([TINY], IMAGE_TOPIC):
+        for image in itertools.islice(reader.read_images([TINY], IMAGE_TOPIC), 4):
             assert isinstance(image, Image)
             writer.write_image(IMAGE_TOPIC, image, 'camera')
         for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC] if kind else []):
@@ -130,7 +130,7 @@ def test_inspect_takes_images_without_attitudes_where_calibrate_does(
     given = [word for option in options for word in words.get(option, [option])]
     assert main(['inspect', str(bag), *given]) == 0
     said = capsys.readouterr().out
-    assert '10 of 10 images' in said and 'the camera alone, without attitudes' in said
+    assert '4 of 4 images' in said and 'the camera alone, without attitudes' in said
 
 
 @pytest.mark.slow

@@ -90,7 +90,7 @@ def test_the_selection_of_sources_that_shows_stars_is_found(
     frame: Frame, catalog: StarCatalog
 ) -> None:
     points = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
-    found, row = find_in_any([points[:4], points, frame.xy_px], frame.prior, catalog)
+    found, row = find_in_any([points[:4], points, frame.xy_px], [frame.prior], catalog)
     assert isinstance(found, SkyMatch) and row == 2
     alone = find_sky(frame.xy_px, frame.prior, catalog)
     assert isinstance(alone, SkyMatch)
@@ -278,7 +278,7 @@ def test_a_camera_that_identified_another_image_is_searched_near_its_focal_lengt
     frame = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
     fx = growth * float(frame.prior.parameters[0])
     prior = frame.prior.replace(fx=fx, fy=fx)
-    sky, _ = find_in_any([frame.xy_px], prior, catalog, ranges=ranges)
+    sky, _ = find_in_any([frame.xy_px], [prior], catalog, ranges=ranges)
     assert isinstance(sky, SkyMatch) == is_found
     if isinstance(sky, SkyMatch):
         apart = (sky.camera_from_icrf * frame.camera_from_icrf.inv()).magnitude()
@@ -292,7 +292,7 @@ def test_an_image_of_a_known_camera_needs_the_index_of_one_scale(
     """Few stars make no candidate almost certain; an index takes as long as many images."""
     frame = next(frames(catalog, width_deg, stars, false, 0.0, 1))
     before, fresh = pattern_index.cache_info().misses, dataclasses.replace(catalog)
-    sky, _ = find_in_any([frame.xy_px], frame.prior, fresh, ranges=FOUND)
+    sky, _ = find_in_any([frame.xy_px], [frame.prior], fresh, ranges=FOUND)
     assert isinstance(sky, SkyMatch) and pattern_index.cache_info().misses == before + 1
 
 
