@@ -29,7 +29,7 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import StarcalError
-from starcal_ros.pipeline.campaign import calibrate_bags, Campaign
+from starcal_ros.pipeline.campaign import calibrate, Campaign, chosen, observe
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry
 from studies.trials import rms
@@ -127,7 +127,7 @@ def calibrated(
                 writer.write_velocity('/spacecraft/velocity', image.time_ns, velocity_m_s, 'icrf')
             writer.write_image('/camera/image_raw', image, 'camera')
     found = night_sky.from_bags([bag], Topics(), options, folder)
-    return calibrate_bags(found.bags, found.setup, found.topics, None, found.through_air)
+    return calibrate(observe(chosen(found)))
 
 
 def off_arcsec(found: Calibration, truth: CameraModel) -> tuple[float, float]:

@@ -61,13 +61,16 @@ def write_products(
 def write_camera_info(
     camera: CameraModel, path: Path, camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
 ) -> None:
+    """Write `camera_info_text`; raises ProductError when the file cannot be written."""
+    product_files.write_atomically(path, camera_info_text(camera, camera_name))
+
+
+def camera_info_text(camera: CameraModel, camera_name: str) -> str:
     """
-    Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
+    ROS camera YAML as camera_info_manager reads it: the best camera without skew.
 
     Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
     make up for it as well as they can (`ros_fit`).
-
-    Raises ProductError when the file cannot be written.
     """
     info = camera_info_fields(camera)
     content = {
@@ -80,7 +83,7 @@ def write_camera_info(
         'rectification_matrix': _matrix(3, info['r']),
         'projection_matrix': _matrix(3, info['p']),
     }
-    product_files.write_atomically(path, yaml_text(content))
+    return yaml_text(content)
 
 
 def yaml_text(content: object) -> str:

@@ -28,7 +28,7 @@ from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.campaign import Source, source_of, ThroughAir
+from starcal_ros.pipeline.campaign import Source
 from starcal_ros.pipeline.setup import (
     aligned,
     files_of,
@@ -126,34 +126,25 @@ class Given:
 @dataclass(frozen=True)
 class FirstSetup:
     """
-    Bags, topics and setup to calibrate from, and the files that are read.
+    The source to calibrate from, before `campaign.chosen`, and the files that are read.
 
-    ``found`` are sentences on what the stars show.
+    Its notes are sentences on what the stars show.
     """
 
     given: Given
-    bags: tuple[Path, ...]
-    topics: Topics
-    setup: Setup
+    source: Source
     files: tuple[Path, ...]
-    found: tuple[str, ...] = ()
-    through_air: ThroughAir | None = None
-
-    def source(self) -> Source:
-        """Source of a calibration; raises BagError and OptionError as `campaign.source_of`."""
-        source = source_of(self.bags, self.setup, self.topics, self.through_air)
-        return dataclasses.replace(source, notes=(*self.found, *source.notes))
 
     def write(self, folder: Path, topics: Topics) -> None:
         """Write ``params.yaml`` and ``camera.yaml``, which repeat the calibration."""
         make_folder(folder)
-        write_camera_info(self.setup.prior.camera, folder / CAMERA_FILE)
+        write_camera_info(self.source.setup.prior.camera, folder / CAMERA_FILE)
         write_atomically(folder / PARAMETER_FILE, self._parameter_file(topics))
 
     def _parameter_file(self, topics: Topics) -> str:
-        setup = self.setup
+        setup = self.source.setup
         values: dict[str, object] = {'lens_model': setup.frames.lens_model}
-        if self.through_air is None:
+        if self.source.through_air is None:
             values['attitude_direction'] = setup.attitude.attitude_direction
             values['prior_alignment'] = setup.prior.star_tracker_from_camera_xyzw.tolist()
         elif setup.site.observer == 'ground':  # stated by the images
@@ -161,7 +152,7 @@ class FirstSetup:
         values |= paths_from(self.given.options, Path.cwd())
         values['camera_info_url'] = CAMERA_FILE
         text = ''.join(f'{name}: {_in_a_line(value)}\n' for name, value in values.items())
-        found = ''.join(f'# {printable(line)}\n' for line in self.found)
+        found = ''.join(f'# {printable(line)}\n' for line in self.source.notes)
         to_state = ''.join(f'# {name}: {what}\n' for name, what in self.assumed(topics))
         return f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
 
@@ -171,17 +162,17 @@ class FirstSetup:
 
         ``ensemble``: the images, where they are at hand.
         """
-        options, stated = self.setup.calibration, self.given.options
-        has_tracker = self.through_air is None
+        setup, stated = self.source.setup, self.given.options
+        has_tracker = self.source.through_air is None
         has_velocity = bool(topics.velocity or topics.observations)
         rows = [
             ('star_tracker_sigma_arcsec', 'from the scatter of the images',
-             has_tracker and not tracker_sigma_is_given(options)),
+             has_tracker and not tracker_sigma_is_given(setup.calibration)),
             ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
             ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
             ('shutter', _assumed_shutter(ensemble), has_tracker),
             ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
-             not (has_velocity or self.setup.site.observer == 'ground'
+             not (has_velocity or setup.site.observer == 'ground'
                   or 'observer_velocity_m_s' in stated)),
         ]  # fmt: skip
         return [(name, text) for name, text, matters in rows if matters and name not in stated]
@@ -225,18 +216,18 @@ def first_setup(
         from starcal_ground.images import night_sky  # the search of the sky is seldom needed, slow
 
         with given.with_place():
-            sky, images = night_sky.from_images(
+            source, images = night_sky.from_images(
                 given.paths, given.topics, given.options, bag_folder, given.lens, on_notes
             )
-        read = (*images, *files)
-        return FirstSetup(given, sky.bags, sky.topics, sky.setup, read, sky.notes, sky.through_air)
+        return FirstSetup(given, source, (*images, *files))
     read = (*reader.mcap_files(given.paths), *files)
-    paths = tuple(given.paths)
-    if stated is not None:
-        return FirstSetup(given, paths, given.topics, stated, read)
-    with given.with_place():
-        setup, found = _of_attitudes(given, folder)
-    return FirstSetup(given, paths, given.topics, setup, read, found)
+    setup = stated
+    found: tuple[str, ...] = ()
+    if setup is None:
+        with given.with_place():
+            setup, found = _of_attitudes(given, folder)
+    source = Source(tuple(given.paths), given.topics, setup, notes=found)
+    return FirstSetup(given, source, read)
 
 
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
-from dataclasses import dataclass
+import functools
 import itertools
 import math
 from pathlib import Path
@@ -28,9 +28,9 @@ from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.identification.blind.bright_sources import bright_sources
 from starcal_ros.identification.blind.images import FEWEST_SOURCES
-from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.campaign import calibrate, chosen, observe, Source
 from starcal_ros.pipeline.diagnosis.bags import refusals
-from starcal_ros.pipeline.setup import load_setup, option_groups, Setup
+from starcal_ros.pipeline.setup import load_setup, option_groups
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
@@ -40,48 +40,36 @@ _FEW = 5  # images that are looked at for stars
 _ATTITUDE_TOPIC = '/stars/attitude'
 
 
-@dataclass(frozen=True)
-class NightSky:
+def _through_air(
+    stars: by_stars.FromStars, is_located: bool, observations: Sequence[StarObservations]
+) -> tuple[list[StarObservations], str]:
     """
-    Bags and set-up of a calibration by the stars alone, and notes for the user.
+    Observations, refracted if the stars show it and no site is given, and notes on them.
 
-    ``topics`` are those to read: the attitudes of the stars, in place of any in the bags.
     ``is_located`` is False if neither the options nor the files state the site of the camera.
     """
+    images, note = [_in_words_of_stars(stars, one) for one in observations], ''
+    if not is_located:
+        images, note = with_air(images, stars.camera)
+    lost = refusals(one for one in images if one.time_ns in stars.icrf_from_camera)
+    notes = [note] if note else []
+    notes += [
+        f'{row.count} of {len(images)} images, identified by their stars, refused as'
+        f' {row.reason}: {row.detail or row.meaning}'
+        for row in lost
+    ]
+    return images, '; '.join(notes)
 
-    bags: tuple[Path, ...]
-    setup: Setup
-    notes: tuple[str, ...]
-    is_located: bool
-    topics: Topics
-    copies_ns: frozenset[int] = frozenset()
-    identified_ns: frozenset[int] = frozenset()
 
-    def through_air(
-        self, observations: Sequence[StarObservations]
-    ) -> tuple[list[StarObservations], str]:
-        """Observations, refracted if the stars show it and no site is given, and notes on them."""
-        images, note = [self._in_words_of_stars(one) for one in observations], ''
-        if not self.is_located:
-            images, note = with_air(images, self.setup.prior.camera)
-        lost = refusals(one for one in images if one.time_ns in self.identified_ns)
-        notes = [note] if note else []
-        notes += [
-            f'{row.count} of {len(images)} images, identified by their stars, refused as'
-            f' {row.reason}: {row.detail or row.meaning}'
-            for row in lost
-        ]
-        return images, '; '.join(notes)
-
-    def _in_words_of_stars(self, one: StarObservations) -> StarObservations:
-        """Observations of a copy refused, and of an image without stars as such."""
-        if one.time_ns in self.copies_ns:
-            reason, detail = 'frozen', 'a copy of another image'
-        elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
-            reason, detail = 'no_match', 'its stars are no part of the sky'
-        else:
-            return one
-        return refused_image(one.time_ns, one.width, one.height, reason, detail)
+def _in_words_of_stars(stars: by_stars.FromStars, one: StarObservations) -> StarObservations:
+    """Observations of a copy refused, and of an image without stars as such."""
+    if one.time_ns in stars.copies_ns:
+        reason, detail = 'frozen', 'a copy of another image'
+    elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
+        reason, detail = 'no_match', 'its stars are no part of the sky'
+    else:
+        return one
+    return refused_image(one.time_ns, one.width, one.height, reason, detail)
 
 
 def from_images(
@@ -91,10 +79,11 @@ def from_images(
     folder: Path,
     lens: tuple[float, float] = (0.0, 0.0),
     on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
-) -> tuple[NightSky, list[Path]]:
+) -> tuple[Source, list[Path]]:
     """
-    Set-up of a calibration of photographs or of bags without attitudes, and the files it reads.
+    Source of a calibration of photographs or of bags without attitudes, and the files it reads.
 
+    Its topics are those requested, with the attitudes of the stars in place of any in the bags.
     ``lens`` is the focal length (mm) and the pixel size (um), 0 where not given.
     ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
     the stars give no camera.
@@ -151,9 +140,9 @@ def _shows_stars(group: Sequence[image_files.Photograph]) -> bool:
 
 def from_photographs(
     photographs: Sequence[image_files.Photograph], values: Mapping[str, object], folder: Path
-) -> NightSky:
+) -> Source:
     """
-    Set-up of a calibration of photographs, whose bags are written into a folder.
+    Source of a calibration of photographs, whose bags are written into a folder.
 
     The search starts at their stated focal length, if any.  Raises NotFromStars when the stars
     give no camera.
@@ -197,9 +186,9 @@ def from_bags(
     values: Mapping[str, object],
     folder: Path,
     lens: tuple[float, float] = (0.0, 0.0),
-) -> NightSky:
+) -> Source:
     """
-    Set-up of a calibration of bags without attitudes; attitudes by the stars go into a folder.
+    Source of a calibration of bags without attitudes; attitudes by the stars go into a folder.
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
@@ -276,7 +265,7 @@ def _set_up(
     given: Topics,
     notes: Sequence[str] = (),
     times_of: str = '',
-) -> NightSky:
+) -> Source:
     from starcal_ground.bag_writer import BagWriter  # as above
 
     attitudes = folder / 'attitudes.mcap'
@@ -294,15 +283,8 @@ def _set_up(
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
     topics = dataclasses.replace(given, attitude=_ATTITUDE_TOPIC)
-    return NightSky(
-        (*bags, attitudes),
-        setup,
-        tuple(notes),
-        is_located,
-        topics,
-        stars.copies_ns,
-        frozenset(stars.icrf_from_camera),
-    )
+    through_air = functools.partial(_through_air, stars, is_located)
+    return Source((*bags, attitudes), topics, setup, through_air, tuple(notes))
 
 
 def site_of(photographs: Sequence[image_files.Photograph]) -> dict[str, object]:
@@ -354,8 +336,5 @@ def calibrate_images(
     """
     paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
-        folder = Path(name)
-        sky, files = from_images(paths, Topics(image=image_topic), options, folder)
-        inputs = inputs_of(files)
-        campaign = calibrate_bags(sky.bags, sky.setup, sky.topics, inputs, sky.through_air)
-    return campaign.calibration
+        source, files = from_images(paths, Topics(image=image_topic), options, Path(name))
+        return calibrate(observe(chosen(source)), inputs_of(files)).calibration

@@ -118,7 +118,7 @@ def inspect(
                 bag_topics.Topics(image=bag_topics.choose_image_topic(paths, given)),
             )
         if setup:
-            source = campaign.source_of(paths, setup, given, through_air)
+            source = campaign.chosen(campaign.Source(tuple(paths), given, setup, through_air))
             chosen, setup, notes = source.topics, source.setup, source.notes
             records = bag_topics.read(paths, chosen, setup)
         elif (chosen := chosen or bag_topics.choose_topics(paths, given)).observations:

@@ -2,7 +2,7 @@
 """
 The recipe from bags to a calibration, which every program that reads bags follows.
 
-`source_of` chooses the topics and finds the alignment where no prior one is given, `observe`
+`chosen` chooses the topics and finds the alignment where no prior one is given, `observe`
 measures the stars, and `calibrate` solves.  If it is accepted, images that matched no star are
 measured again with that calibration, and a second solution includes those that match now.  The
 nodes take the same steps by `observe` and `solve`; of the images that match no star they keep the
@@ -12,7 +12,7 @@ last few only.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcal_ros.assessment.predictions import Residuals
@@ -30,7 +30,7 @@ ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations]
 @dataclass(frozen=True)
 class Source:
     """
-    Bags, the topics read from them, and the setup with the prior alignment.
+    Bags, topics and setup; once `chosen`, the topics that are read and an alignment.
 
     ``through_air`` is given where the attitudes are those of the stars, each image identified by
     itself; ``notes`` are sentences for the user.
@@ -75,24 +75,22 @@ class Campaign:
     notes: tuple[str, ...]
 
 
-def source_of(
-    bags: Sequence[Path], setup: Setup, requested: Topics, through_air: ThroughAir | None = None
-) -> Source:
+def chosen(source: Source) -> Source:
     """
-    Topics of bags to calibrate from, and a setup with an alignment.
+    A source with the topics to calibrate from, and a setup with an alignment.
 
     The alignment is found from the images where the setup has none; recorded observations need
     none, since their stars are identified.  Raises BagError when a bag cannot be read, a topic is
     missing or several have its type.  Raises OptionError when no alignment is found.
     """
+    bags, requested, setup, notes = source.bags, source.topics, source.setup, source.notes
     topics = bag_topics.choose_topics(bags, requested, setup)
-    notes: tuple[str, ...] = ()
     if not (setup.is_aligned or topics.observations):
         from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags  # seldom needed, slow
 
         setup, sentence = aligned_by_bags(bags, requested, setup)
-        notes = (sentence,)
-    return Source(tuple(bags), topics, setup, through_air, notes)
+        notes = (*notes, sentence)
+    return replace(source, topics=topics, setup=setup, notes=notes)
 
 
 def observe(
@@ -165,7 +163,6 @@ def calibrate_bags(
     setup: Setup,
     requested: Topics,
     inputs: Mapping[str, str] | None = None,
-    through_air: ThroughAir | None = None,
 ) -> Campaign:
-    """Calibration of bags by `source_of`, `observe` and `calibrate`, with their errors."""
-    return calibrate(observe(source_of(bags, setup, requested, through_air)), inputs)
+    """Calibration of bags by `chosen`, `observe` and `calibrate`, with their errors."""
+    return calibrate(observe(chosen(Source(tuple(bags), requested, setup))), inputs)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.mission.export.c_camera import TABLE_FILE
 from starcal_ground.mission.export.export_formats import export
 from starcal_ros.camera import line_of_sight
 from starcal_ros.records import Calibration
@@ -91,7 +92,8 @@ def test_it_answers_with_the_lines_of_sight_of_the_python_package(
         return '' if answer.successful else answer.reason
 
     assert np.abs(sights() - expected(COMPILED_IN, asked)).max() < SAME_DIRECTION
-    (table,) = export(UPLINKED, 'c', tmp_path, None, table=True).files
+    export(UPLINKED, 'c', tmp_path, None, table=True)
+    table = tmp_path / TABLE_FILE
     assert set_table(table) == ''
     assert np.abs(sights() - expected(UPLINKED, asked)).max() < SAME_DIRECTION
     damaged = tmp_path / 'damaged.bin'

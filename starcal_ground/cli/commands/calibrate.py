@@ -106,6 +106,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
     from starcal_ground.images import first_setup
     from starcal_ground.products import check_outputs, make_folder, same_as_one_of
     from starcal_ros.assessment.gate import requirements_of
+    from starcal_ros.pipeline.campaign import chosen
 
     requirements_of(args.require or ())
     given = arguments.given(args, **({'requirements': args.require} if args.require else {}))
@@ -130,7 +131,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
         first = first_setup.first_setup(given, setup, args.output, bag_folder, note)
     first = replace(first, files=tuple(dict.fromkeys((*first.files, *named))))
     with failure_recorded(args.output, given.paths, OptionError):  # no alignment was found
-        source = first.source()
+        source = chosen(first.source)
     note(source.notes)
     if not given.states_camera:
         first.write(args.output, source.topics)

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli.commands.compare import print_comparison
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
     from starcal_ground.report import page
-    from starcal_ros.pipeline.campaign import source_of
+    from starcal_ros.pipeline.campaign import chosen, Source
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
 
@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again, _ = calibrate_into(args.output, source_of([bag.bag], setup, Topics()), dict)
+    source = chosen(Source((bag.bag,), Topics(), setup))
+    again, _ = calibrate_into(args.output, source, dict)
     products.write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again.calibration).before.length_px.max())
     same = apart_px <= _SAME_PX

@@ -34,8 +34,9 @@ def run(args: argparse.Namespace) -> int:
     setup, _ = given.checked()
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
-        arguments.print_notes(first.found)
-        diagnosis = diagnose_bags(first.bags, first.topics, first.setup)
+        source = first.source
+        arguments.print_notes(source.notes)
+        diagnosis = diagnose_bags(source.bags, source.topics, source.setup)
     if args.json:
         arguments.print_json(diagnosis)
     else:

@@ -80,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
     done = export(
         *(calibration, args.to, args.output, names, args.table, observations, args.kernels)
     )
-    terminal.print_text(f'written: {", ".join(map(str, done.files))}')
+    written = ', '.join(str(args.output / name) for name in done.files)
+    terminal.print_text(f'written: {written}')
     if not calibration.accepted:
         arguments.complain(
             f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}'

@@ -61,9 +61,10 @@ def run(args: argparse.Namespace) -> int:
                 raise
             problem = explained(error)  # the bag is listed all the same
         else:
-            arguments.print_notes(first.found)
-            bags, topics, setup = first.bags, first.topics, first.setup
-            through_air = first.through_air
+            source = first.source
+            arguments.print_notes(source.notes)
+            bags, topics, setup = source.bags, source.topics, source.setup
+            through_air = source.through_air
         total = max((t.count for t in reader.topics(bags) if t.type_name in kinds), default=0)
         with terminal.progress_bar(total, 'images') as advance:
             inspection = inspect.inspect(bags, topics, setup, advance, through_air, problem)

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.planning.plan import Cone, plan_pointings, Request
     from starcal_ros.formats.bag import reader
     from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.pipeline.campaign import calibrate, observe
+    from starcal_ros.pipeline.campaign import calibrate, chosen, observe
 
     given = arguments.given(args)
     setup, files = given.checked()
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     )
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
-        campaign = calibrate(observe(first.source()))
+        campaign = calibrate(observe(chosen(first.source)))
     arguments.print_notes(campaign.notes)
     plan = plan_pointings(campaign.ensemble, campaign.setup, request)
     if args.output:

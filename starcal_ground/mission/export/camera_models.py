@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 
 from starcal_ground.mission.export import exported
 from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
-from starcal_ground.products import CAMERA_INFO_FILE, write_camera_info, yaml_text
+from starcal_ground.products import CAMERA_INFO_FILE, camera_info_text, yaml_text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
@@ -84,8 +84,8 @@ def ros_yaml(calibration: Calibration) -> exported.Content:
         },
     }
     comment = _commented(exported.origin(calibration))
-    files: exported.Files = {
-        CAMERA_INFO_FILE: lambda path: write_camera_info(camera, path, calibration.child_frame),
+    files = {
+        CAMERA_INFO_FILE: camera_info_text(camera, calibration.child_frame),
         'alignment.yaml': '\n'.join([*comment, yaml_text(content)]),
     }
     return dataclasses.replace(made, files=files)

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from starcal_ground.mission.export import camera_models, spice
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.exported import Content, Loss
+from starcal_ground.mission.export.exported import Content
 from starcal_ground.products import check_outputs
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
@@ -21,19 +20,6 @@ _OF_ALIGNMENT = ('ros', 'spice', 'ck')
 _OF_SPICE = ('spice', 'ck', 'isd')
 
 
-@dataclass(frozen=True)
-class Exported:
-    """
-    Files written, the largest error of a pixel in them against the calibration, and its parts.
-
-    The error is infinite where the format cannot see the whole detector.
-    """
-
-    files: tuple[Path, ...]
-    worst_px: float
-    losses: tuple[Loss, ...]
-
-
 def export(
     calibration: Calibration,
     kind: str,
@@ -42,9 +28,9 @@ def export(
     table: bool = False,
     observations: Iterable[StarObservations] = (),
     kernels: Sequence[Path] = (),
-) -> Exported:
+) -> Content:
     """
-    Write a calibration to a folder in one of `FORMATS`.
+    Write a calibration to a folder in one of `FORMATS`; return what was written.
 
     Raises OptionError for an unknown format, or names that SPICE does not allow. Raises
     ProductError when a file cannot be written, and as `check_outputs` does.
@@ -90,8 +76,5 @@ def export(
     made = makers[kind]()
     check_outputs((folder / name for name in made.files), kernels)
     for name, content in made.files.items():
-        if callable(content):
-            content(folder / name)
-        else:
-            write_atomically(folder / name, content)
-    return Exported(tuple(folder / name for name in made.files), made.worst_px, made.losses)
+        write_atomically(folder / name, content)
+    return made

@@ -8,9 +8,8 @@ comment, and each text in a format without escapes, passes `ascii_line`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +22,6 @@ PIXEL_CONVENTION = (
     'Pixel (u, v) = (column, row); the centre of the first pixel is (0, 0).',
     'Camera frame: +Z along the optical axis, +X along u, +Y along v.',
 )
-Files = Mapping[str, str | bytes | Callable[[Path], None]]
 GRID = 25  # pixels a side, as in the fits of `camera`
 
 
@@ -43,13 +41,13 @@ class Loss:
 @dataclass(frozen=True)
 class Content:
     """
-    Files of an export: content by name, or a function that writes the file to a path.
+    Files of an export: their content by name.
 
-    ``worst_px`` is the largest error of a pixel in them against the calibration, ``losses`` its
-    parts.
+    ``worst_px`` is the largest error of a pixel in them against the calibration, infinite where
+    the format cannot see the whole detector; ``losses`` are its parts.
     """
 
-    files: Files
+    files: Mapping[str, str | bytes]
     worst_px: float = 0.0
     losses: tuple[Loss, ...] = ()
 

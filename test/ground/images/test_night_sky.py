@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
-from starcal_ground.images.from_stars import _of_one_lens, from_stars, ideal_camera
-from starcal_ground.images.night_sky import calibrate_images, NightSky, photographs_of
+from starcal_ground.images.from_stars import _of_one_lens, from_stars, FromStars, ideal_camera
+from starcal_ground.images.night_sky import _through_air, calibrate_images, photographs_of
 from starcal_ground.simulation.rendering import images
 import starcal_ros
 from starcal_ros.arrays import Pixels
@@ -31,10 +31,8 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.identification.blind.search import SkyMatch
-from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.pipeline.topics import Topics
-from starcal_ros.records import CameraGeometry, Image, refused_image
+from starcal_ros.records import Image, refused_image
 from starcal_ros.sky.catalog import load_catalog
 
 TOPIC = '/camera/image_raw'
@@ -351,11 +349,10 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
 
 
 def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
-    prior = CameraGeometry(ideal_camera((640, 512), 1800.0), np.array([0.0, 0.0, 0.0, 1.0]))
-    setup = load_setup({}, prior=prior)
-    sky = NightSky((), setup, (), True, Topics(), identified_ns=frozenset({1, 2}))
+    identified = dict.fromkeys((1, 2), Rotation.identity())
+    stars = FromStars(ideal_camera((640, 512), 1800.0), False, identified, 3)
     detail = 'stars match in one part of the image only'
     images = [refused_image(time_ns, 640, 512, 'no_match', detail) for time_ns in (1, 2, 3)]
-    _, note = sky.through_air(images)
+    _, note = _through_air(stars, True, images)
     assert note == (f'2 of 3 images, identified by their stars, refused as no_match: {detail}')
-    assert sky.through_air(images[2:])[1] == ''
+    assert _through_air(stars, True, images[2:])[1] == ''

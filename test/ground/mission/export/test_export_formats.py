@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 import spiceypy
 import yaml
 
-from starcal_ground.mission.export.export_formats import export, Exported, FORMATS
+from starcal_ground.mission.export.export_formats import export, FORMATS
+from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import nearest_camera
@@ -61,7 +62,7 @@ def opencv_pixels(
 def test_opencv_sees_a_star_where_the_calibration_does(tmp_path, model, skew, with_field) -> None:
     made = calibration(model, skew, with_field)
     done = export(made, 'opencv', tmp_path, None)
-    storage = cv2.FileStorage(str(done.files[0]), cv2.FILE_STORAGE_READ)
+    storage = cv2.FileStorage(str(tmp_path / 'opencv.yaml'), cv2.FILE_STORAGE_READ)
     K = storage.getNode('camera_matrix').mat()
     D = storage.getNode('distortion_coefficients').mat()
     size = [int(storage.getNode(f'image_{side}').real()) for side in ('width', 'height')]
@@ -81,18 +82,18 @@ def test_opencv_sees_a_star_where_the_calibration_does(tmp_path, model, skew, wi
     assert any('field' in part for part in parts(done)) == with_field
 
 
-def parts(done: Exported) -> list[str]:
+def parts(done: Content) -> list[str]:
     return [loss.part for loss in done.losses]
 
 
 def test_ros_files_are_the_camera_without_skew_and_the_transform(tmp_path: Path) -> None:
     made = calibration(with_field=True)
     done = export(made, 'ros', tmp_path, None)
-    camera_path, alignment = done.files
     pixels, directions = grid_of(made)
-    seen = project(read_camera_info(camera_path), directions)
+    seen = project(read_camera_info(tmp_path / 'camera_info.yaml'), directions)
     assert worst_px(seen, pixels) == pytest.approx(done.worst_px, abs=SAME_PX)
-    rotation = yaml.safe_load(alignment.read_text())['transform']['rotation']
+    alignment = yaml.safe_load((tmp_path / 'alignment.yaml').read_text())
+    rotation = alignment['transform']['rotation']
     found = [rotation[axis] for axis in 'xyzw']
     assert found == made.geometry.star_tracker_from_camera_xyzw.tolist()
 
@@ -102,7 +103,7 @@ def test_giant_has_the_skew_and_the_focal_change(tmp_path: Path, model: str) -> 
     """By the equations that GIANT publishes: it is on no package registry."""
     made = calibration(model, temperature=True)
     done = export(made, 'giant', tmp_path, None)
-    content = json.loads(done.files[0].read_text())
+    content = json.loads((tmp_path / 'giant_camera.json').read_text())
     named = content['OpenCVModel']
     assert (named['a1'], named['a2']) == (4e-5, -6e-7)
     assert (named['n_rows'], named['n_cols']) == (1024, 1296)
@@ -135,7 +136,7 @@ def test_a_model_of_mrcal_has_the_error_it_states(tmp_path: Path, model: str) ->
     """By OpenCV, whose model and order mrcal documents for LENSMODEL_OPENCVn."""
     made = calibration(model)
     done = export(made, 'mrcal', tmp_path, None)
-    lines = done.files[0].read_text().splitlines()
+    lines = (tmp_path / 'camera.cameramodel').read_text().splitlines()
     content = ast.literal_eval('\n'.join(line for line in lines if not line.startswith('#')))
     fx, fy, cx, cy, *D = content['intrinsics']
     assert content['lensmodel'] == f'LENSMODEL_OPENCV{len(D)}'
@@ -183,7 +184,8 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
         sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
     )
     names = SpiceNames(-999, camera_frame='CAMERA', star_tracker_frame='TRACKER')
-    for path in export(made, kind, tmp_path, names).files:
+    for name in export(made, kind, tmp_path, names).files:
+        path = tmp_path / name
         text = path.read_text('ascii')
         assert all(line.isprintable() for line in text.split('\n')), path
         READERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
@@ -232,7 +234,7 @@ def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(
             made.geometry, star_tracker_from_camera_xyzw=Rotation.from_rotvec(rotation).as_quat()
         )
         made = dataclasses.replace(made, geometry=turned, parent_frame=frame)
-        text = export(made, kind, tmp_path, None).files[0].read_text()
+        (text,) = export(made, kind, tmp_path, None).files.values()
         assert (ROTATIONS[kind] in text) is bool(frame)
 
 
@@ -262,13 +264,13 @@ def test_isd_and_isis_keywords_have_the_errors_they_state(
     names = SpiceNames(-999, pixel_size_um=pixel_size_um)
     done = export(made, 'isd', tmp_path, names)
     pixels, directions = grid_of(made)
-    isd = json.loads(done.files[0].read_text())
+    isd = json.loads((tmp_path / 'camera_isd.json').read_text())
     found_px = worst_px(usgs_pixels(isd, directions), pixels)
     assert found_px == pytest.approx(done.worst_px, abs=SAME_PX)
     if model == 'plumb_bob' and not with_field:
         assert found_px < SAME_PX
     spiceypy.kclear()
-    spiceypy.furnsh(str(done.files[1]))
+    spiceypy.furnsh(str(tmp_path / 'camera_isis.ti'))
     key = {
         name: np.array(spiceypy.gdpool(f'INS-999001_{name}', 0, 9))
         for name in ('FOCAL_LENGTH', *CENTER, 'TRANSX', 'TRANSY', 'OD_K')
@@ -293,6 +295,6 @@ def test_an_exported_camera_is_read_as_a_prior_camera(
     tmp_path: Path, form: str, model: str
 ) -> None:
     made = export(calibration(model, 0.0, False), form, tmp_path, None)
-    camera = read_camera_info(made.files[0])
+    camera = read_camera_info(tmp_path / next(iter(made.files)))
     pixels, directions = grid_of(calibration(model, 0.0, False))
     assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6

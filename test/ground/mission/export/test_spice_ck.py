@@ -13,7 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 import spiceypy
 
-from starcal_ground.mission.export.export_formats import export, Exported
+from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight
 from starcal_ros.errors import ProductError
@@ -43,7 +44,7 @@ def observed(k: int) -> StarObservations:
 
 def written(
     folder: Path, made: Calibration, images: list[StarObservations], tracker: int
-) -> Exported:
+) -> Content:
     kernels = [write_lsk(folder / 'leap.tls'), write_sclk(folder / 'clock.tsc')]
     names = SpiceNames(CLOCK_ID, star_tracker_id=tracker)
     return export(made, 'ck', folder, names, observations=images, kernels=kernels)
@@ -56,10 +57,10 @@ def test_spice_has_the_attitude_of_each_image_and_none_between(
     refused = refused_image(FIRST_NS - 10**10, 1296, 1024, 'no_match', '')
     images = [refused, *map(observed, range(len(TRUTH)))]
     done = written(tmp_path, MADE, images, tracker)
-    fk = export(MADE, 'spice', tmp_path, SpiceNames(CLOCK_ID, star_tracker_id=FRAME_ID)).files[0]
+    export(MADE, 'spice', tmp_path, SpiceNames(CLOCK_ID, star_tracker_id=FRAME_ID))
     spiceypy.kclear()
-    for path in (*done.files, tmp_path / 'leap.tls', tmp_path / 'clock.tsc', fk):
-        spiceypy.furnsh(str(path))
+    for name in (*done.files, 'leap.tls', 'clock.tsc', 'camera.tf'):
+        spiceypy.furnsh(str(tmp_path / name))
     # Two axes by all stars; about the boresight by their distance from the centre.
     across_px = NOISE_PX / np.sqrt(STARS)
     assert done.losses[0].cost_px == pytest.approx(across_px, rel=0.02)  # one star left out
