@@ -153,7 +153,7 @@ class FirstSetup:
     def _parameter_file(self, topics: Topics) -> str:
         setup = self.setup
         values: dict[str, object] = {'lens_model': setup.frames.lens_model}
-        if self.through_air is None:
+        if setup.has_tracker:
             values['attitude_direction'] = setup.attitude.attitude_direction
             values['prior_alignment'] = setup.prior.star_tracker_from_camera_xyzw.tolist()
         elif setup.site.observer == 'ground':  # stated by the images
@@ -172,7 +172,7 @@ class FirstSetup:
         ``ensemble``: the images, where they are at hand.
         """
         options, stated = self.setup.calibration, self.given.options
-        has_tracker = self.through_air is None
+        has_tracker = self.setup.has_tracker
         has_velocity = bool(topics.velocity or topics.observations)
         rows = [
             ('star_tracker_sigma_arcsec', 'from the scatter of the images',
@@ -232,11 +232,18 @@ def first_setup(
         return FirstSetup(given, sky.bags, sky.topics, sky.setup, read, sky.notes, sky.through_air)
     read = (*reader.mcap_files(given.paths), *files)
     paths = tuple(given.paths)
-    if stated is not None:
-        return FirstSetup(given, paths, given.topics, stated, read)
     with given.with_place():
-        setup, found = _of_attitudes(given, folder)
-    return FirstSetup(given, paths, given.topics, setup, read, found)
+        setup, found = (stated, ()) if stated else _of_attitudes(given, folder)
+    return FirstSetup(given, paths, given.topics, setup, read, found, air_of(setup))
+
+
+def air_of(setup: Setup) -> ThroughAir | None:
+    """Search for the air of a camera on the ground, where nobody states its site; else None."""
+    if setup.site.observer != 'ground' or setup.site.is_known:
+        return None
+    from starcal_ground.images.unknown_air import with_air  # seldom needed, slow
+
+    return functools.partial(with_air, camera=setup.prior.camera, is_ground=True)
 
 
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:

@@ -63,7 +63,8 @@ class NightSky:
         """Observations, refracted if the stars show it and no site is given, and notes on them."""
         images, note = [self._in_words_of_stars(one) for one in observations], ''
         if not self.is_located:
-            images, note = with_air(images, self.setup.prior.camera)
+            is_ground = self.setup.site.observer == 'ground'
+            images, note = with_air(images, self.setup.prior.camera, is_ground)
         lost = refusals(one for one in images if one.time_ns in self.identified_ns)
         notes = [note] if note else []
         notes += [
@@ -173,7 +174,7 @@ def from_photographs(
             if stars.mirrored:
                 image = Image(image.time_ns, image.pixels[:, ::-1].copy())
             writer.write_image('/camera/image_raw', image, 'camera')
-    stated = {**site_of(photographs), **values}
+    stated = {**({} if 'observer' in values else site_of(photographs)), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
@@ -298,7 +299,7 @@ def _set_up(
         (*bags, attitudes),
         setup,
         tuple(notes),
-        is_located,
+        is_located and (setup.site.observer == 'space' or setup.site.is_known),
         topics,
         stars.copies_ns,
         frozenset(stars.icrf_from_camera),

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from starcal_ground import file_kinds, products
+from starcal_ground.images.first_setup import air_of
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
@@ -269,7 +270,8 @@ def _answer(task: Task, path: Path) -> Answer:
     text = ''
     try:
         if task.params:
-            campaign = calibrate_bags([path], read_setup(Path(task.params)), Topics())
+            setup = read_setup(Path(task.params))
+            campaign = calibrate_bags([path], setup, Topics(), through_air=air_of(setup))
             made, kind = campaign.calibration, trend_table.COMPUTED
             degc = _mean_temperature(campaign.observations)
             text = product_files.calibration_text(made)

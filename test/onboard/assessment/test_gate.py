@@ -193,7 +193,7 @@ def test_a_good_calibration_passes() -> None:
             (
                 'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
                 'of 7.4 sigma (max_held_term_sigma); the stars add -60000 to it; correct '
-                'the velocity so; on the ground state the site'
+                'it so; on the ground state observer: ground'
             ),
         ),
         (
@@ -214,7 +214,7 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); on the ground state the site (observer); '
+                'of 0.2 px (max_image_variation_px); on the ground state observer: ground; '
                 'else use temperatures, or one focus'
             ),
         ),
