@@ -368,7 +368,7 @@ def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-    departures = 'velocity', 'stamp', 'mounting', 'latitude', 'sidereal'
+    departures = 'velocity', 'stamp', 'mounting', 'latitude', 'clock'
     is_departure = kind.removeprefix('assumed ') in departures
     note = f'{estimated} by the stars, {assumed} assumed'
     return (
@@ -600,7 +600,7 @@ REMEDIES: Mapping[str, str] = {
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
     'assumed velocity': 'correct it so; on the ground state observer: ground',
     'assumed latitude': _OF_SITE,
-    'assumed sidereal': _OF_SITE,
+    'assumed clock': _OF_SITE,
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',

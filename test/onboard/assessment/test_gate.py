@@ -197,6 +197,17 @@ def test_a_good_calibration_passes() -> None:
             ),
         ),
         (
+            with_model(held=(HeldTerm('clock_offset_min', 0.0, -42.5, 5.0),)),
+            'max_held_term_sigma',
+            8.5,
+            8.4,
+            (
+                'distance of clock_offset_min from its assumed value is 8.5 sigma, over the limit '
+                'of 8.4 sigma (max_held_term_sigma); the stars add -42.5 to it; check site and '
+                'UTC, or state observer: ground alone'
+            ),
+        ),
+        (
             with_model(held=(HeldTerm('mounting of head_2 x_deg', 0.0, 20.0, 0.125),)),
             'max_held_term_sigma',
             160.0,
