@@ -38,6 +38,8 @@ from starcal_ros.sky.catalog import load_catalog
 
 _FEW = 5  # images that are looked at for stars
 _ATTITUDE_TOPIC = '/stars/attitude'
+# Of no site: its zenith at a time that is not known is not known either.
+_NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class NightSky:
     Bags and set-up of a calibration by the stars alone, and notes for the user.
 
     ``topics`` are those to read: the attitudes of the stars, in place of any in the bags.
-    ``is_located`` is False if neither the options nor the files state the site of the camera.
+    ``is_located`` is False if neither the options nor the files state the site of the camera and
+    its time.
     """
 
     bags: tuple[Path, ...]
@@ -177,7 +180,7 @@ def from_photographs(
     stated = {**({} if 'observer' in values else site_of(photographs)), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
-        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
+        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
     undated = sum(not one.dated for one in photographs)
     times_of = f'of the file: {undated} of {len(photographs)} images state none' * bool(undated)
     return _set_up(stars, [bag], stated, folder, is_located, Topics(), damaged.lines(), times_of)
@@ -208,7 +211,7 @@ def from_bags(
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
     if is_located and min(stars.icrf_from_camera) < CLOCKS_SET_NS:
-        values = {'velocity_sigma_m_s': EARTH_M_S, **values}
+        values = {'velocity_sigma_m_s': EARTH_M_S, **values, **_NOWHERE}
     return _set_up(stars, bags, values, folder, is_located, topics)
 
 

@@ -22,7 +22,12 @@ from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ground.images.from_stars import _of_one_lens, from_stars, ideal_camera
-from starcal_ground.images.night_sky import calibrate_images, NightSky, photographs_of
+from starcal_ground.images.night_sky import (
+    calibrate_images,
+    from_photographs,
+    NightSky,
+    photographs_of,
+)
 from starcal_ground.simulation.rendering import images
 import starcal_ros
 from starcal_ros.arrays import Pixels
@@ -348,6 +353,27 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
     kept, left_out_px = _of_one_lens(matches)
     assert len(kept) == len(matches) - len(others_px)
     assert left_out_px == pytest.approx(others_px)
+
+
+@pytest.mark.slow
+def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_stated(
+    tmp_path: Path,
+) -> None:
+    frames = write_pngs(tmp_path / 'night', frames_of(3))
+    photographs, _ = photographs_of([frames], 18.0, 10.0)  # of the small bag, within 1 %
+    place = (37.2, -3.6, 600.0)
+    stated = {'observer': 'ground', 'latitude_deg': place[0], 'longitude_deg': place[1]}
+    known: dict[str, object] = {'dated': True, 'utc': True}
+    for values, of_files, is_known in (
+        (stated, {'dated': False}, False),
+        (stated, known, True),
+        ({}, {**known, 'site': place}, True),
+        ({'observer': 'ground'}, {**known, 'site': place}, False),
+    ):
+        given = [dataclasses.replace(one, **of_files) for one in photographs]
+        sky = from_photographs(given, values, tmp_path)
+        site = sky.setup.site
+        assert (site.observer, site.is_known, sky.is_located) == ('ground', is_known, is_known)
 
 
 def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
