@@ -144,6 +144,16 @@ def test_a_clock_is_named_in_minutes_to_add_to_the_stamps() -> None:
     assert abs(clock.estimated - 20.0) < 2.0 * clock.sigma < 8.0
 
 
+def test_an_image_without_a_zenith_leaves_the_others_theirs() -> None:
+    """Recordings of early versions have none; a wrong clock of the others is named."""
+    images = from_the_stated_site(1, 3600)
+    unknown = dataclasses.replace(
+        images[3], zenith_icrf=np.full(3, np.nan), refraction_arcsec=np.zeros(2)
+    )
+    found = estimate([*images[:3], unknown, *images[4:]])
+    assert off_sigma(found) > LIMIT_SIGMA
+
+
 def unmoved(pixels: Floats) -> Floats:
     return np.zeros_like(pixels)
 
