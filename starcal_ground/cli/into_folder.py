@@ -122,7 +122,7 @@ def _calibrated(
         made = campaign.calibrate(observed, inputs)
     except TooFewObservations as error:
         failure = _failure(str(error), observed)
-        if observed.source.through_air is not None:  # its bags are temporary
+        if not observed.source.setup.has_tracker:  # its bags are temporary
             failure = dataclasses.replace(failure, inputs=tuple(inputs))
         look = _write_failure(folder, failure, album.unmatched)
         raise TooFewObservations(f'{failure.reason}{look}') from error
@@ -168,7 +168,7 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     cause = cause_of(source.bags, source.topics, source.setup, groups, count)
     if cause is None:
         return NotCalibrated(words, named, refused)
-    command = 'starcal diagnose' if source.through_air is None else ''
+    command = 'starcal diagnose' if source.setup.has_tracker else ''
     words = f'{cause.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
     return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
 

@@ -28,7 +28,7 @@ from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.campaign import Source
+from starcal_ros.pipeline.campaign import Source, ThroughAir
 from starcal_ros.pipeline.setup import (
     aligned,
     files_of,
@@ -144,7 +144,7 @@ class FirstSetup:
     def _parameter_file(self, topics: Topics) -> str:
         setup = self.source.setup
         values: dict[str, object] = {'lens_model': setup.frames.lens_model}
-        if self.source.through_air is None:
+        if setup.has_tracker:
             values['attitude_direction'] = setup.attitude.attitude_direction
             values['prior_alignment'] = setup.prior.star_tracker_from_camera_xyzw.tolist()
         elif setup.site.observer == 'ground':  # stated by the images
@@ -163,7 +163,7 @@ class FirstSetup:
         ``ensemble``: the images, where they are at hand.
         """
         setup, stated = self.source.setup, self.given.options
-        has_tracker = self.source.through_air is None
+        has_tracker = setup.has_tracker
         has_velocity = bool(topics.velocity or topics.observations)
         rows = [
             ('star_tracker_sigma_arcsec', 'from the scatter of the images',
@@ -221,13 +221,19 @@ def first_setup(
             )
         return FirstSetup(given, source, (*images, *files))
     read = (*reader.mcap_files(given.paths), *files)
-    setup = stated
-    found: tuple[str, ...] = ()
-    if setup is None:
-        with given.with_place():
-            setup, found = _of_attitudes(given, folder)
-    source = Source(tuple(given.paths), given.topics, setup, notes=found)
+    with given.with_place():
+        setup, found = (stated, ()) if stated else _of_attitudes(given, folder)
+    source = Source(tuple(given.paths), given.topics, setup, air_of(setup), found)
     return FirstSetup(given, source, read)
+
+
+def air_of(setup: Setup) -> ThroughAir | None:
+    """Search for the air of a camera on the ground, where nobody states its site; else None."""
+    if setup.site.observer != 'ground' or setup.site.is_known:
+        return None
+    from starcal_ground.images.unknown_air import with_air  # seldom needed, slow
+
+    return functools.partial(with_air, camera=setup.prior.camera, is_ground=True)
 
 
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:

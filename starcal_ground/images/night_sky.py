@@ -34,23 +34,30 @@ from starcal_ros.pipeline.setup import load_setup, option_groups
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog
 
 _FEW = 5  # images that are looked at for stars
 _ATTITUDE_TOPIC = '/stars/attitude'
+# Of no site: its zenith at a time that is not known is not known either.
+_NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
 
 
 def _through_air(
-    stars: by_stars.FromStars, is_located: bool, observations: Sequence[StarObservations]
+    stars: by_stars.FromStars,
+    site: SiteOptions,
+    is_located: bool,
+    observations: Sequence[StarObservations],
 ) -> tuple[list[StarObservations], str]:
     """
     Observations, refracted if the stars show it and no site is given, and notes on them.
 
-    ``is_located`` is False if neither the options nor the files state the site of the camera.
+    ``is_located`` is False if neither the options nor the files state the site of the camera and
+    its time.
     """
     images, note = [_in_words_of_stars(stars, one) for one in observations], ''
     if not is_located:
-        images, note = with_air(images, stars.camera)
+        images, note = with_air(images, stars.camera, site.observer == 'ground')
     lost = refusals(one for one in images if one.time_ns in stars.icrf_from_camera)
     notes = [note] if note else []
     notes += [
@@ -162,10 +169,10 @@ def from_photographs(
             if stars.mirrored:
                 image = Image(image.time_ns, image.pixels[:, ::-1].copy())
             writer.write_image('/camera/image_raw', image, 'camera')
-    stated = {**site_of(photographs), **values}
+    stated = {**({} if 'observer' in values else site_of(photographs)), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
-        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
+        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
     undated = sum(not one.dated for one in photographs)
     times_of = f'of the file: {undated} of {len(photographs)} images state none' * bool(undated)
     return _set_up(stars, [bag], stated, folder, is_located, Topics(), damaged.lines(), times_of)
@@ -196,7 +203,7 @@ def from_bags(
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
     if is_located and min(stars.icrf_from_camera) < CLOCKS_SET_NS:
-        values = {'velocity_sigma_m_s': EARTH_M_S, **values}
+        values = {'velocity_sigma_m_s': EARTH_M_S, **values, **_NOWHERE}
     return _set_up(stars, bags, values, folder, is_located, topics)
 
 
@@ -283,7 +290,8 @@ def _set_up(
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
     topics = dataclasses.replace(given, attitude=_ATTITUDE_TOPIC)
-    through_air = functools.partial(_through_air, stars, is_located)
+    is_located = is_located and (setup.site.observer == 'space' or setup.site.is_known)
+    through_air = functools.partial(_through_air, stars, setup.site, is_located)
     return Source((*bags, attitudes), topics, setup, through_air, tuple(notes))
 
 

@@ -79,55 +79,59 @@ def zenith_of(latitude_rad: float, right_ascension_rad: Floats) -> Floats:
 @dataclass(frozen=True)
 class _Site:
     """
-    Latitude, sidereal times (m,) of the images there, and 2 log of their mean likelihood.
+    Latitude, sidereal times (m,) of the images there, and 2 log of their likelihood.
 
-    ``gain`` is over that of no air; no times and minus infinity where an image has no zenith
+    ``gain`` is that of the mean over all times over that of space, ``best`` that of these times
+    over that of no air on the Earth; no times and minus infinity where an image has no zenith
     above it.
     """
 
     latitude_rad: float
     times_rad: Floats
     gain: float
+    best: float = -math.inf
 
 
 def with_air(
-    observations: Sequence[StarObservations], camera: CameraModel
+    observations: Sequence[StarObservations], camera: CameraModel, is_ground: bool = False
 ) -> tuple[list[StarObservations], str]:
     """
     Observations with directions as seen through the air, if there was any, and what was found.
 
-    ``camera`` is that of all images, good to a pixel.  Where the stars do not tell, half of the
-    usual refraction is taken, with that as its 1-sigma.  An image that no air gives the shape of
-    the others is refused: its stars are false, or its lens is another.
+    ``camera`` is that of all images, its focal length good to 5 %; ``is_ground`` where air is
+    stated.  Where the stars do not tell, half of the usual refraction is taken, with that as its
+    1-sigma.  An image that no air gives the shape of the others is refused: its stars are false,
+    or its lens is another.  Observations that state a zenith, as recorded ones, are unchanged.
     """
     used = [one for one in observations if not one.refusal]
-    if len(used) < 2:
+    if len(used) < 2 - is_ground or any(np.isfinite(one.zenith_icrf).all() for one in used):
         return list(observations), ''
     images = _images(used, camera)
     site = _searched(images)
+    is_air = site.best > -_TELLING if is_ground else site.gain > _TELLING
     (size, sigma), velocity_m_s = USUAL_ARCSEC, EARTH_M_S
     zenith = zenith_of(site.latitude_rad, site.times_rad)
     text = (
-        'observer: ground: the stars show refraction, with a zenith at'
-        f' {math.degrees(site.latitude_rad):+.0f} degrees of declination'
+        f'observer: ground: the stars show {"refraction, with " * (site.gain > _TELLING)}a zenith'
+        f' at {math.degrees(site.latitude_rad):+.0f} degrees of declination'
     )
-    if site.gain < _TELLING:
+    if not is_air:
         size = sigma = 0.5 * size
         velocity_m_s = SPACE_M_S
         # A zenith found by chance would be trusted: only the change of the focal length is left.
         zenith = np.array([one.boresight for one in images])
         text = (
-            'observer: ground or space: the stars do not tell; state it: --set observer=ground or'
-            ' --set observer=space'
+            'observer: ground or space: the stars do not tell; state it: --set observer=space, or'
+            ' --set observer=ground, best with the site'
         )
     speed_m_s = _speed_m_s(images)
-    if site.gain < _TELLING and speed_m_s > _FASTEST_M_S:
+    if not is_air and speed_m_s > _FASTEST_M_S:
         text = (
             'observer: ground or space: something else than air shifts the stars, such as trees or'
             f' lights in the images (by as much as a velocity of {speed_m_s / 1000:.0f} km/s'
             ' would): leave out those images'
         )
-    elif site.gain < -_TELLING:
+    elif not is_ground and site.gain < -_TELLING:
         size = sigma = 0.0
         text = 'observer: space: the stars show no refraction'
     through = {
@@ -147,7 +151,8 @@ def with_air(
         one = used[worst]
         detail = f'stretched by {off_px[worst]:.1f} px in a corner against the others'
         refused = refused_image(one.time_ns, one.width, one.height, 'no_match', detail)
-        return with_air([refused if each is one else each for each in observations], camera)
+        kept = [refused if each is one else each for each in observations]
+        return with_air(kept, camera, is_ground)
     return [through.get(one.time_ns, one) for one in observations], text
 
 
@@ -296,8 +301,10 @@ def _searched(images: Sequence[_Equations]) -> _Site:
         near = coarse.latitude_rad + np.radians(np.arange(-5.0, 5.5))
         fine = max((times(latitude, coarse) for latitude in near.clip(-1.5, 1.5)), key=by_gain)
         # The mean of a likelihood is that over all times, not over those about the best.
-        best = fine if len(fine.times_rad) else coarse
-        sites.append(dataclasses.replace(best, gain=coarse.gain - without_air / variance))
+        site = fine if len(fine.times_rad) else coarse
+        gain = coarse.gain - without_air / variance
+        best = site.best - float(h @ inverse @ h) / variance
+        sites.append(dataclasses.replace(site, gain=gain, best=best))
     return max(sites, key=by_gain)
 
 
@@ -350,7 +357,8 @@ class _Fit:
         chi2 -= (left * (self.inverse @ left)).sum(axis=0)
         at = int(np.argmin(chi2))
         times = np.array([one.times_rad[at] for one in made])
-        return _Site(latitude_rad, times, -_of_mean(chi2, at, self.variance))
+        best = -float(chi2[at]) / self.variance
+        return _Site(latitude_rad, times, -_of_mean(chi2, at, self.variance), best)
 
     def by_images(self, latitude_rad: float, about: _Site | None) -> _Site:
         """Times of each image by itself, by turns with camera and velocity."""
@@ -373,10 +381,11 @@ class _Fit:
                 break
             before = at
             at = [int(np.argmin(one.chi2 + 2.0 * (common @ one.by_common))) for one in choices]
-        total = -float(left @ common) / self.variance
+        total = best = float(left @ common) / self.variance
         for each, k in zip(choices, at, strict=True):
             by_common = 2.0 * (common @ each.by_common)
-            total += _of_mean(each.chi2 + by_common, k, self.variance)
-            total -= float(by_common[k]) / self.variance
+            total -= _of_mean(each.chi2 + by_common, k, self.variance)
+            total += float(by_common[k]) / self.variance
+            best -= float(each.chi2[k]) / self.variance
         chosen = np.array([one.times_rad[k] for one, k in zip(choices, at, strict=True)])
-        return _Site(latitude_rad, chosen, -total)
+        return _Site(latitude_rad, chosen, total, best)

@@ -100,7 +100,7 @@ def inspect(
     Contents of bags and the images that a calibration would refuse.
 
     With a setup, stars are measured as for a calibration, which measures images that match no star
-    once more in the end; ``through_air`` is given where the attitudes are those of the stars.
+    once more in the end; ``through_air`` is that of `campaign.Source`.
     Without a setup, for which ``problem`` is the reason, images are only checked against the
     attitudes, at the default limits.  Raises BagError when a bag is missing or not a bag.
     """
@@ -109,7 +109,7 @@ def inspect(
     options = setup.attitude if setup else AttitudeOptions()
     problems = [problem] if problem else []
     notes: tuple[str, ...] = ()
-    by_stars, chosen = through_air is not None, None
+    by_stars, chosen = setup is not None and not setup.has_tracker, None
     seen: list[StarObservations] = []
     try:
         if setup is None and bag_topics.without_attitudes(paths, given, {}):

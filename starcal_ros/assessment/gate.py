@@ -368,7 +368,7 @@ def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
     kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-    departures = 'velocity', 'stamp', 'mounting', 'latitude', 'sidereal'
+    departures = 'velocity', 'stamp', 'mounting', 'latitude', 'clock'
     is_departure = kind.removeprefix('assumed ') in departures
     note = f'{estimated} by the stars, {assumed} assumed'
     return (
@@ -565,7 +565,7 @@ def requirement_answers(calibration: Calibration) -> tuple[str, ...]:
     )
 
 
-_OF_SITE = 'check the site, and that the stamps are UTC; for images alone leave out the site'
+_OF_SITE = 'check site and UTC, or state observer: ground alone'
 REMEDIES: Mapping[str, str] = {
     # Reasons to refuse images (`IMAGE_REFUSALS`).
     'bad_encoding': 'record images of one channel, 8 or 16 bit, raw, as PNG or JPEG',
@@ -598,9 +598,9 @@ REMEDIES: Mapping[str, str] = {
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'correct the velocity so; on the ground state the site',
+    'assumed velocity': 'correct it so; on the ground state observer: ground',
     'assumed latitude': _OF_SITE,
-    'assumed sidereal': _OF_SITE,
+    'assumed clock': _OF_SITE,
     'assumed readout': 'check shutter and readout_s',
     'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'assumed mounting': 'check more_alignments',
@@ -613,7 +613,7 @@ REMEDIES: Mapping[str, str] = {
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'on the ground state the site (observer); else use'
+    'change from image to image': 'on the ground state observer: ground; else use'
     ' temperatures, or one focus',
     'star places': 'take more images of other star fields, with a catalog that has proper motions',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',

@@ -21,8 +21,13 @@ from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
+from starcal_ros.sky.astrometry import SIDEREAL_RAD_S
 
 _STATED = ('camera', 'mountings', 'velocity', 'site', 'readout', 'stamps')  # entries with a prior
+_AS_STATED = {  # label -> name and unit of what an operator states
+    'latitude_rad': ('latitude_deg', math.degrees(1.0)),
+    'sidereal_time_1_rad': ('clock_offset_min', 1.0 / (60.0 * SIDEREAL_RAD_S)),
+}
 _CLEAR_SIGMA = 5.0  # from a prior; as a ratio of evidence e^12.5
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for
@@ -139,7 +144,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
             if k in camera:
                 prior = float(problem.prior_parameters[k - camera[0]])
-            name, unit = layout.labels[k], 1.0
+            name, unit = _AS_STATED.get(layout.labels[k], (layout.labels[k], 1.0))
             head = (k - first) // 3 + 1
             if 1 <= head < len(estimate.star_trackers):
                 frame = estimate.star_trackers[head].frame

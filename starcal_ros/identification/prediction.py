@@ -128,7 +128,7 @@ def visible(
     site: SiteOptions,
 ) -> tuple[NDArray[np.intp], Floats]:
     """Catalog rows (m,) above the elevation limit, and apparent ICRF directions (m, 3)."""
-    if site.observer != 'ground':
+    if not site.is_known:
         return index, astrometry.apparent_directions(catalog, time_ns, velocity_m_s, index)
     direction_icrf, elevation_rad = astrometry.through_the_air(
         astrometry.apparent_directions(catalog, time_ns, rows=index), time_ns, site

@@ -19,7 +19,7 @@ from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.formats.bag import reader
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import check_site, Setup
 from starcal_ros.pipeline.topics import OnImage, Topics, Wanted
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
@@ -32,8 +32,8 @@ class Source:
     """
     Bags, topics and setup; once `chosen`, the topics that are read and an alignment.
 
-    ``through_air`` is given where the attitudes are those of the stars, each image identified by
-    itself; ``notes`` are sentences for the user.
+    ``through_air`` is given where the air, if any, is to be found by the stars, in all images
+    together; ``notes`` are sentences for the user.
     """
 
     bags: tuple[Path, ...]
@@ -51,9 +51,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Observed:
-    """A source with the observations of its images, refused ones too, and notes so far."""
+    """
+    A source with the observations of its images, refused ones too, and notes so far.
+
+    ``measured`` are the observations before the air was found.
+    """
 
     source: Source
+    measured: Sequence[StarObservations]
     observations: tuple[StarObservations, ...]
     notes: tuple[str, ...]
 
@@ -81,9 +86,12 @@ def chosen(source: Source) -> Source:
 
     The alignment is found from the images where the setup has none; recorded observations need
     none, since their stars are identified.  Raises BagError when a bag cannot be read, a topic is
-    missing or several have its type.  Raises OptionError when no alignment is found.
+    missing or several have its type.  Raises OptionError when no alignment is found, or for a
+    camera on the ground of which neither the site is stated nor the air to be found.
     """
     bags, requested, setup, notes = source.bags, source.topics, source.setup, source.notes
+    if source.through_air is None:
+        check_site(setup.site)
     topics = bag_topics.choose_topics(bags, requested, setup)
     if not (setup.is_aligned or topics.observations):
         from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags  # seldom needed, slow
@@ -106,14 +114,19 @@ def observe(
     predicted its stars, ``on_record`` for each image or recorded observation.  Raises BagError
     when a bag cannot be read.
     """
-    observations, notes = [], source.notes
+    measured = []
     for record in bag_topics.read(source.bags, source.topics, source.setup, on_image, wanted):
-        observations.append(record)
+        measured.append(record)
         on_record()
+    return _observed(source, measured)
+
+
+def _observed(source: Source, measured: Sequence[StarObservations], *notes: str) -> Observed:
+    observations, note = measured, ''
     if source.through_air is not None:
-        observations, note = source.through_air(observations)
-        notes = (*notes, note) if note else notes
-    return Observed(source, tuple(observations), notes)
+        observations, note = source.through_air(measured)
+    found = filter(None, (note, *notes))
+    return Observed(source, measured, tuple(observations), (*source.notes, *found))
 
 
 def calibrate(observed: Observed, inputs: Mapping[str, str] | None = None) -> Campaign:
@@ -123,9 +136,9 @@ def calibrate(observed: Observed, inputs: Mapping[str, str] | None = None) -> Ca
     Raises TooFewObservations when the images do not determine the parameters to be estimated.
     """
     campaign = _solved(observed, inputs)
-    source, before = observed.source, observed.observations
+    source, before = observed.source, observed.measured
     # An image identified by itself is not identified by the calibration of the others either.
-    if not campaign.calibration.accepted or source.through_air is not None:
+    if not (campaign.calibration.accepted and source.setup.has_tracker):
         return campaign
     geometry = campaign.calibration.geometry
     again = bag_topics.measured_again(source.bags, source.topics, source.setup, geometry, before)
@@ -136,7 +149,7 @@ def calibrate(observed: Observed, inputs: Mapping[str, str] | None = None) -> Ca
         f'{gained} images matched nothing at first, and are used with the calibration of the'
         ' others'
     )
-    return _solved(Observed(source, tuple(again), (*observed.notes, note)), inputs)
+    return _solved(_observed(source, again, note), inputs)
 
 
 def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:

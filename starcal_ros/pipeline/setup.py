@@ -81,10 +81,10 @@ def check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
 
 def check_site(site: SiteOptions) -> None:
     """Raise `OptionError` for a camera on the ground without a site."""
-    if site.observer == 'ground' and site.latitude_deg == site.longitude_deg == 0.0:
+    if site.observer == 'ground' and not site.is_known:
         raise OptionError(
             'observer: ground needs the site: set latitude_deg, longitude_deg (east positive) and'
-            ' height_m'
+            ' height_m; starcal calibrate needs none'
         )
 
 
@@ -221,6 +221,11 @@ class Setup:
     flat: Floats | None = None
     mountings: tuple[Mounting, ...] = ()
     times_of: str = ''
+
+    @property
+    def has_tracker(self) -> bool:
+        """False where the attitudes are those of the stars, each image identified by itself."""
+        return bool(self.frames.star_tracker_frame)
 
     @property
     def star_search(self) -> StarSearch:
@@ -396,7 +401,6 @@ def option_groups(values: Mapping[str, object]) -> dict[str, Any]:
         options.from_mapping(kind, values)  # a value that is read elsewhere is checked here too
     _check_relative(files_of(groups['frames']))
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
-    check_site(groups['site'])
     requirements_of(groups['gate'].requirements)
     return groups
 

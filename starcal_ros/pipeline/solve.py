@@ -182,8 +182,7 @@ def _not_judged(
         result.information, result.information_names
     )
     stamps_ns = [image.time_ns for image in ensemble.images]
-    is_aligned = bool(setup.frames.star_tracker_frame)
-    budget = sigma_budget(result, setup.calibration, has_alignment=is_aligned)
+    budget = sigma_budget(result, setup.calibration, has_alignment=setup.has_tracker)
     return Calibration(
         time_ns=max(stamps_ns),
         first_image_ns=min(stamps_ns),

@@ -73,6 +73,7 @@ class StarObserver(StarcalNode):
         values = self.options.values()
         self._own = from_mapping(setup.ObserverOptions, values)
         self._setup = setup.load_setup(values)
+        setup.check_site(self._setup.site)
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
         self._observations = self.publisher(

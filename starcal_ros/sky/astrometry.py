@@ -48,7 +48,8 @@ class SiteOptions:
     observer: str = option(
         'space',
         'location of the camera; ground: refraction and the rotation of the Earth are modelled,'
-        ' and velocity inputs are ignored',
+        ' and velocity inputs are ignored; without a site, which the nodes need, starcal finds the'
+        ' air by the stars',
         choices=('space', 'ground'),
     )
     latitude_deg: float = option(
@@ -72,6 +73,11 @@ class SiteOptions:
     # 2 arcsec, nearly the same for all stars of an image.  Zero means the pressure at the height.
     air_pressure_hpa: float = 0.0
     air_temperature_degc: float = 10.0
+
+    @property
+    def is_known(self) -> bool:
+        """True if a place on the ground is stated; none is where both angles are zero."""
+        return self.observer == 'ground' and bool(self.latitude_deg or self.longitude_deg)
 
 
 @dataclass(frozen=True)
@@ -106,8 +112,8 @@ def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
 
     The sigma of a velocity that may be one about the Earth is not known.
     """
-    if site.observer == 'ground':
-        return Velocity(None, 0.0)
+    if site.observer == 'ground':  # a date is as uncertain as the site
+        return Velocity(None, 0.0) if site.is_known else EARTH
     if measured_m_s is None and any(site.observer_velocity_m_s):
         measured_m_s = np.array(site.observer_velocity_m_s)
     if measured_m_s is None:
@@ -265,9 +271,10 @@ def air_above(time_unix_ns: int, site: SiteOptions) -> tuple[Floats, Floats]:
     """
     Zenith (3,) of a site, ICRF, and refraction (2,) 45 degrees from it with its 1-sigma, arcsec.
 
-    NaN and zeros in space.  The 1-sigma is that of 15 degrees and 20 hPa of weather.
+    NaN and zeros in space, and where the site is not stated.  The 1-sigma is that of 15 degrees
+    and 20 hPa of weather.
     """
-    if site.observer != 'ground':
+    if not site.is_known:
         return np.full(3, math.nan), np.zeros(2)
     right_ascension = _earth_rotation_rad(time_unix_ns) + math.radians(site.longitude_deg)
     zenith_cirs = erfa.s2c(right_ascension, math.radians(site.latitude_deg))

@@ -555,6 +555,7 @@ def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tupl
         (lambda f, _: parameters(f, 'attitude_direction:=up'), 'attitude_direction'),
         (lambda f, _: parameters(f, 'prior_alignment:=[1.0, 2.0]'), 'prior_alignment'),
         (lambda f, _: parameters(f, 'estimate:=[fx, fz]'), 'estimate'),
+        (lambda f, _: parameters(f, 'observer:=ground'), 'observer: ground needs the site'),
         (lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
         (
             lambda f, _: parameters(f, 'magnitude_limt:=6.0'),

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from starcal_ground import file_kinds, products
+from starcal_ground.images.first_setup import air_of
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
@@ -34,7 +35,7 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE
-from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.campaign import calibrate, chosen, observe, Source
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import StarObservations
@@ -269,7 +270,9 @@ def _answer(task: Task, path: Path) -> Answer:
     text = ''
     try:
         if task.params:
-            campaign = calibrate_bags([path], read_setup(Path(task.params)), Topics())
+            setup = read_setup(Path(task.params))
+            source = Source((path,), Topics(), setup, air_of(setup))
+            campaign = calibrate(observe(chosen(source)))
             made, kind = campaign.calibration, trend_table.COMPUTED
             degc = _mean_temperature(campaign.observations)
             text = product_files.calibration_text(made)

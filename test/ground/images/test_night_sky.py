@@ -22,7 +22,12 @@ from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
 from starcal_ground.images.from_stars import _of_one_lens, from_stars, FromStars, ideal_camera
-from starcal_ground.images.night_sky import _through_air, calibrate_images, photographs_of
+from starcal_ground.images.night_sky import (
+    _through_air,
+    calibrate_images,
+    from_photographs,
+    photographs_of,
+)
 from starcal_ground.simulation.rendering import images
 import starcal_ros
 from starcal_ros.arrays import Pixels
@@ -33,6 +38,7 @@ from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Image, refused_image
+from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog
 
 TOPIC = '/camera/image_raw'
@@ -348,11 +354,34 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
     assert left_out_px == pytest.approx(others_px)
 
 
+@pytest.mark.slow
+def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_stated(
+    tmp_path: Path,
+) -> None:
+    frames = write_pngs(tmp_path / 'night', frames_of(3))
+    photographs, _ = photographs_of([frames], 18.0, 10.0)  # of the small bag, within 1 %
+    place = (37.2, -3.6, 600.0)
+    stated = {'observer': 'ground', 'latitude_deg': place[0], 'longitude_deg': place[1]}
+    known: dict[str, object] = {'dated': True, 'utc': True}
+    for values, of_files, is_known in (
+        (stated, {'dated': False}, False),
+        (stated, known, True),
+        ({}, {**known, 'site': place}, True),
+        ({'observer': 'ground'}, {**known, 'site': place}, False),
+    ):
+        given = [dataclasses.replace(one, **of_files) for one in photographs]
+        source = from_photographs(given, values, tmp_path)
+        site, air = source.setup.site, source.through_air
+        assert isinstance(air, functools.partial)
+        is_located = air.args[-1]
+        assert (site.observer, site.is_known, is_located) == ('ground', is_known, is_known)
+
+
 def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
     identified = dict.fromkeys((1, 2), Rotation.identity())
     stars = FromStars(ideal_camera((640, 512), 1800.0), False, identified, 3)
     detail = 'stars match in one part of the image only'
     images = [refused_image(time_ns, 640, 512, 'no_match', detail) for time_ns in (1, 2, 3)]
-    _, note = _through_air(stars, True, images)
+    _, note = _through_air(stars, SiteOptions(), True, images)
     assert note == (f'2 of 3 images, identified by their stars, refused as no_match: {detail}')
-    assert _through_air(stars, True, images[2:])[1] == ''
+    assert _through_air(stars, SiteOptions(), True, images[2:])[1] == ''

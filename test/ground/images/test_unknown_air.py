@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import dataclasses
 import functools
 import math
+from pathlib import Path
 
 import erfa
 import numpy as np
@@ -14,6 +15,8 @@ import pytest
 from random_pointings import honesty  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.bag_writer import BagWriter
+from starcal_ground.images.first_setup import air_of
 from starcal_ground.images.from_stars import ideal_camera, options_of
 from starcal_ground.images.unknown_air import refracted, with_air, zenith_of
 from starcal_ground.simulation.scenario import scenario
@@ -21,10 +24,15 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.camera import project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.unknowns import Refraction
-from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
+from starcal_ros.pipeline.campaign import calibrate, chosen, observe, Source
+from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import CameraGeometry, Ensemble, HeldTerm, StarObservations
 from starcal_ros.sky.astrometry import (
     air_above,
     apparent_directions,
@@ -112,10 +120,14 @@ def from_the_stated_site(seed: int, late_s: int = 0) -> list[StarObservations]:
 
 def off_sigma(found: Estimate) -> float:
     """Largest distance of a number of the site from what was stated, in sigma."""
-    numbers = ('latitude_rad', 'sidereal_time_1_rad')
-    terms = [term for term in model_checks(found).held if term.name in numbers]
-    assert len(terms) == len(numbers)
-    return max(term.significance for term in terms)
+    return max(term.significance for term in numbers_of_site(found).values())
+
+
+def numbers_of_site(found: Estimate) -> dict[str, HeldTerm]:
+    names = ('latitude_deg', 'clock_offset_min')
+    terms = {term.name: term for term in model_checks(found).held if term.name in names}
+    assert len(terms) == len(names)
+    return terms
 
 
 @pytest.mark.slow
@@ -129,6 +141,22 @@ def test_a_clock_wrong_by_an_hour_is_named_and_a_minute_is_in_the_sigma() -> Non
             assert np.sqrt(np.mean(np.square(errors))) < 1.3
         else:
             assert min(off) > LIMIT_SIGMA
+
+
+def test_a_clock_is_named_in_minutes_to_add_to_the_stamps() -> None:
+    clock = numbers_of_site(estimate(from_the_stated_site(1, 1200)))['clock_offset_min']
+    # Its 1-sigma is 3.7 minutes, of which the prior takes 5 %.
+    assert abs(clock.estimated - 20.0) < 2.0 * clock.sigma < 8.0
+
+
+def test_an_image_without_a_zenith_leaves_the_others_theirs() -> None:
+    """Recordings of early versions have none; a wrong clock of the others is named."""
+    images = from_the_stated_site(1, 3600)
+    unknown = dataclasses.replace(
+        images[3], zenith_icrf=np.full(3, np.nan), refraction_arcsec=np.zeros(2)
+    )
+    found = estimate([*images[:3], unknown, *images[4:]])
+    assert off_sigma(found) > LIMIT_SIGMA
 
 
 def unmoved(pixels: Floats) -> Floats:
@@ -145,6 +173,74 @@ def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: 
         declination = math.degrees(math.asin(images[0].zenith_icrf[2]))
         assert abs(declination - SITE.latitude_deg) < 8.0
         errors.append(honesty(GIVEN, estimate(images), unmoved)[0])
+    assert np.sqrt(np.mean(np.square(errors))) < 1.3
+
+
+def noisy(images: list[StarObservations], seed: int) -> list[StarObservations]:
+    """Images of four times the noise."""
+    rng, more_px = np.random.default_rng(seed), math.sqrt(15.0) * NOISE_PX
+    return [
+        dataclasses.replace(
+            one,
+            measured_px=one.measured_px + rng.normal(0.0, more_px, one.measured_px.shape),
+            covariance_px2=16.0 * one.covariance_px2,
+        )
+        for one in images
+    ]
+
+
+@pytest.mark.slow
+def test_on_a_stated_ground_the_likeliest_zenith_is_taken_with_an_honest_sigma() -> None:
+    """Of four noisy images, each with a time of its own, which alone show no air."""
+    given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
+    found = []
+    for seed in range(8):
+        images = noisy(seen_from(SITE, seed, wrong_clock=True)[:4], seed)
+        (_, alone), (stated, text) = (with_air(images, CAMERA, is_it) for is_it in (False, True))
+        assert 'a zenith at' in text
+        found.append((alone, *honesty(given, estimate(stated), unmoved)))
+    told, errors, _ = zip(*found, strict=True)
+    assert sum(text.startswith('observer: ground or space') for text in told) > 2
+    assert np.sqrt(np.mean(np.square(errors))) < 1.3
+
+
+def test_a_ground_that_the_stars_contradict_is_doubted() -> None:
+    images, text = with_air(seen_from(SiteOptions(), 2), CAMERA, is_ground=True)
+    assert text.startswith('observer: ground or space: ') and 'best with the site' in text
+    given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
+    assert honesty(given, estimate(images), unmoved)[0] < 2.0
+
+
+def test_air_that_is_recorded_is_not_applied_again() -> None:
+    once, _ = with_air(seen_from(SITE, 3), CAMERA)
+    assert with_air(once, CAMERA, is_ground=True) == (once, '')
+
+
+@pytest.mark.slow
+def test_a_camera_with_attitudes_on_the_ground_needs_no_site(tmp_path: Path) -> None:
+    """Recorded with a wrong clock; the prior camera is off by 2 % and 20 px."""
+    prior = CameraGeometry(CAMERA.replace(fx=2040.0, fy=2040.0, cx=591.0), np.eye(4)[3])
+    values = {'observer': 'ground', 'star_tracker_sigma_arcsec': [10.0, 10.0, 10.0]}
+    setup = load_setup(values, prior=prior)
+    given = dataclasses.replace(scenario('small'), truth=CameraGeometry(CAMERA, np.eye(4)[3]))
+    errors = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        images = sorted(seen_from(SITE, seed, wrong_clock=True), key=lambda one: one.time_ns)
+        with BagWriter(tmp_path / f'{seed}.mcap') as writer:
+            for one in images:
+                turn = Rotation.from_rotvec(rng.normal(0.0, 10.0 * ARCSECOND_RAD, 3))
+                attitude = Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * turn
+                recorded = dataclasses.replace(one, icrf_from_star_tracker_xyzw=attitude.as_quat())
+                writer.write_observations('/observations', recorded, 'camera')
+        source = Source((tmp_path / f'{seed}.mcap',), Topics(), setup)
+        with pytest.raises(OptionError, match='needs the site'):
+            chosen(source)
+        source = dataclasses.replace(source, through_air=air_of(setup))
+        made = calibrate(observe(chosen(source)))
+        assert made.calibration.accepted, made.calibration.reasons
+        assert made.notes[0].startswith('observer: ground: the stars show refraction')
+        errors.append(honesty(given, made.calibration, unmoved)[0])
     assert np.sqrt(np.mean(np.square(errors))) < 1.3
 
 

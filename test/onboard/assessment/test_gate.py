@@ -193,7 +193,18 @@ def test_a_good_calibration_passes() -> None:
             (
                 'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
                 'of 7.4 sigma (max_held_term_sigma); the stars add -60000 to it; correct '
-                'the velocity so; on the ground state the site'
+                'it so; on the ground state observer: ground'
+            ),
+        ),
+        (
+            with_model(held=(HeldTerm('clock_offset_min', 0.0, -42.5, 5.0),)),
+            'max_held_term_sigma',
+            8.5,
+            8.4,
+            (
+                'distance of clock_offset_min from its assumed value is 8.5 sigma, over the limit '
+                'of 8.4 sigma (max_held_term_sigma); the stars add -42.5 to it; check site and '
+                'UTC, or state observer: ground alone'
             ),
         ),
         (
@@ -214,7 +225,7 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); on the ground state the site (observer); '
+                'of 0.2 px (max_image_variation_px); on the ground state observer: ground; '
                 'else use temperatures, or one focus'
             ),
         ),

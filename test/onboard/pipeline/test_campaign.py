@@ -21,6 +21,7 @@ from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.trend_table import Row
 import starcal_ros
+from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.records import Calibration
 
 pytestmark = pytest.mark.slow
@@ -44,7 +45,18 @@ def unaligned(folder: Path) -> Path:
     return bag
 
 
-@pytest.fixture(scope='module', params=[unsound, unaligned], ids=['unsound', 'unaligned'])
+def unsited(folder: Path) -> Path:
+    """A bag whose set-up is wrong, and on the ground, where the stars are to show the air."""
+    bag = unsound(folder)
+    with (bag / 'params.yaml').open('a') as params:
+        params.write('\n    observer: ground\n')
+    return bag
+
+
+BAGS = [unsound, unaligned, unsited]
+
+
+@pytest.fixture(scope='module', params=BAGS, ids=[make.__name__ for make in BAGS])
 def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag with its parameter file."""
     make: Callable[[Path], Path] = request.param
@@ -60,6 +72,11 @@ def expected(bag: Path) -> Calibration:
     written = starcal_ros.read_calibration(out)
     assert written.accepted and written.images_used == 10
     return written
+
+
+def is_unsited(bag: Path) -> bool:
+    """True for the bag of `unsited`."""
+    return 'observer: ground' in (bag / 'params.yaml').read_text()
 
 
 def by_python(bag: Path) -> Mapping[str, Any]:
@@ -102,9 +119,19 @@ def test_all_entrances_give_one_calibration(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     given = (bag, capsys) if entrance is by_plan else (bag,)
+    if entrance is by_python and is_unsited(bag):  # what flies does not find the air
+        with pytest.raises(starcal_ros.OptionError, match='observer: ground needs the site'):
+            entrance(*given)
+        return
     for name, number in entrance(*given).items():
         # JSON and Parquet keep all digits; the process has solved it with one BLAS thread.
         np.testing.assert_allclose(number, numbers_of(expected)[name], rtol=1e-9, err_msg=name)
+
+
+def test_images_measured_again_have_the_air_of_all(bag: Path, expected: Calibration) -> None:
+    observed = read_observations([bag.parent / 'out' / 'observations.mcap'], '/observations')
+    is_known = [bool(np.isfinite(one.zenith_icrf).all()) for one in observed]
+    assert is_known == [is_unsited(bag)] * expected.images_used
 
 
 def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:

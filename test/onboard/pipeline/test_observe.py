@@ -438,6 +438,7 @@ def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> 
         ({'observer_velocity_m_s': [0.0, 3e4, 0.0]}, None, 10.0),
         ({'observer_velocity_m_s': [9e4, 0.0, 0.0]}, [0.0, 3e4, 0.0], 10.0),
         ({'observer': 'ground', 'latitude_deg': 30.0}, [0.0, 3e4, 0.0], 0.0),
+        ({'observer': 'ground'}, [0.0, 3e4, 0.0], np.nan),
     ],
 )
 def test_the_sigma_of_the_velocity_is_recorded(

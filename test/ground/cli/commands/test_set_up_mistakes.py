@@ -167,7 +167,6 @@ def test_a_focal_length_of_other_pixels(
     [
         ({'star_tracker_sigma_arcsec': [4.8e-5, 4.8e-5, 2e-4]}, ['radians', '[9.9, 9.9, 41.3]']),
         ({'star_tracker_sigma_arcsec': [0.003, 0.003, 0.009]}, ['degrees', '[10.8, 10.8, 32.4]']),
-        ({'observer': 'ground'}, ['latitude_deg', 'longitude_deg']),
         ({'magnitude_limit': 2.0}, ['magnitude_limit: 2 leaves', 'raise it']),
     ],
 )
