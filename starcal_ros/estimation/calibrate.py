@@ -82,6 +82,7 @@ from starcal_ros.estimation.weights import (
     judge,
     Judged,
     sky_rotations,
+    towards,
     tracker_attitudes,
     weighted_attitudes,
 )
@@ -261,9 +262,9 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
-            state, judged = last.after, after
-        # Where stars hardly show an unknown, whole steps overshoot to and fro: the part of the
-        # step before that is left shows the share that ends in the minimum.
+            state, judged = last.after, towards(judged, after, share)
+        # Where stars hardly show an unknown, whole steps overshoot to and fro, and so do weights:
+        # the part of the step before that is left shows the share that ends in the minimum.
         if k:
             of_before = max(float(before_sigma @ before_sigma), 1e-300)
             rest = float(step_sigma @ before_sigma) / of_before

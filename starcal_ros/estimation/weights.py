@@ -461,6 +461,33 @@ def judge(
     return Judged(variance, errors, kept, attitudes)
 
 
+def towards(one: Judged, other: Judged, share: float) -> Judged:
+    """
+    Return other conclusions, with weights that are a share of the way from one to theirs.
+
+    Weights and what they leave may answer each other to and fro, as a step may overshoot.
+    """
+    a, b, to = one.variance, other.variance, other.attitudes
+    if share == 1.0 or one.attitudes is None or to is None:
+        return other
+    before = one.attitudes.trackers
+    if len(a.class_factor) != len(b.class_factor) or len(before) != len(to.trackers):
+        return other
+
+    def part(this: float, that: float) -> float:
+        return this + share * (that - this)
+
+    trackers = tuple(
+        dataclasses.replace(that, working=part(this.working, that.working))
+        for this, that in zip(before, to.trackers, strict=True)
+    )
+    scale, floor_px2 = part(a.scale, b.scale), part(a.floor_px2, b.floor_px2)
+    factor = tuple(map(part, a.class_factor, b.class_factor))
+    variance = CentroidVariance(scale, floor_px2, b.class_magnitude, factor)
+    attitudes = dataclasses.replace(to, trackers=trackers)
+    return dataclasses.replace(other, variance=variance, attitudes=attitudes)
+
+
 def agree(one: Judged, other: Judged, table: StarTable) -> bool:
     """Return True if both lead to the same estimate."""
     if one.attitudes is None or other.attitudes is None:
