@@ -17,7 +17,7 @@ from starcal_ros.records import HeldTerm
     ('held', 'by_stars', 'remedy'),
     [
         (HeldTerm('cx', 320.0, 326.0, 2.0), '326 by the stars, 320 assumed', 'estimate it'),
-        (HeldTerm('velocity_x_m_s', 0.0, 6e4, 2e4), 'the stars add 60000 to it', 'correct the'),
+        (HeldTerm('velocity_x_m_s', 0.0, 6e4, 2e4), 'the stars add 60000 to it', 'correct it so'),
     ],
 )
 def test_rows_say_what_was_found_and_what_to_do(
