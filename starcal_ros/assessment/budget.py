@@ -86,14 +86,15 @@ def sigma_budget(
     of_rows = seen.turned(np.eye(len(errors.root))[:, rows])
     covariance = estimate.map_covariance.matrix
     held = of_rows.variances(covariance - estimate.posterior.covariance[part])
-    shapes = _known_shapes(estimate, errors)
+    shapes = _of_shapes(estimate, errors)
     common = common_shape(estimate.linear.layout, estimate.posterior.shapes.common_px2)
     causes = [
         _Cause('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
         *_unknowns(estimate, options, errors, in_root),
         _Cause(
             'change from image to image',
-            _gain(errors, shapes, in_root) + seen.variances(common),
+            _gain(errors, _known(errors, estimate, ['trend'], shapes), in_root)
+            + seen.variances(common),
             _estimated(
                 float(np.linalg.norm(estimate.posterior.shapes.sigma_px)),
                 estimate.posterior.shapes.amplitudes.likelihood_ratio,
@@ -247,34 +248,40 @@ def _gain(errors: ErrorParts, T: Floats, seen: _Seen) -> Floats:
     return seen.variances(np.eye(len(T)) + errors.excess - T @ inner @ T.T)
 
 
-def _known(errors: ErrorParts, estimate: Estimate, names: Sequence[str]) -> Floats:
-    """Return T (r, s) of an estimator that is given some shared unknowns."""
+def _known(
+    errors: ErrorParts, estimate: Estimate, names: Sequence[str], shapes: Floats | None = None
+) -> Floats:
+    """
+    Return T (r, s) of an estimator that is given some shared unknowns.
+
+    With ``shapes`` (r, r), the information of `_of_shapes`, the shapes of the images too.
+    """
     rows = errors.root[estimate.linear.layout.of(names)]
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     rows = (rows / np.where(size > 0, size, 1.0))[size[:, 0] > 0]
-    # By pivoting, in a third of the time of singular values.
-    Q, R, _ = qr(rows.T, pivoting=True)
-    size = np.abs(np.diag(R))
-    rank = np.count_nonzero(size > max(rows.shape) * np.finfo(float).eps * size.max(initial=0.0))
-    return np.asarray(Q[:, rank:])
+    T: Floats = np.eye(rows.shape[1])
+    if len(rows):
+        # By pivoting, in a third of the time of singular values.
+        T, R, _ = qr(rows.T, pivoting=True)
+        size = np.abs(np.diag(R))
+        T = T[:, np.count_nonzero(size > max(rows.shape) * np.finfo(float).eps * size.max()) :]
+    if shapes is None:
+        return T
+    # The information of the shapes adds up within what is left.
+    values, vectors = np.linalg.eigh(T.T @ shapes @ T)
+    return np.asarray(T @ (vectors * (1.0 + values.clip(0.0)) ** -0.5) @ vectors.T)
 
 
-def _known_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
-    """Return T (r, r) of an estimator that is given the shapes of the images."""
+def _of_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
+    """Return the information (r, r) that the shapes of the images take from an estimate."""
     without = equations(estimate.sums, estimate.linear, _KNOWN_SHAPE_PX)
     given = estimate.posterior.equations
-    hidden = errors.root.T @ (without.information - given.information) @ errors.root
-    values, vectors = np.linalg.eigh(hidden)
-    return np.asarray((vectors * (1.0 + values.clip(0.0)) ** -0.5) @ vectors.T)
+    return np.asarray(errors.root.T @ (without.information - given.information) @ errors.root)
 
 
 def _noise(estimate: Estimate, errors: ErrorParts, shapes: Floats, seen: _Seen) -> Floats:
     """Return the variances (k,) by the noise of the centroids, all other causes absent."""
-    N = _known(errors, estimate, list(itertools.chain(*_UNKNOWNS.values())))
-    # An estimator that is given both: the information of the shapes adds up within what is left.
-    held = N.T @ np.linalg.inv(shapes @ shapes) @ N
-    values, vectors = np.linalg.eigh(held)
-    T = N @ (vectors * values.clip(1.0) ** -0.5) @ vectors.T
+    T = _known(errors, estimate, ['trend', *itertools.chain(*_UNKNOWNS.values())], shapes)
     noise = np.eye(T.shape[1]) + T.T @ (errors.excess - sum(errors.shared.values())) @ T
     return seen.variances(T @ noise @ T.T)
 

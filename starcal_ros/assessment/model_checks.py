@@ -86,9 +86,10 @@ def _image_variation_px(estimate: Estimate) -> float:
     """1-sigma change of the camera from image to image in a corner, px."""
     camera = estimate.geometry.camera
     corner_px = 0.5 * math.hypot(camera.width, camera.height)
-    sigma_px = np.exp(estimate.posterior.shapes.amplitudes.log_px)
+    trend_px = estimate.posterior.mean[estimate.linear.layout.of(['trend'])]
+    sigma_px = np.append(trend_px, np.exp(estimate.posterior.shapes.amplitudes.log_px))
     # Those of the focal length grow to the corner; the decentring is that of the corner.
-    sigma_px[:3] *= corner_px / float(camera.parameters[0])
+    sigma_px[: len(trend_px) + 3] *= corner_px / float(camera.parameters[0])
     return float(np.linalg.norm(sigma_px))
 
 
@@ -128,7 +129,9 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         tested &= entry.widest > entry.sigma  # of any lens: nobody states it
         if entry.name not in _STATED or not tested.any():
             continue
-        means, variances, log_evidence = without_prior(estimate.sums, estimate.linear, entry.name)
+        means, variances, log_evidence = without_prior(
+            estimate.sums, estimate.linear, entry.name, found
+        )
         is_clear = log_evidence - found.log_evidence > 0.5 * _CLEAR_SIGMA**2
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
             if not np.isfinite(variance):

@@ -402,16 +402,15 @@ def residuals_px(
     if found is not None:
         layout = found.layout
         own = np.broadcast_to(own, (table.image_count, problem.camera_count)).copy()
-        shapes_px = found.of_images[:, layout.places['shape']]
-        modes = layout['shape'].camera
-        assert modes is not None
-        own += np.einsum('mps,ms->mp', modes, shapes_px)
         measured = measured - _field_of(found, size).displacement_px(measured)
         turn = np.zeros((3, len(table)))
         for entry in layout.entries:
+            at = layout.places[entry.name]
+            if entry.camera is not None and entry.name not in _IN_STATE:
+                values = found.of_images[:, at] if entry.of_image else found.mean[None, at]
+                own += (entry.camera @ values[:, :, None])[:, :, 0]
             if entry.turn is not None:
                 by = entry.turn(table.measured_px.T, e.T, table.image)
-                at = layout.places[entry.name]
                 if entry.of_image:
                     turn += (by * found.of_images[table.image, at].T).sum(axis=1)
                 else:

@@ -180,20 +180,29 @@ def posterior(
 
 
 def without_prior(
-    sums: StarSums, linear: Linearisation, name: str
+    sums: StarSums, linear: Linearisation, name: str, near: Posterior
 ) -> tuple[Floats, Floats, float]:
     """
     Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
 
-    The amplitudes are found again: field and shapes may hide that a prior is wrong.  The variance
-    is that of the working weights; infinite where stars show less than what is possible at all.
+    The amplitudes are found again: field and shapes may hide that a prior is wrong.  A trend keeps
+    its value of the posterior ``near`` with the prior, and its cost: together with a free velocity
+    it can be much that is of the lens.  The variance is that of the working weights; infinite
+    where stars show less than what is possible at all.
     """
-    wide = Layout(
-        tuple(
-            dataclasses.replace(one, sigma=_without_prior(one)) if one.name == name else one
-            for one in linear.layout.entries
-        )
+    at_trend = linear.layout.of(['trend'])
+    trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
+    cost = 0.5 * float(
+        (stated * trend**2 - np.log(stated * np.diag(near.working)[at_trend])).sum()
     )
+    entries = []
+    for entry in linear.layout.entries:
+        if entry.name == name:
+            entry = dataclasses.replace(entry, sigma=_without_prior(entry))
+        elif entry.name == 'trend':
+            entry = dataclasses.replace(entry, sigma=_KEPT * entry.sigma, offset=-trend)
+        entries.append(entry)
+    wide = Layout(tuple(entries))
     linear = dataclasses.replace(linear, layout=wide)
     at = wide.of([name])
     try:
@@ -207,7 +216,7 @@ def without_prior(
         variance = np.where(seen, 1.0 / shown, np.inf)
         # The wide prior pulls a little: off + mean is the sum of both by their information.
         alone = (off + found.mean[at]) * (1.0 + precision * variance) - off
-    return np.where(seen, alone, 0.0), variance, found.log_evidence
+    return np.where(seen, alone, 0.0), variance, found.log_evidence - cost
 
 
 def _without_prior(entry: Unknown) -> Floats:
@@ -294,7 +303,8 @@ def _shape_sums(
     """
     Return what each image shows of its shape, the field known and its other unknowns eliminated.
 
-    The images are alike in the field; each has stars in other parts of it.
+    The images are alike in the field; each has stars in other parts of it.  A trend is a change of
+    the images as well, and correlated: what all share of it has to be known here.
     """
     layout = linear.layout
     blocks = sums.blocks.copy()
@@ -314,7 +324,7 @@ def _shape_sums(
     shape, total = columns[own][layout.places['shape']], left.sum(axis=0)
     at = seen_by_stars(layout)  # the first columns
     precision, offset = solver.precision[at], layout.prior_offset[at]
-    free = np.flatnonzero(np.isfinite(precision))
+    free = np.flatnonzero(np.isfinite(precision) & ~np.isin(at, layout.of(['trend'])))
     return ShapeSums(
         left[:, shape[:, None], shape],
         left[:, shape, -1],
@@ -337,6 +347,7 @@ def common_shape(layout: Layout, common_px2: Floats) -> Floats:
 
 
 TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
+_KEPT = 1e-3  # of the sigma of a prior, by which an unknown stays at its mean
 _HELD = 0.05  # information on a mode times its variance, below which its prior holds it
 
 

@@ -74,7 +74,7 @@ class Problem:
     is_weak : (p,) bool, or False
         True where the prior is that of any lens: no data sheet states it.
     time_s : (m,)
-        Times of the images; (0,): not known.
+        Times of the images, from the mean of all stars; (0,): not known.
     star_tracker_from_icrf : Rotation (m,)
         As measured.
     star_tracker_sigma_rad : (m, 3)

@@ -96,6 +96,8 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
     is_default = (prior_sigma == 0) & np.isin(np.arange(len(names)), list(free))
     prior_sigma = np.where(is_default, _default_sigma(prior.camera, options), prior_sigma)
     stamps_ns = np.array([image.time_ns for image in ensemble.images], np.int64)
+    late_s = (stamps_ns - stamps_ns[0]) / NANOSECONDS_PER_SECOND
+    stars = [max(len(image), 1) for image in ensemble.images]
     attitudes = Rotation.from_quat(
         np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
     )
@@ -125,7 +127,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
         star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
         first_from_star_tracker=mountings,
         mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
-        time_s=(stamps_ns - stamps_ns[0]) / NANOSECONDS_PER_SECOND,
+        time_s=late_s - np.average(late_s, weights=stars),
         is_weak=is_default & np.isin(camera.parameter_names, COEFFICIENTS[model]),
     )
 

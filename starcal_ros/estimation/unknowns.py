@@ -66,6 +66,7 @@ _FOCAL_MODES = {
 }
 """Changes of fx, skew and fy."""
 _DECENTRING = ('p1', 'p2')  # of the lens models that have them
+_TREND = 1e-4  # of the focal length, rms over the images: a lens that warms by some degrees
 _NO_TURN_RAD = 1e-8  # within an image: 2 milliarcseconds
 _FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
 FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
@@ -361,7 +362,7 @@ def unknowns_of(
         Of the detector, px.
     """
     width, height = size
-    entries = list(unknowns_in_state(problem, state).entries)
+    entries = [*unknowns_in_state(problem, state).entries, *_trend(problem, state)]
     if assumed.velocity_m_s > 0:
         entries.append(
             Unknown(
@@ -400,6 +401,22 @@ def _shape(problem: Problem, state: State, size: tuple[int, int]) -> Unknown:
     count, m = len(labels), len(state.camera_from_icrf)
     camera = np.broadcast_to(modes, (m, *modes.shape))
     return Unknown('shape', labels, np.ones(count), np.zeros(count), of_image=True, camera=camera)
+
+
+def _trend(problem: Problem, state: State) -> list[Unknown]:
+    """
+    Return the entry of a scale that changes in proportion to time, as that of a lens that warms.
+
+    Changes that each image has by itself do not explain it as well as a velocity does where the
+    line of sight turns slowly.  Where temperatures are given, the scale changes with them.
+    """
+    if len(state.focal) or not problem.time_s.any():
+        return []
+    late = problem.time_s / np.sqrt((problem.time_s**2).mean())
+    modes = np.zeros((len(late), problem.camera_count, 1))
+    modes[:, :3, 0] = np.outer(late, _FOCAL_MODES['scale_px'])
+    sigma = np.array([_TREND * abs(float(state.parameters[0]))])
+    return [Unknown('trend', ('scale_trend_px',), sigma, np.zeros(1), camera=modes)]
 
 
 def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:

@@ -232,7 +232,7 @@ def test_known_shapes_add_the_information_that_they_hide() -> None:
     found, _ = estimate(breathing)
     errors = found.posterior.errors
     assert errors is not None
-    T = budget._known_shapes(found, errors)
+    T = budget._known(errors, found, [], budget._of_shapes(found, errors))
     given = found.sums, found.linear
     hidden = equations(*given, 1e-7).information
     hidden = hidden - equations(*given, found.posterior.shapes.sigma_px).information

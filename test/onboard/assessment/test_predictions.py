@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -49,8 +50,14 @@ def with_noise(ensemble: Ensemble, factor: Callable[[int, StarObservations], Flo
 def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
     """Whitened residuals (2, n) of image k under a calibration of the others."""
     others = Ensemble(tuple(one for i, one in enumerate(ensemble.images) if i != k))
-    camera = estimated(given, others, variance_components=False).geometry.camera
-    image = ensemble.images[k]
+    found = estimated(given, others, variance_components=False)
+    image, camera = ensemble.images[k], found.geometry.camera
+    time_s = found.linear.problem.time_s
+    late_s = time_s[0] + (image.time_ns - others.images[0].time_ns) * 1e-9
+    trend_px = found.posterior.mean[found.linear.layout.of(['trend'])].item()
+    scale = 1.0 + trend_px * late_s / math.sqrt((time_s**2).mean()) / camera.parameters[0]
+    fx, skew, fy = (scale * camera.parameters[:3]).tolist()
+    camera = camera.replace(fx=fx, skew=skew, fy=fy)
     wuu, wuv, wvv = whitening(image.covariance_px2)
     start = Rotation.from_quat(given.truth.star_tracker_from_camera_xyzw).inv() * (
         Rotation.from_quat(image.icrf_from_star_tracker_xyzw).inv()

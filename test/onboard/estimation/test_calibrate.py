@@ -355,7 +355,7 @@ def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_sca
 @pytest.mark.slow
 def test_a_floor_that_no_centroid_knows_of_is_found() -> None:
     errors, floors = [], []
-    for k in range(20):
+    for k in range(TRIALS):
         noisy = with_noise(clean(), 200 + k, floor_px=0.1)
         found = estimate_calibration(noisy, PRIOR, options('per_image'))
         errors.append(normalised_error(found))
