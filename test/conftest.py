@@ -28,6 +28,9 @@ import pytest
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+# The background of a shell ignores Ctrl-C, and what is started there inherits that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # The same cases in each run; by default, a busy machine makes them fail for their time.
 hypothesis.settings.register_profile(
     'any machine',
