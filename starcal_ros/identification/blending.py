@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.identification.prediction import Prediction
 from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 from starcal_ros.stars.centroiding import Centroids, SWAMPED_SIGMA
-from starcal_ros.stars.detection import near_pairs
 from starcal_ros.stars.image_model import ImageModel
 from starcal_ros.stars.pixel_noise import expected_snr
 from starcal_ros.stars.psf_fit import apart_px, neighbour_pull_px, stamp_radius_px
@@ -63,7 +63,7 @@ def neighbour_pulls(
     sigma_px = model.psf_sigma_px or 1.0
     radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
     reach_px = radius_px * math.sqrt(2.0) + 2.0 * model.extent_px
-    pairs = near_pairs(xy_px, reach_px)
+    pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     star, other = pairs[pairs[:, 0] < len(flux_dn)].T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
@@ -299,7 +300,7 @@ def _without_neighbours(
         return stamps, parameters, done, modelled
     # The wing of a star outside the stamp adds light to it.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px + 0.5 * streak_px
-    pairs = detection.near_pairs(centre, reach_px)
+    pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
     apart_px = psf_fit.apart_px(
         predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]],
         sigma_px[pairs[:, 0]],

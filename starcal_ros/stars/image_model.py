@@ -215,23 +215,11 @@ def model_image(
     unknown = ImageModel(
         background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
-    apart_px = _ISOLATED_PX + (streak.longest_px if streak else 0.0)
-
-    def bright(of: detection.Sources, least_snr: float) -> Floats:
-        xy_px = of.xy_px[of.snr > least_snr]
-        nearest = np.rint(xy_px).astype(np.int64)
-        return xy_px[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
-
-    def alone(least_snr: float) -> Floats:
-        xy_px = bright(sources, least_snr)[:400]
-        crowd = cKDTree(bright(neighbours or sources, least_snr))
-        is_alone = crowd.query_ball_point(xy_px, apart_px, return_length=True) == 1
-        return np.asarray(xy_px[is_alone][:80])
-
-    xy = alone(BRIGHT_SNR)
+    given = pixels, sources, neighbours or sources, saturation_dn, streak
+    xy = _isolated(*given, BRIGHT_SNR)
     # The peak of a streak is lower than its light, and a short exposure has few bright stars.
     if streak is not None or len(xy) < FEWEST_BRIGHT:
-        xy = alone(SHOWN_SNR)
+        xy = _isolated(*given, SHOWN_SNR)
     sigma = 1.2
     if len(xy) < FEWEST_BRIGHT:
         return unknown
@@ -274,6 +262,27 @@ def model_image(
     return ImageModel(
         background, psf, noise_model, saturation_dn, shape_median, shape_scatter, streak
     )
+
+
+def _isolated(
+    pixels: Pixels,
+    sources: detection.Sources,
+    neighbours: detection.Sources,
+    saturation_dn: float,
+    streak: Streak | None,
+    least_snr: float,
+) -> Floats:
+    """Places (n, 2) of the bright, unsaturated sources that are alone, up to 80."""
+
+    def bright(of: detection.Sources) -> Floats:
+        xy_px = of.xy_px[of.snr > least_snr]
+        nearest = np.rint(xy_px).astype(np.int64)
+        return xy_px[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
+
+    xy_px = bright(sources)[:400]
+    apart_px = _ISOLATED_PX + (streak.longest_px if streak else 0.0)
+    count = cKDTree(bright(neighbours)).query_ball_point(xy_px, apart_px, return_length=True)
+    return np.asarray(xy_px[count == 1][:80])
 
 
 def known_model(

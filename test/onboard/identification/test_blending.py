@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from starcal_ground.simulation.rendering import star_electrons
 from starcal_ros.constants import ARCSECOND_RAD
@@ -18,26 +17,12 @@ from starcal_ros.identification.blending import (
     Pulls,
     unlisted_pull_px,
 )
-from starcal_ros.stars.detection import Background, near_pairs
+from starcal_ros.stars.detection import Background
 from starcal_ros.stars.image_model import ImageModel, uniform_width
 from starcal_ros.stars.pixel_noise import PixelNoise
 from starcal_ros.stars.psf_fit import fit_psf, stamp_radius_px
 
 SIGMA_PX = 0.95
-
-
-@pytest.mark.parametrize('count', [0, 1, 2, 500])
-@pytest.mark.parametrize('side_px', [(400.0, 300.0), (2.0, 300.0), (400.0, 2.0), (1.0, 1.0)])
-@pytest.mark.parametrize('whole', [False, True])
-def test_pairs_are_those_of_a_k_d_tree(
-    count: int, side_px: tuple[float, float], whole: bool
-) -> None:
-    # Fainter neighbours may lie some pixels outside the image.
-    points = np.random.default_rng(count).uniform(-8.0, side_px, (count, 2))
-    points = np.rint(points).astype(np.int64) if whole else points
-    pairs = near_pairs(points, 5.5)
-    expected = cKDTree(points).query_pairs(5.5)
-    assert len(pairs) == len(expected) and set(map(tuple, pairs.tolist())) == expected
 
 
 def pull_of_a_neighbour(
