@@ -613,8 +613,8 @@ REMEDIES: Mapping[str, str] = {
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'on the ground state observer: ground; else use'
-    ' temperatures, or one focus',
+    'change from image to image': 'use temperatures, or one focus; unstated air (observer:'
+    ' ground) changes it too',
     'star places': 'take more images of other star fields, with a catalog that has proper motions',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',

@@ -4,9 +4,9 @@ The recipe from bags to a calibration, which every program that reads bags follo
 
 `chosen` chooses the topics and finds the alignment where no prior one is given, `observe`
 measures the stars, and `calibrate` solves.  If it is accepted, images that matched no star are
-measured again with that calibration, and a second solution includes those that match now.  The
-nodes take the same steps by `observe` and `solve`; of the images that match no star they keep the
-last few only.
+measured again with that calibration, and all images if it only lacks stars; a second solution
+includes what is found then.  The nodes take the same steps by `observe` and `solve`; of the images
+that match no star they keep the last few only.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.formats.bag import reader
 from starcal_ros.pipeline import solve
@@ -22,6 +23,8 @@ from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.setup import check_site, Setup
 from starcal_ros.pipeline.topics import OnImage, Topics, Wanted
 from starcal_ros.records import Calibration, Ensemble, StarObservations
+
+_FOR_WANT_OF_STARS = {REQUIREMENTS, 'min_coverage'}  # checks that fail, of a sound calibration
 
 ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations], str]]
 """Observations with the refraction that they show, and a sentence on it or an empty one."""
@@ -136,20 +139,47 @@ def calibrate(observed: Observed, inputs: Mapping[str, str] | None = None) -> Ca
     Raises TooFewObservations when the images do not determine the parameters to be estimated.
     """
     campaign = _solved(observed, inputs)
+    again, note = _measured_again(observed, campaign.calibration)
+    return _solved(_observed(observed.source, again, note), inputs) if note else campaign
+
+
+def _measured_again(
+    observed: Observed, calibration: Calibration
+) -> tuple[Sequence[StarObservations], str]:
+    """
+    Observations with those measured again with a calibration, and a sentence if any gained stars.
+
+    They are those of images that matched no star; and all of a calibration that is refused for
+    want of stars alone: a prior lens without its distortion leads tracking to the stars in the
+    middle, but the calibration by these leads to the corners.  An image refused in the second
+    attempt keeps its first observations.
+    """
     source, before = observed.source, observed.measured
+    failed = {check.option for check in calibration.gate if not check.passed}
+    lacks_stars = bool(failed) and failed <= _FOR_WANT_OF_STARS
+    if not (calibration.accepted or lacks_stars):
+        return before, ''
     # An image identified by itself is not identified by the calibration of the others either.
-    if not (campaign.calibration.accepted and source.setup.has_tracker):
-        return campaign
-    geometry = campaign.calibration.geometry
-    again = bag_topics.measured_again(source.bags, source.topics, source.setup, geometry, before)
-    gained = sum(new is not old for new, old in zip(again, before, strict=True))
-    if not gained:
-        return campaign
-    note = (
-        f'{gained} images matched nothing at first, and are used with the calibration of the'
-        ' others'
-    )
-    return _solved(_observed(source, again, note), inputs)
+    if not (source.setup.has_tracker and source.topics.image):
+        return before, ''
+    again = ('no_match', '') if lacks_stars else ('no_match',)
+    wanted = {record.time_ns for record in before if record.refusal in again}
+    if not wanted:
+        return before, ''
+    setup = replace(source.setup, prior=calibration.geometry)
+    second = bag_topics.read(source.bags, source.topics, setup, wanted=wanted.__contains__)
+    new = {record.time_ns: record for record in second if not record.refusal}
+    records = [new.get(old.time_ns, old) if old.refusal in again else old for old in before]
+    matched = sum(bool(a.refusal) - bool(b.refusal) for a, b in zip(before, records, strict=True))
+    stars = sum(len(record) for record in records) - sum(len(record) for record in before)
+    if lacks_stars and stars > 0:
+        return records, f'the calibration lacked stars at first: {stars} more are found with it'
+    if matched:
+        return records, (
+            f'{matched} images matched nothing at first, and are used with the calibration of the'
+            ' others'
+        )
+    return before, ''
 
 
 def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:

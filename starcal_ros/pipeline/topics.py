@@ -179,33 +179,6 @@ def read(
             yield observations
 
 
-def measured_again(
-    paths: Sequence[Path],
-    topics: Topics,
-    setup: Setup,
-    geometry: CameraGeometry,
-    observations: Sequence[StarObservations],
-) -> list[StarObservations]:
-    """
-    Observations of bags; images refused as ``no_match`` are measured again with a calibration.
-
-    An image without a match in the second attempt keeps its first refusal.
-    """
-    wanted = {record.time_ns for record in observations if record.refusal == 'no_match'}
-    if not wanted or not topics.image:
-        return list(observations)
-    again: dict[int, StarObservations] = {}
-    for frame in _frames(paths, topics, setup):
-        if isinstance(frame, Frame) and frame.image.time_ns in wanted - again.keys():
-            record, _ = _of_frame(frame, setup, Track(geometry))
-            if not record.refusal:
-                again[record.time_ns] = record
-    return [
-        again.get(record.time_ns, record) if record.refusal == 'no_match' else record
-        for record in observations
-    ]
-
-
 def _frames(
     paths: Sequence[Path], topics: Topics, setup: Setup
 ) -> Iterator[Frame | StarObservations]:

@@ -225,8 +225,8 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); on the ground state observer: ground; '
-                'else use temperatures, or one focus'
+                'of 0.2 px (max_image_variation_px); use temperatures, or one focus; '
+                'unstated air (observer: ground) changes it too'
             ),
         ),
         (

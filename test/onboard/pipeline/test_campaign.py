@@ -21,8 +21,10 @@ from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.trend_table import Row
 import starcal_ros
-from starcal_ros.formats.bag.reader import read_observations
-from starcal_ros.records import Calibration
+from starcal_ros.formats.bag.reader import read_observations, Topics
+from starcal_ros.pipeline import campaign
+from starcal_ros.pipeline.setup import read_setup
+from starcal_ros.records import Calibration, refused_image
 
 pytestmark = pytest.mark.slow
 
@@ -132,6 +134,46 @@ def test_images_measured_again_have_the_air_of_all(bag: Path, expected: Calibrat
     observed = read_observations([bag.parent / 'out' / 'observations.mcap'], '/observations')
     is_known = [bool(np.isfinite(one.zenith_icrf).all()) for one in observed]
     assert is_known == [is_unsited(bag)] * expected.images_used
+
+
+def test_images_without_a_match_are_measured_with_the_calibration() -> None:
+    """No other image is."""
+    setup = read_setup(TINY / 'params.yaml')
+    source = campaign.chosen(campaign.Source((TINY,), Topics(), setup))
+    seen = campaign.observe(source).measured
+    lost, smeared = (
+        refused_image(seen[k].time_ns, seen[k].width, seen[k].height, reason, reason)
+        for k, reason in ((2, 'no_match'), (5, 'no_stars'))
+    )
+    before = [*seen[:2], lost, *seen[3:5], smeared, *seen[6:]]
+    made = campaign.calibrate(campaign.Observed(source, before, tuple(before), ()))
+    again = made.observations
+    assert made.notes[0].startswith('1 image') and made.calibration.images_used == 9
+    assert all(a is b for k, (a, b) in enumerate(zip(again, before, strict=True)) if k != 2)
+    # The same stars at the same places, by a search in place of a track.
+    common = np.isin(again[2].catalog_id, seen[2].catalog_id)
+    assert common.sum() > 0.95 * len(seen[2])
+
+
+def test_a_calibration_refused_for_want_of_stars_finds_those_of_a_right_prior(
+    tmp_path: Path,
+) -> None:
+    """A prior off by 20 px in the corners leads to 7 % fewer stars, and misses a requirement."""
+    bag = Path(shutil.copytree(TINY, tmp_path / 'bag'))
+    with (bag / 'params.yaml').open('a') as params:
+        params.write("    magnitude_limit: 5.0\n    requirements: ['map=0.036px']\n")
+    right = read_setup(bag / 'params.yaml')
+    camera = bag / 'camera.yaml'
+    camera.write_text(camera.read_text().replace('data: [-0.045, 0.08,', 'data: [1.0, 0.0,'))
+    wrong = read_setup(bag / 'params.yaml')
+    found, expected = (campaign.calibrate_bags([bag], setup, Topics()) for setup in (wrong, right))
+    assert found.notes == ('the calibration lacked stars at first: 14 more are found with it',)
+    assert found.calibration.accepted and not expected.notes
+    assert found.calibration.stars_used == expected.calibration.stars_used
+    # The stars are measured again from other predictions: the sigma of fx is 0.3 px.
+    offset = found.calibration.geometry.camera.parameters[0]
+    offset -= expected.calibration.geometry.camera.parameters[0]
+    assert abs(offset) < 0.03
 
 
 def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:

@@ -20,16 +20,9 @@ from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
-from starcal_ros.pipeline import observe, solve, topics
-from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
-from starcal_ros.records import (
-    AttitudeSample,
-    CameraGeometry,
-    Ensemble,
-    Image,
-    refused_image,
-    StarObservations,
-)
+from starcal_ros.pipeline import observe, topics
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.astrometry import air_above, apparent_directions, through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
 
@@ -462,24 +455,3 @@ def test_the_sigma_of_the_velocity_is_recorded(
         np.testing.assert_allclose(
             found.direction_icrf[order], expected[by_id], rtol=0, atol=1e-15
         )
-
-
-@pytest.mark.slow
-def test_an_image_without_a_match_is_measured_with_the_calibration() -> None:
-    setup = read_setup(TINY / 'params.yaml')
-    chosen = topics.choose_topics([TINY], Topics(), setup)
-    seen = list(topics.read([TINY], chosen, setup))
-    width, height = seen[0].width, seen[0].height
-    lost = refused_image(seen[2].time_ns, width, height, 'no_match', 'lost')
-    smeared = refused_image(seen[5].time_ns, width, height, 'no_stars', 'smeared')
-    before = [*seen[:2], lost, *seen[3:5], smeared, *seen[6:]]
-    ensemble = Ensemble()
-    for record in before:
-        ensemble = solve.add_to_ensemble(ensemble, record, setup)
-    geometry = solve.solve(ensemble, setup)[0].geometry
-    again = topics.measured_again([TINY], chosen, setup, geometry, before)
-    assert [record.refusal for record in again] == [''] * 5 + ['no_stars'] + [''] * 4
-    assert all(a is b for k, (a, b) in enumerate(zip(again, before, strict=True)) if k != 2)
-    # The same stars at the same places, by a search in place of a track.
-    common = np.isin(again[2].catalog_id, seen[2].catalog_id)
-    assert common.sum() > 0.95 * len(seen[2])
