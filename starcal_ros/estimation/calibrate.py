@@ -97,7 +97,7 @@ from starcal_ros.records import (
 _START_FLOOR_PX = 0.05  # until the residuals show it: of the order of what is left in good images
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
-_ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
+_ROUNDS = 24  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
 _IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')

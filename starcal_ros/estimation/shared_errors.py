@@ -25,10 +25,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import functools
+from itertools import pairwise
 import math
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.special import softmax
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
@@ -51,6 +53,9 @@ _NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _ROUNDING = 1e-9  # of sums over pairs, where there are none
 _ROUNDS = 8  # of the factors of stars
+# That there is a floor of the centroids, and as much that it is structure, to none.
+_FLOOR_ODDS = 0.2
+_SHARES = 20  # of a floor
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
@@ -156,6 +161,7 @@ def shared_errors(
     groups: Sequence[Groups],
     from_sky: Floats,
     last_octave: tuple[Floats, Floats],
+    floor_px2: tuple[float, float],
 ) -> tuple[SharedError, ...]:
     """
     Return the errors that observations share.
@@ -172,6 +178,8 @@ def shared_errors(
         Rotation of a displacement fixed to the star into pixel axes.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
+    floor_px2 : (estimate, 1-sigma)
+        Variance per axis that all centroids have beyond their own.
     """
     star = groups[0].group
     sightings = np.maximum(np.bincount(star, used)[star], 1.0)
@@ -194,10 +202,15 @@ def shared_errors(
     together = max(_pairs(working * np.sqrt(groups[0].together), star), 0.0)
     share = together / max(_pairs(working, star), together, 1e-300)
     octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
-    variances = chain_means(longest * _beside_stars(of_places, share), moments[:octaves])
+    first = longest * _beside_stars(of_places, share)
+    variances = chain_means(first, _increments(moments[:octaves]))
+    beyond_px2 = max(floor_px2[0] - place_px2, 0.0)
+    of_floor_px2 = _of_floor(beyond_px2, floor_px2[1], np.array(moments[:octaves]))
+    variances = max(variances, of_floor_px2, key=sum)
     # Strips of rows and of columns are chains of their own, from the coarser to the finer.
-    for first in range(octaves, len(moments), len(_STRIPS)):
-        variances += chain_means(_PRIOR, moments[first : first + len(_STRIPS)])
+    for first_strip in range(octaves, len(moments), len(_STRIPS)):
+        strips = moments[first_strip : first_strip + len(_STRIPS)]
+        variances += chain_means(_PRIOR, _increments(strips))
     for kind, moment, variance in zip(groups[1:], moments, variances, strict=True):
         ratio = max(moment[0] / moment[1], 0.0) ** 2
         found.append(_error(kind, weight, np.full(len(weight), variance), ratio, 0.0))
@@ -327,6 +340,20 @@ def pair_moment(
     return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
 
 
+def _increments(moments: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """
+    Return what moments of cells show beyond those of the coarser ones before them, with 1-sigma.
+
+    Neighbours in a small cell are neighbours in the large one, and share its structure too.
+    """
+    found = [moments[0]]
+    for (before, before_sigma), (after, sigma) in pairwise(moments):
+        is_known = math.isfinite(sigma)
+        own_sigma = math.sqrt(max(sigma**2 - before_sigma**2, 0.0)) if is_known else sigma
+        found.append((after - before if is_known else 0.0, max(own_sigma, _ROUNDING * sigma)))
+    return found
+
+
 def _next_octave(log_px: Floats) -> Floats:
     """Weights (s, 240) on the grid of an octave that follows one of logarithms (s,)."""
     off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
@@ -372,6 +399,25 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
         after = transition @ (likelihood * after)
         after /= after.max()
     return means[::-1]
+
+
+def _of_floor(floor_px2: float, sigma_px2: float, moments: Floats) -> list[float]:
+    """
+    Return the variances (k,) of the fine octaves that a floor of the centroids is.
+
+    What adds to the centroids of all stars alike is noise of each of them, or structure of the
+    detector at its place; where no two stars are near each other, nothing tells the two apart.
+    Posterior means: there is no floor, or it is noise, or a share of it, uniform, is structure of
+    one octave, which the pairs of its cells and of the finer ones show (`pair_moment`).
+    """
+    estimate, sigma = moments.T
+    share = (np.arange(_SHARES) + 0.5) / _SHARES
+    shown = share[:, None, None] * floor_px2 * np.triu(np.ones((len(moments), len(moments))))
+    off = ((estimate / sigma) ** 2 - ((estimate - shown) / sigma) ** 2).sum(axis=2)
+    is_floor = math.log(_FLOOR_ODDS) + 0.5 * (floor_px2 / sigma_px2) ** 2
+    of_structure = is_floor + 0.5 * off - math.log(off.size)
+    likely = softmax(np.concatenate([[0.0, is_floor], of_structure.ravel()]))[2:]
+    return list(floor_px2 * share @ likely.reshape(off.shape))
 
 
 def pixel_variance_px2(errors: Sequence[SharedError]) -> float:

@@ -90,6 +90,7 @@ class CentroidVariance:
     floor_px2: float
     class_magnitude: tuple[float, ...] = ()
     class_factor: tuple[float, ...] = ()
+    floor_sigma_px2: float = math.inf
 
     def of(self, covariance_px2: Floats, magnitude: NDArray[np.floating]) -> Floats:
         """Corrected covariances (n, 3) uu, uv, vv of stars of magnitudes (n,)."""
@@ -133,12 +134,13 @@ def estimate_variance(
     for _ in range(_ROUNDS):
         before = scale, floor_px2
         expected = scale * own + floor_px2
-        scale, floor_px2 = _line(own, squared, _part(squared / expected) / expected**2)
+        weight = _part(squared / expected) / expected**2
+        scale, floor_px2, sigma_px2 = _line(own, squared, weight)
         if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
             break
     ratio = squared / (scale * own + floor_px2)
     nodes, factors = _brightness(ratio, np.asarray(magnitude, np.float64)[used])
-    return CentroidVariance(scale, floor_px2, nodes, factors)
+    return CentroidVariance(scale, floor_px2, nodes, factors, sigma_px2)
 
 
 def _part(ratio: Floats) -> Floats:
@@ -151,14 +153,15 @@ def _part(ratio: Floats) -> Floats:
     return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
 
 
-def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
-    """Return scale and floor of ``squared = scale own + floor``, neither negative."""
+def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, float]:
+    """Return scale and floor of ``squared = scale own + floor``, not negative, and its sigma."""
     weighted = weight * own
     by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
     determinant = by_own * by_one - both**2
-    scale, floor_px2 = right_own / by_own, 0.0
+    scale, floor_px2, sigma_px2 = right_own / by_own, 0.0, math.inf
     if determinant > _ALIKE * by_own * by_one:
+        sigma_px2 = math.sqrt(by_own / determinant)
         scale = (by_one * right_own - both * right_one) / determinant
         floor_px2 = (by_own * right_one - both * right_own) / determinant
     if floor_px2 < 0:
@@ -166,7 +169,7 @@ def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
     if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
         scale = float(np.clip(scale, *_SCALE_LIMITS))
         floor_px2 = max((right_one - scale * both) / by_one, 0.0)
-    return scale, floor_px2
+    return scale, floor_px2, sigma_px2
 
 
 def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -455,8 +458,9 @@ def judge(
         raise NotObservable('no image has three stars that fit')
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
+        floor = (variance.floor_px2, variance.floor_sigma_px2)
         errors = shared_errors(
-            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave
+            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave, floor
         )
     return Judged(variance, errors, kept, attitudes)
 
