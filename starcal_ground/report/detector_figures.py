@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import functools
-from pathlib import Path
 from typing import Any
 
 import contourpy
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.comparison import Comparison, DifferenceMap
 from starcal_ground.report import svg, verdict
 from starcal_ros import records
 from starcal_ros.arrays import Floats
@@ -22,8 +20,6 @@ from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField
-from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.text import significant
 
 FLAT = 0.02  # relative range below which a map counts as flat
@@ -184,32 +180,21 @@ def arrows(
     The longest is as long as one of the columns; none is drawn if all are below ``least_px``.
     """
     panel = over_detector(camera)
-    if float(np.nanmax(np.hypot(*shift_px.T), initial=0.0)) > least_px:
-        _draw_arrows(panel, places, shift_px, [svg.SERIES[0]] * len(places), columns)
-    elif least_px > _ROUNDING_PX:
-        panel.note(f'less than {least_px:g} px everywhere')
-    else:
-        panel.note('no displacement')
-    return _drawn(panel)
-
-
-def _draw_arrows(
-    panel: svg.Panel, places: Floats, shift_px: Floats, colours: Sequence[str], columns: int
-) -> None:
-    """Draw displacements, the longest as long as a grid column is wide, and their scale."""
     longest_px = float(np.nanmax(np.hypot(*shift_px.T), initial=0.0))
-    if not longest_px > _ROUNDING_PX:
-        panel.note('no displacement')
-        return
+    if not longest_px > least_px:
+        is_any = least_px > _ROUNDING_PX
+        panel.note(f'less than {least_px:g} px everywhere' if is_any else 'no displacement')
+        return _drawn(panel)
     units_per_px = 0.95 * abs(panel.x.end - panel.x.start) / columns / longest_px
     starts = np.stack([panel.x(places[:, 0]), panel.y(places[:, 1])], axis=-1)
-    for start, shift, colour in zip(starts, shift_px, colours, strict=True):
-        panel.outside.append(svg.arrow(start, units_per_px * shift, colour))
+    for start, shift in zip(starts, shift_px, strict=True):
+        panel.outside.append(svg.arrow(start, units_per_px * shift, svg.SERIES[0]))
     key_px = svg.round_step(longest_px / 2.5)
     along = np.array([units_per_px * key_px, 0.0])
     start = panel.x.end - along[0]
     panel.outside.append(svg.arrow(np.array([start, 13.0]), along, svg.SERIES[1]))
     panel.outside.append(svg.words(start - 7, 17, f'scale: {svg.in_digits(key_px)} px', 'end'))
+    return _drawn(panel)
 
 
 def line_of_sight_sigma(
@@ -268,14 +253,8 @@ def budget_over_detector(
     )
 
 
-def detector_map(
-    values: Floats, camera: CameraModel, unit: str, shift_px: Floats | None = None
-) -> svg.Drawing:
-    """
-    Colours and labelled contours of a grid from corner to corner; the colours start at zero.
-
-    ``shift_px`` (rows, columns, 2) is drawn at the places of the grid, as arrows.
-    """
+def detector_map(values: Floats, camera: CameraModel, unit: str) -> svg.Drawing:
+    """Colours and labelled contours of a grid from corner to corner; the colours start at zero."""
     panel = over_detector(camera, right=_BAR)
     finite = values[np.isfinite(values)]
     low, top = (float(end) for end in (finite.min(initial=np.inf), finite.max(initial=0.0)))
@@ -286,11 +265,7 @@ def detector_map(
     panel.picture(_coloured(cv2.resize(255 * known / top, (240, 192))))
     rows, columns = values.shape
     u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
-    if shift_px is not None:
-        places = np.stack(np.meshgrid(u, v), axis=-1)
-        colours = np.where(values.ravel() > 0.6 * top, _DARK, _BRIGHT).tolist()
-        _draw_arrows(panel, places.reshape(-1, 2), shift_px.reshape(-1, 2), colours, columns)
-    elif top - low > FLAT * top:
+    if top - low > FLAT * top:
         levels = [x for x in svg.Scale(low, top, 0, 1).ticks(_LEVELS) if low < x < top]
         _draw_contours(panel, contourpy.contour_generator(u, v, values), levels, top, unit)
     else:
@@ -432,34 +407,3 @@ def _draw_graticule(panel: svg.Panel) -> None:
         panel.curve(svg.Curve(x, y, svg.GRID, width=1.0))
         if degrees:
             panel.text(x[36], y[36], f'{svg.in_digits(degrees)}°', svg.MUTED)
-
-
-def write_comparison(comparison: Comparison, path: Path) -> None:
-    """
-    Draw the difference of two calibrations over the detector, with and without common rotation.
-
-    Colours and arrows are in pixels; the title states the largest length, also in sigmas if known.
-
-    Raises OptionError for an ending that is not .svg. Raises ProductError when the file cannot be
-    written.
-    """
-    if path.suffix != '.svg':
-        raise OptionError(f'{path}: the name must end in .svg')
-    camera = comparison.a.geometry.camera
-    maps = [
-        _difference(camera, comparison.before, 'lines of sight, B minus A'),
-        _difference(camera, comparison.after, 'common rotation removed'),
-    ][not comparison.is_aligned :]
-    write_atomically(path, svg.sheet([maps]).document())
-
-
-def _difference(camera: CameraModel, difference: DifferenceMap, title: str) -> svg.Drawing:
-    """Length in pixels as colours from zero, direction as arrows with a scale."""
-    sigmas, _ = difference.worst_and_rms_sigmas
-    in_sigmas = f', {significant(sigmas, 2)} sigma' if np.isfinite(sigmas) else ''
-    drawn = detector_map(
-        difference.length_px[::2, ::2], camera, ' px', shift_px=difference.difference_px[::2, ::2]
-    )
-    return svg.sheet(
-        [[drawn]], f'{title}: at most {significant(difference.length_px.max(), 3)} px{in_sigmas}'
-    )
