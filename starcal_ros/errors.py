@@ -23,7 +23,6 @@ _OF_EXTRAS = (
 _OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
 # Of the plain install, by their names in PyPI: rosdep brings none of them.
 _NEEDED = {
-    'contourpy': 'contourpy',
     'jinja2': 'Jinja2',
     'markupsafe': 'Jinja2',
     'mcap': 'mcap rosbags',

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import functools
 from typing import Any
 
-import contourpy
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -104,24 +103,24 @@ def distortion_vectors(camera: CameraModel) -> svg.Chart:
     )
 
 
-def distortion_contours(camera: CameraModel) -> svg.Chart:
+def distortion_magnitude(camera: CameraModel) -> svg.Chart:
     """Length of the distortion in pixels (paper, Fig. 6 right)."""
-    shift = distortion_px(camera, pixel_grid(camera, 60, 48))
+    length_px = np.hypot(*distortion_px(camera, pixel_grid(camera, 60, 48)).T)
     return svg.Chart(
         'Distortion magnitude',
-        detector_map(np.hypot(*shift.T).reshape(48, 60), camera, ' px'),
-        'Contours of the length of the distortion vectors; longer ones are thicker.',
+        detector_map(length_px.reshape(48, 60), camera, ' px'),
+        f'Length of the distortion vectors: at most {significant(np.nanmax(length_px), 3)} px.',
     )
 
 
-def change_contours(before: records.CameraGeometry, after: records.CameraGeometry) -> svg.Chart:
+def change_from_prior(before: records.CameraGeometry, after: records.CameraGeometry) -> svg.Chart:
     """Change of the lines of sight in pixels, common rotation removed."""
     _, moved_px = movement(before, after, 60, 48)
     return svg.Chart(
         'Change relative to the prior',
         detector_map(moved_px.reshape(48, 60), after.camera, ' px'),
-        'Change of the line of sight of each pixel relative to the prior, in pixels, with the '
-        'common rotation removed.',
+        'Change of the line of sight of each pixel relative to the prior, with the common '
+        f'rotation removed: at most {significant(np.nanmax(moved_px), 3)} px.',
     )
 
 
@@ -254,7 +253,7 @@ def budget_over_detector(
 
 
 def detector_map(values: Floats, camera: CameraModel, unit: str) -> svg.Drawing:
-    """Colours and labelled contours of a grid from corner to corner; the colours start at zero."""
+    """Colours of a grid from corner to corner, with their bar; they start at zero."""
     panel = over_detector(camera, right=_BAR)
     finite = values[np.isfinite(values)]
     low, top = (float(end) for end in (finite.min(initial=np.inf), finite.max(initial=0.0)))
@@ -263,64 +262,10 @@ def detector_map(values: Floats, camera: CameraModel, unit: str) -> svg.Drawing:
         return _drawn(panel)
     known = np.where(np.isfinite(values), values, 0.0)
     panel.picture(_coloured(cv2.resize(255 * known / top, (240, 192))))
-    rows, columns = values.shape
-    u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
-    if top - low > FLAT * top:
-        levels = [x for x in svg.Scale(low, top, 0, 1).ticks(_LEVELS) if low < x < top]
-        _draw_contours(panel, contourpy.contour_generator(u, v, values), levels, top, unit)
-    else:
+    if top - low <= FLAT * top:
         percent = 100 * (top - low) / top
         panel.note(f'flat within {svg.in_digits(round(percent, 2))} %', _BRIGHT, _DARK)
     return _drawn(panel, _bar(panel, top, unit))
-
-
-def _draw_contours(
-    panel: svg.Panel,
-    generator: contourpy.ContourGenerator,
-    levels: Sequence[float],
-    top: float,
-    unit: str,
-) -> None:
-    """Contours, thicker for higher levels, each open at one label where there is room."""
-    lines = [
-        # contourpy's types allow other forms of a line as well.
-        [np.stack([panel.x(x), panel.y(y)], axis=-1)
-         for x, y in (np.asarray(line, np.float64).T for line in generator.lines(level))]
-        for level in levels
-    ]  # fmt: skip
-    taken: list[Floats] = []
-    for k, level in enumerate(levels):
-        text = f'{svg.in_digits(level)}{unit}'
-        half = np.array([0.3 * len(text) + 0.5, 0.8]) * svg.LETTER
-        others = [line for other in (*lines[:k], *lines[k + 1 :]) for line in other]
-        place = _label_place(panel, lines[k], [*others, *taken], half)
-        if place is not None:
-            taken.append(place[None])
-            x, y = place.tolist()
-            panel.outside.append(svg.words(x, y + 4, text, colour=_BRIGHT, edge=_DARK))
-        colour = _DARK if level > 0.6 * top else _BRIGHT
-        for line in lines[k]:
-            shown = line
-            if place is not None:
-                at_label = np.asarray((abs(line - place) < half).all(axis=1))
-                shown = np.where(at_label[:, None], np.nan, line)
-            panel.path(shown, colour, 1.0 + 1.4 * k / max(len(levels) - 1, 1))
-
-
-def _label_place(
-    panel: svg.Panel, lines: Sequence[Floats], others: Sequence[Floats], half: Floats
-) -> Floats | None:
-    """Label position on the lines of a level, farthest from other labels; None: no room."""
-    low, high = np.sort([[panel.x.start, panel.y.start], [panel.x.end, panel.y.end]], axis=0)
-    places = np.concatenate([*lines, np.empty((0, 2))])
-    places = places[((places > low + half) & (places < high - half)).all(axis=1)]
-    if not len(places):
-        return None
-    crossing = np.concatenate([*others, np.full((1, 2), -1e4)])
-    # In units of the label size: labels overlap if both components are below 1.
-    apart = (abs(places[:, None] - crossing) / half).max(axis=-1).min(axis=1)
-    best = int(np.argmax(apart))
-    return np.asarray(places[best]) if apart[best] > 1.0 else None
 
 
 def _bar(panel: svg.Panel, top: float, unit: str) -> svg.Panel:

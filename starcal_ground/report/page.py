@@ -406,11 +406,11 @@ def charts_of(
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, svg.Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
-        'contours': detector_figures.distortion_contours(camera),
+        'distortion': detector_figures.distortion_magnitude(camera),
         'sky': detector_figures.pointings(observations, geometry),
     }
     if prior is not None:
-        charts['change'] = detector_figures.change_contours(prior, geometry)
+        charts['change'] = detector_figures.change_from_prior(prior, geometry)
     if (field := camera.moving_field) is not None:
         charts['lens_field'] = detector_figures.field_vectors(field, camera)
     if maps is not None:

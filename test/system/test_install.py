@@ -23,7 +23,7 @@ MANIFEST = ROOT / 'MANIFEST.in'
 MADE = ('.*cache*', '.hypothesis', '*.egg-info', '__pycache__', '_build', 'generated')
 SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = ('dask', 'distributed', 'pyarrow', 'sphinx', 'spiceypy')
-OF_THE_REPORT = ('PIL', 'contourpy', 'jinja2')
+OF_THE_REPORT = ('PIL', 'jinja2')
 
 
 PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')

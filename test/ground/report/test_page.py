@@ -38,7 +38,7 @@ FIGURES = (
     'coverage',
     'cells',
     'vectors',
-    'contours',
+    'distortion',
     'change',
     'sky',
     'before',
