@@ -15,13 +15,11 @@ from dataclasses import astuple, dataclass
 import functools
 import json
 import logging
-import math
 from pathlib import Path
 
 import cv2
 import jinja2
 from markupsafe import Markup
-import numpy as np
 
 from starcal_ground import products
 from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
@@ -98,48 +96,7 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     return results
 
 
-_SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
-
-
-def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
-    """Data of the single-image view: positions in px, residuals in 0.001 px."""
-    if residuals is None or len(residuals.image_time_ns) == 0:
-        return None
-    camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
-    count = len(residuals.image_time_ns)
-    mean_stars = max(1.0, len(residuals.image) / count)
-    most = max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars)))
-    chosen = np.rint(np.linspace(0, count - 1, min(count, most))).astype(int).tolist()
-    rms = residuals.image_rms_px()
-    images = []
-    for k in chosen:
-        here = residuals.image == k
-        place = np.rint(residuals.measured_px[here]).astype(int)
-        residual = np.rint(1000 * np.clip(residuals.residual_px[here], -99, 99)).astype(int)
-        stars = np.c_[place, residual, residuals.used[here].astype(int)]
-        error = residuals.attitude_error_arcsec[k]
-        images.append(
-            {
-                'number': k + 1,
-                'time': utc_text(int(residuals.image_time_ns[k])),
-                'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
-                'misfit': bool(residuals.image_misfit[k]),
-                'tracker': [
-                    None if math.isnan(e) else round(float(e), 2)
-                    for e in error[: 3 * calibration.has_alignment]
-                ],
-                'stars': stars.ravel().tolist(),
-            }
-        )
-    return {
-        'width': camera.width,
-        'height': camera.height,
-        'count': count,
-        'images': images,
-        # The length of a typical residual is a fiftieth of the width.
-        'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
-    }
 
 
 def picture(thumbnail: Thumbnail) -> Markup:
@@ -316,7 +273,6 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
-        'slider': slider(calibration, residuals),
         'refused_images': refused_images(refused, observations, pictures),
         'refused_stars': refused_stars(observations),
         'model_rows': verdict.model_rows(calibration),

@@ -166,8 +166,7 @@ def test_of_the_camera_alone_nothing_is_said_of_an_alignment(folder: Path, tmp_p
                   'Alignment: small rotation', ' on <code></code>', ' on </td>'):  # fmt: skip
         assert words not in text, words
     assert 'No alignment: the attitudes come from the stars' in text
-    # Those of the header and of the table to sign.
-    assert text.count(times) == 2 and '"tracker": []' in text
+    assert text.count(times) == 2  # of the header and of the table to sign
 
 
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
@@ -260,15 +259,9 @@ window.wrong = [];
 addEventListener('error', (e) => wrong.push(e.message || 'a resource did not load'), true);
 document.addEventListener('securitypolicyviolation', (e) => wrong.push(e.blockedURI));
 </script>"""
-# Put last: moves the slider as a person would, and writes down what the page looks like.
+# Put last: writes down what the page looks like.
 _MEASURE = """<script>
 addEventListener('load', () => {
-  const drawn = () => document.querySelectorAll('#one-image svg line').length;
-  const output = document.querySelector('#one-image output');
-  const [which] = document.querySelectorAll('#one-image input');
-  const before = [output.textContent, drawn()];
-  which.value = 2;
-  which.dispatchEvent(new Event('input'));
   const figures = {};
   for (const figure of document.querySelectorAll('figure[id]')) {
     const svg = figure.querySelector('svg'), box = svg.getBoundingClientRect();
@@ -281,8 +274,7 @@ addEventListener('load', () => {
     ];
   }
   const result = {
-    wrong, figures, before, after: [output.textContent, drawn()],
-    inner: innerWidth, scroll: document.documentElement.scrollWidth,
+    wrong, figures, inner: innerWidth, scroll: document.documentElement.scrollWidth,
     paper: getComputedStyle(document.body).backgroundColor,
     unnamed: document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label])').length,
     titles: document.querySelectorAll('#figure-images title').length,
@@ -290,7 +282,6 @@ addEventListener('load', () => {
     rows: new Set(
       [...document.querySelectorAll('.charts.first figure')].map((f) => f.offsetTop)
     ).size,
-    axes: document.querySelectorAll('#one-image svg text').length,
     loaded: [...document.images].every((image) => image.complete && image.naturalWidth > 0),
   };
   parent.postMessage(JSON.stringify(result), '*');
@@ -325,7 +316,6 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
     return json.loads(found[1].replace('&quot;', '"')), console
 
 
-@pytest.mark.slow
 @pytest.mark.packaging
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
@@ -345,6 +335,3 @@ def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -
     assert measured['loaded'] and measured['unnamed'] == 0
     assert measured['titles'] == 10  # one for each image
     assert measured['contents'] == 'sticky' and measured['rows'] == (3 if width == 400 else 1)
-    assert measured['axes'] > 10  # numbers of both axes, their names and the scale
-    assert 'Image 1 of 10' in measured['before'][0] and measured['before'][1] > 100
-    assert 'Image 2 of 10' in measured['after'][0] and measured['after'][1] > 100
