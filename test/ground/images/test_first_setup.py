@@ -182,10 +182,6 @@ def test_a_requirement_is_answered_for_people_and_programs(
 STATED = f'--params {TINY}/params.yaml -o out'
 WRONG = [
     ('calibrate {bag}', ['-o/--output DIR: not given', 'e.g. -o out']),
-    ('calibrate params.yaml -o out',
-     ['parameters: give a bag or images, and --params params.yaml']),
-    ('calibrate camera.yaml -o out',
-     ['a camera file: give a bag or images, and --set camera_info_url=camera.yaml']),
     ('calibrate {bag} --params camera.yaml -o out',
      ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
     ('calibrate {bag} -o out --set camera_info_url=none.yaml',
