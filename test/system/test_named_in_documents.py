@@ -226,7 +226,7 @@ def test_a_name_that_does_not_exist_is_found(span: str) -> None:
 
 
 def test_a_docstring_names_no_function_of_docstrings_alone() -> None:
-    assert is_in_code('pixels_every') and not is_in_code('line_of_sight_jacobian')
+    assert is_in_code('line_of_sight_table') and not is_in_code('line_of_sight_jacobian')
 
 
 def test_lines_of_pytest_bench_and_studies_in_documents_exist() -> None:
