@@ -259,9 +259,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'tiles': tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
-        'requirements': verdict.met_requirements(calibration),
-        'precision': verdict.precision_sentences(calibration),
-        'next_step': verdict.next_step(calibration),
+        'sentences': verdict.in_sentences(calibration),
         'signed': _signed(calibration),
         'star_trackers': [verdict.alignment_summary(one) for one in calibration.star_trackers],
         'thermal': verdict.thermal_summary(calibration.temperature)

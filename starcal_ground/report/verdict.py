@@ -114,20 +114,16 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], o
     )
 
 
-def met_requirements(calibration: records.Calibration) -> list[str]:
-    """A sentence on each requirement that is met; one that is missed is among the reasons."""
-    met = [text for text in requirement_answers(calibration) if text.endswith(': met')]
-    return [f'{text[0].upper()}{text[1:]}.' for text in met]
-
-
 def in_sentences(calibration: records.Calibration) -> list[str]:
-    """Sentences of the first box: reasons, requirements, precision, next step."""
-    reasons = [f'{text[0].upper()}{text[1:]}.' for text in calibration.reasons]
-    checks = checks_sentence(calibration.gate) or 'The gate checks are not recorded.'
-    sentences = [*reasons, *met_requirements(calibration), checks]
+    """Sentences on the verdict: reasons, met requirements, checks, precision, next step."""
+    # A requirement that is missed is among the reasons.
+    met = [text for text in requirement_answers(calibration) if text.endswith(': met')]
+    sentences = [f'{text[0].upper()}{text[1:]}.' for text in (*calibration.reasons, *met)]
+    sentences.append(checks_sentence(calibration.gate) or 'The gate checks are not recorded.')
     sentences += precision_sentences(calibration)
-    step = next_step(calibration)
-    return [*sentences, f'Next: {step}'] if step else sentences
+    if step := next_step(calibration):
+        sentences.append(f'Next: {step}')
+    return [sentence.replace(' arcsec', '″') for sentence in sentences]
 
 
 def next_step(calibration: records.Calibration) -> str:

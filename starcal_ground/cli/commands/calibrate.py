@@ -232,4 +232,4 @@ def _print_verdict(calibration: Calibration) -> None:
     word = 'accepted' if calibration.accepted else 'refused'
     print_verdict(calibration.accepted, f'{word} by the gate')
     for sentence in verdict.in_sentences(calibration):
-        print_wrapped(f'  {sentence}'.replace(' arcsec', '″'), 4)
+        print_wrapped(f'  {sentence}', 4)
