@@ -11,7 +11,7 @@ from __future__ import annotations
 import base64
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 import functools
 import json
 from pathlib import Path
@@ -45,14 +45,6 @@ _LETTERS = {
     cv2.MARKER_CROSS: '+',
     cv2.MARKER_STAR: '*',
 }
-
-
-def typeset(rows: Sequence[verdict.Row]) -> list[verdict.Row]:
-    """Rows with minus signs in place of hyphens."""
-    return [
-        verdict.Row(*(text.replace('-', '\N{MINUS SIGN}') for text in astuple(row)))
-        for row in rows
-    ]
 
 
 def _none(count: int) -> str:
@@ -254,8 +246,8 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'time': utc_text(calibration.time_ns),
         'times_of': calibration.provenance.get(solve.TIMES, ''),
         'active_since': utc_text(calibration.active_since_ns),
-        'parameters': typeset(verdict.parameter_rows(calibration, prior)),
-        'alignment': typeset(verdict.alignment_rows(calibration, prior)),
+        'parameters': verdict.parameter_rows(calibration, prior),
+        'alignment': verdict.alignment_rows(calibration, prior),
         'tiles': tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
