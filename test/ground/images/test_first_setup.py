@@ -211,8 +211,7 @@ WRONG = [
     ('calibrate observations.mcap -o out', ['shows no camera: give the parameter file']),
     ('calibrate colour.mcap -o out', ['set image_channel, e.g. to green']),
     ('calibrate colour.mcap {stated}', ['set image_channel, e.g. to green']),
-    ('calibrate {bag} -o out --jsn', ['--jsn (did you mean --json?)']),
-    ('--json inspect {bag}', ['--json (write it after the command)']),
+    ('calibrate {bag} -o out --jsn', ['unrecognized arguments: --jsn', 'calibrate --help']),
     ('import --images night/0.png --attitude none.csv -o bag --camera none.yaml', ['none.yaml']),
 ]  # fmt: skip
 
