@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     failures = [*done.unreachable, *(f'{row.path}: {row.error}' for row in page.failures)]
     for failure in failures[:_FAILURES_SHOWN]:
         terminal.print_text(f'failed: {failure}')
-    terminal.print_text(f'{page.span}; look at {page.path}')
+    terminal.print_text(f'calibrations: {page.calibrations}; look at {page.path}')
     if done.silent == fleet.MOST_SILENT:
         arguments.complain(
             f'{args.root}: the last {done.silent} files cannot be read; run again when the store'

@@ -17,7 +17,7 @@ from starcal_ground.report import page, svg
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.text import printable, significant
+from starcal_ros.text import printable
 
 TREND_FILE = 'trend.html'
 _LISTED = 200
@@ -35,12 +35,10 @@ _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axi
 
 @dataclass(frozen=True)
 class Page:
-    """Path of a page, calibrations on it, their span as text; failures, rows of the first."""
+    """Path of a page, how many calibrations are on it, and the first failures."""
 
     path: Path
     calibrations: int
-    span: str
-    failed: int
     failures: tuple[Row, ...]
 
 
@@ -70,7 +68,6 @@ def write_page(
     drawn: list[_Judged] = []
     lines: list[tuple[trends.Overview, int, str, float, str]] = []
     failed = count = 0
-    times: list[int] = []
     for rows in cameras:
         bad = [row for row in rows if row.error]
         failures += bad[: _LISTED - len(failures)]
@@ -79,7 +76,6 @@ def write_page(
             camera, px = _judged(name, group, max_p_value)
             newest = utc_text(camera.rows[-1].time_ns)[:10]
             lines.append((camera.overview, len(camera.rows), newest, px, camera.verdict[1]))
-            times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
     lines.sort(key=lambda line: not line[0].needs_attention)
     text = page.page_template('trend.html').render(
@@ -94,11 +90,7 @@ def write_page(
     )
     path = folder / TREND_FILE
     write_atomically(path, text)
-    span_ns = max(times) - min(times) if times else 0
-    years = span_ns / NANOSECONDS_PER_SECOND / trends.SECONDS_PER_YEAR
-    long = f'{years:.2g} years' if years >= 1 else f'{significant(365.25 * years, 2)} days'
-    words = f'{count} calibration{"s" * (count != 1)}' + (f' over {long}' if span_ns else '')
-    return Page(path, count, words, failed, tuple(failures))
+    return Page(path, count, tuple(failures))
 
 
 def _order(camera: _Judged) -> tuple[bool, int, str]:
