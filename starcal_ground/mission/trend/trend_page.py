@@ -77,7 +77,7 @@ def write_page(
             newest = utc_text(camera.rows[-1].time_ns)[:10]
             lines.append((camera.overview, len(camera.rows), newest, px, camera.verdict[1]))
             drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
-    lines.sort(key=lambda line: not line[0].needs_attention)
+    lines.sort(key=lambda line: (not line[0].needs_attention, -np.nan_to_num(line[3])))
     text = page.page_template('trend.html').render(
         root=printable(root),
         lines=lines if len(lines) > 1 else (),
