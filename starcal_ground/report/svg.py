@@ -140,7 +140,7 @@ def round_step(least: float) -> float:
 
 def in_digits(value: float) -> str:
     """A number with a minus sign, not a hyphen, and without trailing digits."""
-    return f'{0.0 if abs(value) < 1e-12 else value:.6g}'.replace('-', '\N{MINUS SIGN}')
+    return f'{0.0 if abs(value) < 1e-12 else value:.9g}'.replace('-', '\N{MINUS SIGN}')
 
 
 def named(scale: Scale, most: int = 6) -> list[tuple[float, str]]:

@@ -27,7 +27,6 @@ _RECALIBRATE_PX = 0.1  # change from which a new calibration is worth its upload
 _HEIGHT = 270.0
 _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
 _TICKS = 6
-_DIGITS = 1e4  # a number with more of them than a label holds is drawn as a difference
 _STEPS_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240)
 _PER = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}
 _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axis
@@ -240,12 +239,6 @@ def _change_chart(rows: Sequence[Row], new: Sequence[trends.Change]) -> svg.Char
 def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
     """A number of calibrations over time with 1-sigma, its fit, and a line at each step."""
     at = _times([rows[index] for index in series.row])
-    low, high = (series.value - series.sigma).min(), (series.value + series.sigma).max()
-    # A sigma below the last digit of its value leaves no range.
-    room = max(high - low, 1e-12 * max(abs(low), abs(high)))
-    offset = _offset(float(low - room), float(high + room))
-    sign = '\N{MINUS SIGN}' if offset > 0 else '+'
-    name = f'{series.name} {sign} {svg.in_digits(abs(offset))}' if offset else series.name
     drawn = slice(None, None, _every(series.row))
     value, sigma = series.value[drawn], series.sigma[drawn]
     titles = [
@@ -253,12 +246,12 @@ def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
         for index, v, s in zip(series.row[drawn], value, sigma, strict=True)
     ]
     curves = [
-        svg.Curve(at[drawn], value - offset, svg.SERIES[0], 'calibration, 1-sigma', 'circle',
+        svg.Curve(at[drawn], value, svg.SERIES[0], 'calibration, 1-sigma', 'circle',
                   width=0, sigma=sigma, titles=titles)
     ]  # fmt: skip
     steps = sorted(term.after for term in series.trend.terms if term.kind == 'step')
     if series.trend.terms:
-        fit, gaps = series.trend.fit - offset, [step + 1 for step in steps]
+        fit, gaps = series.trend.fit, [step + 1 for step in steps]
         curves.append(
             svg.Curve(
                 np.insert(at, gaps, np.nan), np.insert(fit, gaps, np.nan), svg.SERIES[1], 'fit'
@@ -269,9 +262,8 @@ def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
         for step in steps:
             panel.upright(at[step : step + 2].mean(), svg.MUTED, 1.0, '5 3')
 
-    return _over_dates(
-        at, curves, f'{name} ({series.unit})' if series.unit else name, '', lines_at_steps
-    )
+    name = f'{series.name} ({series.unit})' if series.unit else series.name
+    return _over_dates(at, curves, name, '', lines_at_steps)
 
 
 def change_figure(new: Sequence[trends.Change], rows: Sequence[Row]) -> svg.Drawing:
@@ -313,15 +305,6 @@ def _times(rows: Sequence[Row]) -> Floats:
 def _date_ends(at: Floats) -> tuple[float, float]:
     margin = _MARGIN_NS / NANOSECONDS_PER_SECOND
     return float(at.min()) - margin, float(at.max()) + margin
-
-
-def _offset(low: float, high: float) -> float:
-    """Round number to draw values from ``low`` to ``high`` as differences to; 0: not needed."""
-    step = svg.round_step((high - low) / _TICKS)
-    if max(abs(low), abs(high)) < _DIGITS * step:
-        return 0.0
-    coarse = svg.round_step(50 * step)
-    return round(0.5 * (low + high) / coarse) * coarse
 
 
 def _date_ticks(low: float, high: float) -> list[tuple[float, str]]:
