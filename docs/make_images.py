@@ -26,7 +26,7 @@ from starcal_ground.cli import main as cli
 from starcal_ground.products import write_camera_info
 from starcal_ground.report.detector_figures import (
     cell_counts,
-    distortion_contours,
+    distortion_magnitude,
     distortion_vectors,
     star_cloud,
 )
@@ -143,7 +143,7 @@ def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     stars = np.concatenate([observed.measured_px for observed in ensemble.images])
     drawn = sheet(
         [
-            [distortion_vectors(camera).svg, distortion_contours(camera).svg],
+            [distortion_vectors(camera).svg, distortion_magnitude(camera).svg],
             [star_cloud(stars, camera), cell_counts(coverage(ensemble, camera), camera).svg],
         ],
         f'distortion; {calibration.stars_used} stars in {calibration.images_used} images',

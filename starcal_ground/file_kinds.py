@@ -1,10 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Kind of a file by its content: images, bags, and what people give in their place.
-
-The first bytes decide, not the name.  Each kind that is not read names the command that makes a
-readable file of it.
-"""
+"""Kind of a file by its content, not its name, and what helps where a bag was expected."""
 
 from __future__ import annotations
 
@@ -18,16 +13,13 @@ from starcal_ros.formats.image_files import is_fits
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
 
-_START_BYTES, _YAML_BYTES = 512, 2**18
-_YAML_FILES = (
-    (b'ros__parameters', 'parameters', '--params '),
-    (b'camera_matrix', 'a camera file', '--set camera_info_url='),
-)
+_START_BYTES = 64
+IMAGES_READ = 'FITS, TIFF, PNG, JPEG, camera raw'
 _OF_IMAGES = (
     ': starcal calibrate, inspect, diagnose and plan take images alone; starcal import makes a bag'
     ' of image files and attitudes'
 )
-_NOR_IMAGES = ', nor images (FITS, TIFF, PNG, JPEG, camera raw), which calibrate takes'
+_NOR_IMAGES = f', nor images ({IMAGES_READ}), which calibrate takes'
 # Topics of other types may be unknown to the converter, which then stops.
 _CONVERTED = frozenset(
     [
@@ -42,15 +34,10 @@ _CONVERTED = frozenset(
 
 @dataclass(frozen=True)
 class FileKind:
-    """
-    Kind of a file: its name with an article, and whether it is an image.
-
-    ``instead`` is empty if the kind is read, else the command that makes a readable file of FILE.
-    """
+    """Kind of a file: its name with an article, and whether it is an image."""
 
     name: str
     is_image: bool = False
-    instead: str = ''
 
 
 MCAP = FileKind('an MCAP bag')
@@ -61,10 +48,6 @@ JPEG, PNG, TIFF, FITS, RAW = (
     FileKind(name, is_image=True)
     for name in ('a JPEG', 'a PNG', 'a TIFF', 'a FITS file', 'a camera raw file')
 )
-_MAGICK = 'magick FILE FILE.png'
-_HEIF = FileKind('a HEIF image (HEIC)', True, 'heif-convert FILE FILE.jpg')
-_VIDEO = FileKind('a video', True, 'ffmpeg -i FILE FILE_%04d.png')
-_UNZIP = FileKind('a zip archive', instead='unzip FILE -d unzipped')
 # Offset and bytes; the first that match count.
 _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, b'\x89MCAP0\r\n', MCAP),
@@ -82,26 +65,6 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, b'II*\0', TIFF),
     (0, b'MM\0*', TIFF),
     (4, b'ftypcrx ', RAW),
-    (4, b'ftypavif', FileKind('an AVIF image', True, _MAGICK)),
-    (4, b'ftyphe', _HEIF),
-    (4, b'ftypmif1', _HEIF),
-    (4, b'ftypmsf1', _HEIF),
-    (4, b'ftyp', _VIDEO),
-    (8, b'AVI ', _VIDEO),
-    (0, b'\x1aE\xdf\xa3', _VIDEO),  # Matroska and WebM
-    (0, b'LUCAM-RECORDER', _VIDEO),  # SER
-    (0, b'XISF0100', FileKind('an XISF image', True, 'save it as FITS where it was made')),
-    (8, b'WEBP', FileKind('a WebP image', True, _MAGICK)),
-    (0, b'GIF8', FileKind('a GIF image', True, _MAGICK)),
-    (0, b'\0\0\0\x0cjP  ', FileKind('a JPEG 2000 image', True, _MAGICK)),
-    (0, b'8BPS', FileKind('a Photoshop image', True, _MAGICK)),
-    (0, b'(\xb5/\xfd', FileKind('a file compressed by zstd', instead='zstd -d FILE')),
-    (0, b'\x04"M\x18', FileKind('a file compressed by lz4', instead='lz4 -d FILE')),
-    (0, b'\xfd7zXZ\0', FileKind('a file compressed by xz', instead='xz -dk FILE')),
-    (0, b'BZh', FileKind('a file compressed by bzip2', instead='bunzip2 -k FILE')),
-    (0, b'\x1f\x8b', FileKind('a file compressed by gzip', instead='gunzip -k FILE')),
-    (0, b'PK\x03\x04', _UNZIP),
-    (257, b'ustar', FileKind('a tar archive', instead='tar xf FILE')),
 )
 # Camera raw has the first bytes of a TIFF in these, whose first image is a preview.
 _RAW_ENDINGS = ('.dng', '.nef', '.nrw', '.arw', '.sr2', '.pef', '.srw', '.3fr', '.iiq', '.raw')
@@ -123,47 +86,38 @@ def kind_of(path: Path) -> FileKind:
 
 def explained(error: StarcalError) -> str:
     """Text of an error; where a bag was expected, with what is there, and what helps."""
-    if isinstance(error, NotABag):
-        place = error.place
-        with contextlib.suppress(OSError, ValueError, IngestError):
-            instead = _instead_of_any(place) if place.is_dir() else _instead(place, kind_of(place))
-            if instead:
-                return f'{str(error).partition(" (did")[0]}{instead}'
-            return f'{error}{"" if " (did" in str(error) else _NOR_IMAGES}'
-    return str(error)
+    words = str(error)
+    if not isinstance(error, NotABag):
+        return words
+    with contextlib.suppress(OSError):
+        if instead := _instead(error.place):
+            return words.partition(' (did')[0] + instead
+    return words if ' (did' in words else words + _NOR_IMAGES
 
 
-def _instead_of_any(folder: Path) -> str:
-    """The first file of use in a folder without MCAP files."""
-    for file in sorted(folder.iterdir()):
+def _instead(place: Path) -> str:
+    """First file of use in a place without an MCAP bag and what helps, to append to an error."""
+    is_folder = place.is_dir()
+    for file in sorted(place.iterdir()) if is_folder else [place]:
         with contextlib.suppress(OSError, ValueError, IngestError):
             kind = SQLITE_BAG if file.suffix == '.db3' else kind_of(file)
-            if kind.is_image or kind.instead or kind in (SQLITE_BAG, ROS_1_BAG):
-                return f', but {file.name}:{_instead(file, kind).removeprefix(" but")}'
+            start = f', but {file.name}: {kind.name}' if is_folder else f' but {kind.name}'
+            if kind.is_image:
+                return start + _OF_IMAGES
+            if kind in (SQLITE_BAG, ROS_1_BAG):
+                return f'{start}: {_conversion(file, kind)} makes one'
     return ''
 
 
-def _instead(file: Path, kind: FileKind) -> str:
-    """End of an error message on a file that is no MCAP bag: what it is, and what helps."""
-    if kind.is_image:
-        return f' but {kind.name}{_OF_IMAGES}'
-    if kind.instead:
-        return f' but {kind.name}: {kind.instead.replace("FILE", shlex.quote(str(file)))}'
-    if kind is UNKNOWN and file.suffix in ('.yaml', '.yml'):
-        with regular_file(file) as opened:
-            content = opened.read(_YAML_BYTES)
-        for word, name, option in _YAML_FILES:
-            if word in content:
-                return f' but {name}: give a bag or images, and {option}{shlex.quote(str(file))}'
-    if kind not in (SQLITE_BAG, ROS_1_BAG):
-        return _NOR_IMAGES
+def _conversion(file: Path, kind: FileKind) -> str:
+    """Command that makes an MCAP bag of one of another kind."""
     # rosbags converts the folder with its metadata.yaml, not the file in it.
     source = file.parent if kind is SQLITE_BAG else file
     command = ['rosbags-convert', '--src', str(source)]
     command += ['--dst', str(source.with_name(f'{source.stem}_mcap')), '--dst-storage', 'mcap']
     if names := _convertible(source):
         command += ['--include-topic', *names]
-    return f' but {kind.name}: {shlex.join(command)} makes one'
+    return shlex.join(command)
 
 
 def _convertible(source: Path) -> list[str]:

@@ -16,14 +16,10 @@ from pathlib import Path
 import sys
 
 # Modules of the extras in setup.cfg.
-_OF_EXTRAS = (
-    'astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'rawpy', 'spiceypy',
-    'weasyprint',
-)  # fmt: skip
+_OF_EXTRAS = ('astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'rawpy', 'spiceypy')
 _OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
 # Of the plain install, by their names in PyPI: rosdep brings none of them.
 _NEEDED = {
-    'contourpy': 'contourpy',
     'jinja2': 'Jinja2',
     'markupsafe': 'Jinja2',
     'mcap': 'mcap rosbags',

@@ -22,7 +22,7 @@ from scipy.stats import norm
 
 from starcal_ground.report import svg
 from starcal_ground.report.detector_figures import (
-    distortion_contours,
+    distortion_magnitude,
     distortion_vectors,
     star_cloud,
 )
@@ -281,7 +281,7 @@ def page(found: PaperStudy, software: str) -> str:
 
 def svgs(found: PaperStudy) -> Mapping[str, str]:
     """Text of the SVG file of each figure, by name."""
-    distortion = [distortion_vectors(found.camera).svg, distortion_contours(found.camera).svg]
+    distortion = [distortion_vectors(found.camera).svg, distortion_magnitude(found.camera).svg]
     stars = f'{found.stars:,} star centroids in {found.images - found.refused} images'
     drawn = {
         'figure_5': sheet([[star_cloud(found.judged.measured_px, found.camera)]], stars),

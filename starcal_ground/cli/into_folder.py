@@ -205,7 +205,7 @@ class Drawings:
         """End the block quietly where drawing fails; writing belongs outside of it."""
         try:
             yield
-        # Other versions of contourpy, Jinja2 and OpenCV fail in their own ways.
+        # Other versions of Jinja2 and OpenCV fail in their own ways.
         except Exception as error:
             if arguments.is_interrupt(error):
                 raise

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Collection, Sequence
-import difflib
 import importlib
 import io
 import os
@@ -48,22 +47,17 @@ calibration; 2 bad input, named in one line; 130 interrupted."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports errors in one line and suggests the nearest known word."""
+    """Reports errors in one line; an option of a parameter file is named as ``--set`` takes it."""
 
     command = ''  # that the line names
+    has_set = False  # whether it takes ``--set``
 
     def error(self, message: str) -> NoReturn:
         """Exit with status 2."""
-        bad = re.search(r"(?:invalid choice: '?|unrecognized arguments: )([^' ]+)", message)
-        if bad:
-            word, words = bad[1].partition('=')[0], _words(self)
-            near = difflib.get_close_matches(word, words, 1)
-            if word in words:
-                message += ' (write it after the command)'
-            elif '--set' in words and (name := word.lstrip('-').replace('-', '_')) in _options():
-                message += f' (did you mean --set {name}=VALUE?)'
-            elif near:
-                message += f' (did you mean {near[0]}?)'
+        unknown = re.search(r'unrecognized arguments: --([^ =]+)', message)
+        name = unknown[1].replace('-', '_') if unknown else ''
+        if self.has_set and name in _options():
+            message += f' (did you mean --set {name}=VALUE?)'
         prog = ' '.join(filter(None, [self.prog, self.command]))
         self.exit(arguments.complain(f'{message} (see {prog} --help)'))
 
@@ -74,19 +68,6 @@ def _options() -> Collection[str]:
     from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 
     return names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
-
-
-def _words(parser: argparse.ArgumentParser) -> list[str]:
-    """Every command, option and choice of a parser and its commands."""
-    words: list[str] = []
-    for action in parser._actions:
-        words += action.option_strings
-        if isinstance(action, argparse._SubParsersAction):
-            for name, command in action.choices.items():
-                words += [name, *_words(command)]
-        else:
-            words += map(str, action.choices or ())
-    return words
 
 
 class _TopFormatter(argparse.RawDescriptionHelpFormatter):
@@ -130,6 +111,7 @@ def parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         module.add_arguments(command)
+        top.has_set = '--set' in command._option_string_actions
         command.set_defaults(run=module.run)
     return top
 
@@ -169,8 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        extra = 'pdf' if error.name == 'weasyprint' else 'mission'
-        return arguments.complain(missing_package(error, extra))
+        return arguments.complain(missing_package(error, 'mission'))
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:

@@ -27,7 +27,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ground.file_kinds import FileKind, FITS, JPEG, kind_of, RAW, UNKNOWN
+from starcal_ground.file_kinds import FileKind, FITS, IMAGES_READ, JPEG, kind_of, RAW, UNKNOWN
 from starcal_ground.images.time_systems import middle_of_exposure, number
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -41,8 +41,8 @@ from starcal_ros.formats.image_files import (
     read_image,
 )
 
-# Of files whose content says nothing, as of damaged ones.
-_ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts')
+# Of files whose content says nothing, as of damaged ones; HEIC, of telephones, is not read.
+_ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts', '.heic')
 _DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
 _EXIF, _GPS = 0x8769, 0x8825
@@ -163,9 +163,7 @@ def _readable(path: Path) -> FileKind:
     with errors_as(IngestError, path):
         kind = kind_of(path)
     if kind is UNKNOWN:
-        raise IngestError(f'{path}: no image, by its content')
-    if kind.instead:
-        raise IngestError(f'{path}: {kind.name}, which is not read: {kind.instead}')
+        raise IngestError(f'{path}: no image that is read, by its content: {IMAGES_READ}')
     if not kind.is_image:
         raise IngestError(f'{path}: {kind.name}: calibrate it by itself')
     return kind

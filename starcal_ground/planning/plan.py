@@ -357,13 +357,6 @@ class Plan:
     steps: tuple[Step, ...]
     enough: int | None
 
-    def in_a_sentence(self) -> str:
-        """Return the sigma now and at the end."""
-        last = self.steps[-1].sigma if self.steps else self.sigma
-        count = f'{len(self.steps)} image{"s" * (len(self.steps) != 1)}'
-        now, then = significant(self.sigma, 4), significant(last, 4)
-        return f'{self.name} {now} now, {then} expected after {count}'
-
 
 @one_blas_thread()
 def plan_pointings(ensemble: Ensemble, setup: Setup, request: Request) -> Plan:

@@ -5,16 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import functools
-from pathlib import Path
 from typing import Any
 
-import contourpy
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.comparison import Comparison, DifferenceMap
 from starcal_ground.report import svg, verdict
 from starcal_ros import records
 from starcal_ros.arrays import Floats
@@ -22,8 +19,6 @@ from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField
-from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.text import significant
 
 FLAT = 0.02  # relative range below which a map counts as flat
@@ -108,24 +103,24 @@ def distortion_vectors(camera: CameraModel) -> svg.Chart:
     )
 
 
-def distortion_contours(camera: CameraModel) -> svg.Chart:
+def distortion_magnitude(camera: CameraModel) -> svg.Chart:
     """Length of the distortion in pixels (paper, Fig. 6 right)."""
-    shift = distortion_px(camera, pixel_grid(camera, 60, 48))
+    length_px = np.hypot(*distortion_px(camera, pixel_grid(camera, 60, 48)).T)
     return svg.Chart(
         'Distortion magnitude',
-        detector_map(np.hypot(*shift.T).reshape(48, 60), camera, ' px'),
-        'Contours of the length of the distortion vectors; longer ones are thicker.',
+        detector_map(length_px.reshape(48, 60), camera, ' px'),
+        f'Length of the distortion vectors: at most {significant(np.nanmax(length_px), 3)} px.',
     )
 
 
-def change_contours(before: records.CameraGeometry, after: records.CameraGeometry) -> svg.Chart:
+def change_from_prior(before: records.CameraGeometry, after: records.CameraGeometry) -> svg.Chart:
     """Change of the lines of sight in pixels, common rotation removed."""
     _, moved_px = movement(before, after, 60, 48)
     return svg.Chart(
         'Change relative to the prior',
         detector_map(moved_px.reshape(48, 60), after.camera, ' px'),
-        'Change of the line of sight of each pixel relative to the prior, in pixels, with the '
-        'common rotation removed.',
+        'Change of the line of sight of each pixel relative to the prior, with the common '
+        f'rotation removed: at most {significant(np.nanmax(moved_px), 3)} px.',
     )
 
 
@@ -184,32 +179,21 @@ def arrows(
     The longest is as long as one of the columns; none is drawn if all are below ``least_px``.
     """
     panel = over_detector(camera)
-    if float(np.nanmax(np.hypot(*shift_px.T), initial=0.0)) > least_px:
-        _draw_arrows(panel, places, shift_px, [svg.SERIES[0]] * len(places), columns)
-    elif least_px > _ROUNDING_PX:
-        panel.note(f'less than {least_px:g} px everywhere')
-    else:
-        panel.note('no displacement')
-    return _drawn(panel)
-
-
-def _draw_arrows(
-    panel: svg.Panel, places: Floats, shift_px: Floats, colours: Sequence[str], columns: int
-) -> None:
-    """Draw displacements, the longest as long as a grid column is wide, and their scale."""
     longest_px = float(np.nanmax(np.hypot(*shift_px.T), initial=0.0))
-    if not longest_px > _ROUNDING_PX:
-        panel.note('no displacement')
-        return
+    if not longest_px > least_px:
+        is_any = least_px > _ROUNDING_PX
+        panel.note(f'less than {least_px:g} px everywhere' if is_any else 'no displacement')
+        return _drawn(panel)
     units_per_px = 0.95 * abs(panel.x.end - panel.x.start) / columns / longest_px
     starts = np.stack([panel.x(places[:, 0]), panel.y(places[:, 1])], axis=-1)
-    for start, shift, colour in zip(starts, shift_px, colours, strict=True):
-        panel.outside.append(svg.arrow(start, units_per_px * shift, colour))
+    for start, shift in zip(starts, shift_px, strict=True):
+        panel.outside.append(svg.arrow(start, units_per_px * shift, svg.SERIES[0]))
     key_px = svg.round_step(longest_px / 2.5)
     along = np.array([units_per_px * key_px, 0.0])
     start = panel.x.end - along[0]
     panel.outside.append(svg.arrow(np.array([start, 13.0]), along, svg.SERIES[1]))
     panel.outside.append(svg.words(start - 7, 17, f'scale: {svg.in_digits(key_px)} px', 'end'))
+    return _drawn(panel)
 
 
 def line_of_sight_sigma(
@@ -268,14 +252,8 @@ def budget_over_detector(
     )
 
 
-def detector_map(
-    values: Floats, camera: CameraModel, unit: str, shift_px: Floats | None = None
-) -> svg.Drawing:
-    """
-    Colours and labelled contours of a grid from corner to corner; the colours start at zero.
-
-    ``shift_px`` (rows, columns, 2) is drawn at the places of the grid, as arrows.
-    """
+def detector_map(values: Floats, camera: CameraModel, unit: str) -> svg.Drawing:
+    """Colours of a grid from corner to corner, with their bar; they start at zero."""
     panel = over_detector(camera, right=_BAR)
     finite = values[np.isfinite(values)]
     low, top = (float(end) for end in (finite.min(initial=np.inf), finite.max(initial=0.0)))
@@ -284,68 +262,10 @@ def detector_map(
         return _drawn(panel)
     known = np.where(np.isfinite(values), values, 0.0)
     panel.picture(_coloured(cv2.resize(255 * known / top, (240, 192))))
-    rows, columns = values.shape
-    u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
-    if shift_px is not None:
-        places = np.stack(np.meshgrid(u, v), axis=-1)
-        colours = np.where(values.ravel() > 0.6 * top, _DARK, _BRIGHT).tolist()
-        _draw_arrows(panel, places.reshape(-1, 2), shift_px.reshape(-1, 2), colours, columns)
-    elif top - low > FLAT * top:
-        levels = [x for x in svg.Scale(low, top, 0, 1).ticks(_LEVELS) if low < x < top]
-        _draw_contours(panel, contourpy.contour_generator(u, v, values), levels, top, unit)
-    else:
+    if top - low <= FLAT * top:
         percent = 100 * (top - low) / top
         panel.note(f'flat within {svg.in_digits(round(percent, 2))} %', _BRIGHT, _DARK)
     return _drawn(panel, _bar(panel, top, unit))
-
-
-def _draw_contours(
-    panel: svg.Panel,
-    generator: contourpy.ContourGenerator,
-    levels: Sequence[float],
-    top: float,
-    unit: str,
-) -> None:
-    """Contours, thicker for higher levels, each open at one label where there is room."""
-    lines = [
-        # contourpy's types allow other forms of a line as well.
-        [np.stack([panel.x(x), panel.y(y)], axis=-1)
-         for x, y in (np.asarray(line, np.float64).T for line in generator.lines(level))]
-        for level in levels
-    ]  # fmt: skip
-    taken: list[Floats] = []
-    for k, level in enumerate(levels):
-        text = f'{svg.in_digits(level)}{unit}'
-        half = np.array([0.3 * len(text) + 0.5, 0.8]) * svg.LETTER
-        others = [line for other in (*lines[:k], *lines[k + 1 :]) for line in other]
-        place = _label_place(panel, lines[k], [*others, *taken], half)
-        if place is not None:
-            taken.append(place[None])
-            x, y = place.tolist()
-            panel.outside.append(svg.words(x, y + 4, text, colour=_BRIGHT, edge=_DARK))
-        colour = _DARK if level > 0.6 * top else _BRIGHT
-        for line in lines[k]:
-            shown = line
-            if place is not None:
-                at_label = np.asarray((abs(line - place) < half).all(axis=1))
-                shown = np.where(at_label[:, None], np.nan, line)
-            panel.path(shown, colour, 1.0 + 1.4 * k / max(len(levels) - 1, 1))
-
-
-def _label_place(
-    panel: svg.Panel, lines: Sequence[Floats], others: Sequence[Floats], half: Floats
-) -> Floats | None:
-    """Label position on the lines of a level, farthest from other labels; None: no room."""
-    low, high = np.sort([[panel.x.start, panel.y.start], [panel.x.end, panel.y.end]], axis=0)
-    places = np.concatenate([*lines, np.empty((0, 2))])
-    places = places[((places > low + half) & (places < high - half)).all(axis=1)]
-    if not len(places):
-        return None
-    crossing = np.concatenate([*others, np.full((1, 2), -1e4)])
-    # In units of the label size: labels overlap if both components are below 1.
-    apart = (abs(places[:, None] - crossing) / half).max(axis=-1).min(axis=1)
-    best = int(np.argmax(apart))
-    return np.asarray(places[best]) if apart[best] > 1.0 else None
 
 
 def _bar(panel: svg.Panel, top: float, unit: str) -> svg.Panel:
@@ -432,34 +352,3 @@ def _draw_graticule(panel: svg.Panel) -> None:
         panel.curve(svg.Curve(x, y, svg.GRID, width=1.0))
         if degrees:
             panel.text(x[36], y[36], f'{svg.in_digits(degrees)}°', svg.MUTED)
-
-
-def write_comparison(comparison: Comparison, path: Path) -> None:
-    """
-    Draw the difference of two calibrations over the detector, with and without common rotation.
-
-    Colours and arrows are in pixels; the title states the largest length, also in sigmas if known.
-
-    Raises OptionError for an ending that is not .svg. Raises ProductError when the file cannot be
-    written.
-    """
-    if path.suffix != '.svg':
-        raise OptionError(f'{path}: the name must end in .svg')
-    camera = comparison.a.geometry.camera
-    maps = [
-        _difference(camera, comparison.before, 'lines of sight, B minus A'),
-        _difference(camera, comparison.after, 'common rotation removed'),
-    ][not comparison.is_aligned :]
-    write_atomically(path, svg.sheet([maps]).document())
-
-
-def _difference(camera: CameraModel, difference: DifferenceMap, title: str) -> svg.Drawing:
-    """Length in pixels as colours from zero, direction as arrows with a scale."""
-    sigmas, _ = difference.worst_and_rms_sigmas
-    in_sigmas = f', {significant(sigmas, 2)} sigma' if np.isfinite(sigmas) else ''
-    drawn = detector_map(
-        difference.length_px[::2, ::2], camera, ' px', shift_px=difference.difference_px[::2, ::2]
-    )
-    return svg.sheet(
-        [[drawn]], f'{title}: at most {significant(difference.length_px.max(), 3)} px{in_sigmas}'
-    )

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Report of a calibration as one self-contained HTML file, ``report.html``, and pages to sign.
+Report of a calibration as one self-contained HTML file, ``report.html``, to read and to print.
 
 The report is made from the product files of a folder; a section whose file is missing states so.
 The page needs no network: styles, script and pictures are embedded.
@@ -11,17 +11,14 @@ from __future__ import annotations
 import base64
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 import functools
 import json
-import logging
-import math
 from pathlib import Path
 
 import cv2
 import jinja2
 from markupsafe import Markup
-import numpy as np
 
 from starcal_ground import products
 from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
@@ -48,14 +45,6 @@ _LETTERS = {
     cv2.MARKER_CROSS: '+',
     cv2.MARKER_STAR: '*',
 }
-
-
-def typeset(rows: Sequence[verdict.Row]) -> list[verdict.Row]:
-    """Rows with minus signs in place of hyphens."""
-    return [
-        verdict.Row(*(text.replace('-', '\N{MINUS SIGN}') for text in astuple(row)))
-        for row in rows
-    ]
 
 
 def _none(count: int) -> str:
@@ -98,48 +87,7 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     return results
 
 
-_SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
-
-
-def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
-    """Data of the single-image view: positions in px, residuals in 0.001 px."""
-    if residuals is None or len(residuals.image_time_ns) == 0:
-        return None
-    camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
-    count = len(residuals.image_time_ns)
-    mean_stars = max(1.0, len(residuals.image) / count)
-    most = max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars)))
-    chosen = np.rint(np.linspace(0, count - 1, min(count, most))).astype(int).tolist()
-    rms = residuals.image_rms_px()
-    images = []
-    for k in chosen:
-        here = residuals.image == k
-        place = np.rint(residuals.measured_px[here]).astype(int)
-        residual = np.rint(1000 * np.clip(residuals.residual_px[here], -99, 99)).astype(int)
-        stars = np.c_[place, residual, residuals.used[here].astype(int)]
-        error = residuals.attitude_error_arcsec[k]
-        images.append(
-            {
-                'number': k + 1,
-                'time': utc_text(int(residuals.image_time_ns[k])),
-                'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
-                'misfit': bool(residuals.image_misfit[k]),
-                'tracker': [
-                    None if math.isnan(e) else round(float(e), 2)
-                    for e in error[: 3 * calibration.has_alignment]
-                ],
-                'stars': stars.ravel().tolist(),
-            }
-        )
-    return {
-        'width': camera.width,
-        'height': camera.height,
-        'count': count,
-        'images': images,
-        # The length of a typical residual is a fiftieth of the width.
-        'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
-    }
 
 
 def picture(thumbnail: Thumbnail) -> Markup:
@@ -212,9 +160,6 @@ def used_images(
         for t in thumbnails
         if not t.is_expected and t.time_ns in stars
     ]
-
-
-PDF_FILE = 'report.pdf'
 
 
 @dataclass(frozen=True)
@@ -301,14 +246,12 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'time': utc_text(calibration.time_ns),
         'times_of': calibration.provenance.get(solve.TIMES, ''),
         'active_since': utc_text(calibration.active_since_ns),
-        'parameters': typeset(verdict.parameter_rows(calibration, prior)),
-        'alignment': typeset(verdict.alignment_rows(calibration, prior)),
+        'parameters': verdict.parameter_rows(calibration, prior),
+        'alignment': verdict.alignment_rows(calibration, prior),
         'tiles': tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
-        'requirements': verdict.met_requirements(calibration),
-        'precision': verdict.precision_sentences(calibration),
-        'next_step': verdict.next_step(calibration),
+        'sentences': verdict.in_sentences(calibration),
         'signed': _signed(calibration),
         'star_trackers': [verdict.alignment_summary(one) for one in calibration.star_trackers],
         'thermal': verdict.thermal_summary(calibration.temperature)
@@ -316,7 +259,6 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
-        'slider': slider(calibration, residuals),
         'refused_images': refused_images(refused, observations, pictures),
         'refused_stars': refused_stars(observations),
         'model_rows': verdict.model_rows(calibration),
@@ -406,11 +348,11 @@ def charts_of(
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, svg.Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
-        'contours': detector_figures.distortion_contours(camera),
+        'distortion': detector_figures.distortion_magnitude(camera),
         'sky': detector_figures.pointings(observations, geometry),
     }
     if prior is not None:
-        charts['change'] = detector_figures.change_contours(prior, geometry)
+        charts['change'] = detector_figures.change_from_prior(prior, geometry)
     if (field := camera.moving_field) is not None:
         charts['lens_field'] = detector_figures.field_vectors(field, camera)
     if maps is not None:
@@ -457,25 +399,3 @@ def page_template(name: str) -> jinja2.Template:
     )
     environment.filters['significant'] = significant
     return environment.get_template(name)
-
-
-def write_pdf(page: Path) -> Path:
-    """
-    Write the pages of a report beside it and return their path.
-
-    Raises ProductError when the libraries that draw the letters are missing, or the file cannot be
-    written.
-    """
-    try:
-        import weasyprint
-    except OSError as error:
-        raise ProductError(
-            f'{PDF_FILE}: the library Pango is missing ({str(error).splitlines()[0]}): '
-            'apt install libpango-1.0-0 libpangoft2-1.0-0'
-        ) from error
-    logging.getLogger('weasyprint').setLevel(logging.ERROR)  # styles of the screen alone
-    within_page = weasyprint.URLFetcher(allowed_protocols=('data',))
-    document = weasyprint.HTML(string=svg.light(page.read_text()), url_fetcher=within_page)
-    path = page.with_name(PDF_FILE)
-    product_files.write_atomically(path, document.write_pdf())
-    return path

@@ -57,7 +57,7 @@ class Drawing:
     def document(self) -> str:
         """Text of an SVG file: the light palette on paper."""
         size = f'width="{self.width:g}" height="{self.height:g}"'
-        return light(
+        return _light(
             f'<svg xmlns="http://www.w3.org/2000/svg" {size}'
             f' viewBox="0 0 {self.width:g} {self.height:g}"'
             f' font-family="DejaVu Sans, Arial, sans-serif" font-size="{LETTER:g}" fill="{INK}">'
@@ -140,7 +140,7 @@ def round_step(least: float) -> float:
 
 def in_digits(value: float) -> str:
     """A number with a minus sign, not a hyphen, and without trailing digits."""
-    return f'{0.0 if abs(value) < 1e-12 else value:.6g}'.replace('-', '\N{MINUS SIGN}')
+    return f'{0.0 if abs(value) < 1e-12 else value:.9g}'.replace('-', '\N{MINUS SIGN}')
 
 
 def named(scale: Scale, most: int = 6) -> list[tuple[float, str]]:
@@ -148,7 +148,7 @@ def named(scale: Scale, most: int = 6) -> list[tuple[float, str]]:
     return [(value, in_digits(value)) for value in scale.ticks(most)]
 
 
-def light(text: str) -> str:
+def _light(text: str) -> str:
     """Text with the colours of the light palette in place of the variables of its drawings."""
     css = (Path(__file__).parent / 'templates' / 'report.css').read_text()
     match = _PALETTE.search(css)

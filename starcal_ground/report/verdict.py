@@ -13,7 +13,7 @@ from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import of_held, REMEDIES, requirement_answers, REQUIREMENTS
-from starcal_ros.camera import CameraModel, INTRINSIC_NAMES, projection
+from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.text import p_value_text, significant, to_sigma
 
@@ -114,20 +114,16 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[records.SigmaPart], o
     )
 
 
-def met_requirements(calibration: records.Calibration) -> list[str]:
-    """A sentence on each requirement that is met; one that is missed is among the reasons."""
-    met = [text for text in requirement_answers(calibration) if text.endswith(': met')]
-    return [f'{text[0].upper()}{text[1:]}.' for text in met]
-
-
 def in_sentences(calibration: records.Calibration) -> list[str]:
-    """Sentences of the first box: reasons, requirements, precision, next step."""
-    reasons = [f'{text[0].upper()}{text[1:]}.' for text in calibration.reasons]
-    checks = checks_sentence(calibration.gate) or 'The gate checks are not recorded.'
-    sentences = [*reasons, *met_requirements(calibration), checks]
+    """Sentences on the verdict: reasons, met requirements, checks, precision, next step."""
+    # A requirement that is missed is among the reasons.
+    met = [text for text in requirement_answers(calibration) if text.endswith(': met')]
+    sentences = [f'{text[0].upper()}{text[1:]}.' for text in (*calibration.reasons, *met)]
+    sentences.append(checks_sentence(calibration.gate) or 'The gate checks are not recorded.')
     sentences += precision_sentences(calibration)
-    step = next_step(calibration)
-    return [*sentences, f'Next: {step}'] if step else sentences
+    if step := next_step(calibration):
+        sentences.append(f'Next: {step}')
+    return [sentence.replace(' arcsec', '″') for sentence in sentences]
 
 
 def next_step(calibration: records.Calibration) -> str:
@@ -249,8 +245,6 @@ class Row:
     change_sigmas: str
     value: str = ''
     prior: str = ''
-    moves_px: str = ''
-    sigma_px: str = ''
 
 
 def parameter_rows(
@@ -261,7 +255,6 @@ def parameter_rows(
     if prior and prior.camera.model != camera.model:
         prior = None  # parameters of another lens model are no start of these
     changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
-    moves, sigma_moves = _movement_px(camera, changes), _movement_px(camera, sigma)
     rows = []
     for k, name in enumerate(camera.parameter_names):
         known, changed = sigma[k] > 0, prior and changes[k]
@@ -275,8 +268,6 @@ def parameter_rows(
                 prior=significant(prior.camera.parameters[k], 8) if prior else '',
                 change=to_sigma(changes[k], sigma[k], '+') if changed else '',
                 change_sigmas=f'{changes[k] / sigma[k]:+.1f}' if changed and known else '',
-                moves_px=f'{moves[k]:.3f}' if changed else '',
-                sigma_px=f'{sigma_moves[k]:.3f}' if known else '',
             )
         )
     return rows
@@ -355,16 +346,3 @@ def sigma_text(name: str, sigma: float) -> str:
         per = '/degC' if name.endswith('_temperature') else ''
         return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
     return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
-
-
-def _movement_px(camera: CameraModel, changes: Floats) -> Floats:
-    """
-    Largest shift (k,) of a star image over the detector, px.
-
-    For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
-    """
-    pixels = projection.pixel_grid(camera, 25, 20)
-    directions = projection.line_of_sight(camera, pixels)
-    rows = camera.parameters - np.diag(changes)
-    moved = [projection.project_parameters(camera.model, row, directions) for row in rows]
-    return np.asarray(np.linalg.norm(pixels - np.stack(moved), axis=-1).max(axis=1))

@@ -74,14 +74,6 @@ def sigma_arcsec(covariance_rad2: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(variance_rad2, 0.0)) / ARCSECOND_RAD)
 
 
-def pixels_every(camera: CameraModel, step_px: float) -> Floats:
-    """Pixels (n, 2) at every step along both axes from pixel (0, 0), u fastest."""
-    u, v = np.meshgrid(
-        np.arange(0.0, camera.width - 0.5, step_px), np.arange(0.0, camera.height - 0.5, step_px)
-    )
-    return np.stack([u.ravel(), v.ravel()], axis=-1)
-
-
 @dataclass(frozen=True)
 class Derivatives:
     """

@@ -7,7 +7,6 @@ import dataclasses
 import json
 from pathlib import Path
 import shutil
-from xml.etree import ElementTree
 
 from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
@@ -18,11 +17,10 @@ from scipy.spatial.transform import Rotation
 from starcal_ground import comparison
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
-from starcal_ground.report.detector_figures import write_comparison
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_calibration, write_calibration
 from starcal_ros.records import Calibration, TemperatureTerms
 
@@ -199,11 +197,10 @@ def test_cameras_alone_are_compared_without_an_alignment(
     for name, calibration in (('a', alone), ('b', turned)):
         write_calibration(calibration, tmp_path / f'{name}.json')
     command = ['compare', str(tmp_path / 'a.json'), str(tmp_path / 'b.json')]
-    assert main.main([*command, '-o', str(tmp_path / 'map.svg')]) == 0
+    assert main.main(command) == 0
     said = capsys.readouterr().out
     assert 'alignment x' not in said and 'as calibrated' not in said
     assert 'the cameras alone are compared' in said and '10 degrees of freedom' in said
-    assert 'B minus A' not in (tmp_path / 'map.svg').read_text()
     assert main.main([*command, '--json']) == 0
     content = json.loads(capsys.readouterr().out)
     assert content['alignment_arcsec'] is content['lines_of_sight'] is None
@@ -218,19 +215,6 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
         compare(tiny, dataclasses.replace(tiny, geometry=bigger))
 
 
-def test_the_figure_is_drawn(tiny: Calibration, tmp_path: Path) -> None:
-    write_comparison(compare(tiny, tiny), tmp_path / 'same.svg')  # and no warning
-    found = compare(tiny, moved(tiny, fx=1.0))
-    write_comparison(found, tmp_path / 'a.svg')
-    drawn = (tmp_path / 'a.svg').read_text()
-    ElementTree.fromstring(drawn)
-    assert f'at most {found.before.length_px.max():.3g} px' in drawn and '>no ' not in drawn
-    with pytest.raises(OptionError, match=r'a\.png: the name must end in \.svg'):
-        write_comparison(found, tmp_path / 'a.png')
-    with pytest.raises(ProductError, match='cannot be written'):
-        write_comparison(found, tmp_path / 'none' / 'a.svg')
-
-
 def test_the_tool_compares(
     tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -238,12 +222,11 @@ def test_the_tool_compares(
         (tmp_path / name).mkdir()
         write_calibration(calibration, tmp_path / name / 'calibration.json')
     folders = [str(tmp_path / 'a'), str(tmp_path / 'b' / 'calibration.json')]
-    assert main.main(['compare', *folders, '-o', str(tmp_path / 'c.svg')]) == 0
+    assert main.main(['compare', *folders]) == 0
     out = capsys.readouterr().out
     (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
     sigma = np.sqrt(2) * tiny.sigma[0]
     assert row[3:] == ['+0.500', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
-    assert (tmp_path / 'c.svg').is_file() and str(tmp_path / 'c.svg') in out
     assert main.main(['compare', *folders, '--json']) == 0
     made = json.loads(capsys.readouterr().out)
     assert made['difference'][0] == pytest.approx(0.5)

@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[2]
 ONBOARD = ('numpy', 'scipy', 'opencv-python-headless', 'pyerfa', 'PyYAML', 'mcap', 'rosbags')
 ON_THE_GROUND = (
     *('starcal_ground', 'studies', 'bench', 'tools'),
-    *('PIL', 'argcomplete', 'astropy', 'contourpy', 'dask', 'jinja2', 'rich', 'threadpoolctl'),
+    *('PIL', 'argcomplete', 'astropy', 'dask', 'jinja2', 'rich', 'threadpoolctl'),
 )
 # Python runs it before anything else.
 SITECUSTOMIZE = """

@@ -14,7 +14,7 @@ MISSING = [
     ('jinja2', '', 'pip install Jinja2'),
     ('markupsafe', '', 'pip install Jinja2'),
     ('PIL', '', 'pip install Pillow'),
-    ('contourpy', 'mission', 'pip install contourpy'),
+    ('PIL', 'mission', 'pip install Pillow'),
     ('rosbags', '', 'pip install mcap rosbags'),
     ('s3fs', 'mission', 'pip install s3fs'),
     ('dask', 'mission', "pip install '.[mission]' in the folder of starcal"),

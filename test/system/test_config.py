@@ -45,8 +45,8 @@ ROSDEP = {
     'rich': 'python3-rich',
     'scipy': 'python3-scipy',
 }
-# Those of the report by their names in Ubuntu; python3-matplotlib depends on python3-contourpy.
-UBUNTU = {'contourpy': 'python3-matplotlib', 'Jinja2': 'python3-jinja2', 'pillow': 'python3-pil'}
+# Those of the report by their names in Ubuntu.
+UBUNTU = {'Jinja2': 'python3-jinja2', 'pillow': 'python3-pil'}
 
 
 def test_a_vehicle_gets_every_package() -> None:

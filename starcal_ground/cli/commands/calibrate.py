@@ -67,8 +67,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     arguments.add_json(shown)
     what = 'print nothing but errors; the exit status is the verdict'
     shown.add_argument('--quiet', action='store_true', help=what)
-    what = 'print solver, alignment and what each cause of the sigma was estimated from too'
-    shown.add_argument('--verbose', action='store_true', help=what)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -92,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         arguments.print_json(answer_of(made, first, source, args.output))
     elif not args.quiet:
-        print_calibration(made.calibration, made.setup.prior, args.verbose)
+        print_calibration(made.calibration, made.setup.prior)
         _print_assumed(first.assumed(source.topics, made.ensemble), made.calibration)
         print_text(f'\nproducts written to {args.output}' + (f'\n{report}' if report else ''))
         _print_verdict(made.calibration)
@@ -158,9 +156,7 @@ def answer_of(
     }
 
 
-def print_calibration(
-    calibration: Calibration, prior: CameraGeometry, verbose: bool = False
-) -> None:
+def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and causes of the sigma; changes are relative to the prior."""
     from starcal_ground.report import verdict
 
@@ -190,21 +186,13 @@ def print_calibration(
     lines += [
         ('tracker', verdict.alignment_summary(tracker)) for tracker in calibration.star_trackers
     ]
-    if verbose and calibration.has_alignment:
-        quaternion = calibration.geometry.star_tracker_from_camera_xyzw
-        lines.append(('alignment', f'xyzw {", ".join(f"{part:.9f}" for part in quaternion)}'))
-    if verbose:
-        lines += [
-            ('method', calibration.method),
-            ('solver', f'{calibration.iterations} iterations, {calibration.termination}'),
-        ]
     print_text()
     for name, text in lines:
         print_wrapped(f'{name:<12}{text}', 12)
-    _print_budget(calibration, verbose)
+    _print_budget(calibration)
 
 
-def _print_budget(calibration: Calibration, verbose: bool) -> None:
+def _print_budget(calibration: Calibration) -> None:
     from starcal_ground.report.verdict import parts_that_matter
 
     columns = 3 if calibration.has_alignment else 2
@@ -219,8 +207,6 @@ def _print_budget(calibration: Calibration, verbose: bool) -> None:
     ]
     print_text()
     print_table(header[:columns], [row[:columns] for row in rows])
-    for part in parts[1:] if verbose else ():
-        print_wrapped(f'  {part.cause}: {part.assumption}', 4)
 
 
 def _print_assumed(assumed: Sequence[tuple[str, str]], calibration: Calibration) -> None:
@@ -246,4 +232,4 @@ def _print_verdict(calibration: Calibration) -> None:
     word = 'accepted' if calibration.accepted else 'refused'
     print_verdict(calibration.accepted, f'{word} by the gate')
     for sentence in verdict.in_sentences(calibration):
-        print_wrapped(f'  {sentence}'.replace(' arcsec', '″'), 4)
+        print_wrapped(f'  {sentence}', 4)

@@ -10,8 +10,6 @@ rotation. Differences are B minus A; their sigmas assume that A and B are indepe
   starcal compare out again
   # with the truth of a simulated bag
   starcal compare out sim/truth.json
-  # with a map of the difference over the detector
-  starcal compare out again -o difference.svg
   # machine-readable output
   starcal compare out/calibration.json again/calibration.json --json
 """
@@ -34,7 +32,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     for name, which in (('a', 'reference calibration'), ('b', 'calibration to compare')):
         what = f'{which}: calibration.json or its folder'
         command.add_argument(name, type=arguments.path, metavar=name.upper(), help=what)
-    arguments.add_output(command, 'FILE', 'plot of the difference over the detector (.svg)')
     arguments.add_json(command)
 
 
@@ -43,20 +40,13 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.simulation.simulated_bag import read_truth
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
-    files = [calibration_file(path) for path in (args.a, args.b)]
-    a = read_calibration(files[0])
-    result = comparison.compare(a, read_truth(files[1], a) or read_calibration(files[1]))
-    if args.output:
-        from starcal_ground.report.detector_figures import write_comparison
-
-        arguments.check_file(args.output, files)
-        write_comparison(result, args.output)
+    of_a, of_b = (calibration_file(path) for path in (args.a, args.b))
+    a = read_calibration(of_a)
+    result = comparison.compare(a, read_truth(of_b, a) or read_calibration(of_b))
     if args.json:
         arguments.print_json(comparison.content(result))
     else:
         print_comparison(result)
-        if args.output:
-            terminal.print_text(f'figure written to {args.output}')
     return arguments.EXIT_ACCEPTED
 
 

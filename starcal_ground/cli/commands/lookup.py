@@ -8,20 +8,19 @@ sight include the residual field if there is one.
 
   # 25 x 25 pixels over the detector
   starcal lookup out -o lines_of_sight.csv
-  # every 16 pixels, for interpolation
-  starcal lookup out -o lines_of_sight.npz --step 16
+  # a fine table, for interpolation
+  starcal lookup out -o lines_of_sight.npz --points 200
 """
 
 from __future__ import annotations
 
 import argparse
 import io
-import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros import errors, text
+from starcal_ros.errors import ProductError
 
 if TYPE_CHECKING:
     from starcal_ros.assessment.lookup import LineOfSightTable
@@ -33,16 +32,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     what = 'calibration.json or its folder'
     command.add_argument('calibration', type=arguments.path, metavar='DIR', help=what)
     arguments.add_output(command, 'FILE', 'table to write: .csv or .npz', required=True)
-    grid = command.add_mutually_exclusive_group()
     points = arguments.number(int, 2, _MOST_POINTS)
     what = 'N x N pixels from corner to corner of the detector, u fastest (default: 25)'
-    grid.add_argument('--points', type=points, default=25, metavar='N', help=what)
-    what = 'a pixel every PX pixels along both axes, in place of --points'
-    grid.add_argument('--step', type=float, metavar='PX', help=what)
+    command.add_argument('--points', type=points, default=25, metavar='N', help=what)
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
+    from starcal_ros.assessment.lookup import line_of_sight_table
     from starcal_ros.camera import pixel_grid
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
@@ -51,14 +47,6 @@ def run(args: argparse.Namespace) -> int:
     calibration = read_calibration(file)
     camera = calibration.geometry.camera
     pixels = pixel_grid(camera, args.points, args.points)
-    if args.step is not None:
-        least = math.sqrt(camera.width * camera.height) / _MOST_POINTS
-        if not least <= args.step <= max(camera.width, camera.height):
-            raise errors.OptionError(
-                f'--step: {args.step:g} px: give {text.significant(least, 3)} px (a table of'
-                f' {_MOST_POINTS}^2 pixels) or more, up to the size of the detector'
-            )
-        pixels = pixels_every(camera, args.step)
     table = line_of_sight_table(camera, calibration.map_covariance, pixels)
     write_lookup_table(table, args.output)
     terminal.print_text(f'{len(pixels)} lines of sight written to {args.output}')
@@ -87,4 +75,4 @@ def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
         np.savez_compressed(memory, **columns)
         write_atomically(path, memory.getvalue())
     else:
-        raise errors.ProductError(f'{path}: ends neither in .csv nor in .npz')
+        raise ProductError(f'{path}: ends neither in .csv nor in .npz')

@@ -88,7 +88,6 @@ def run(args: argparse.Namespace) -> int:
     if plan.enough is not None:
         after = f'after image {plan.enough} another' if plan.enough else 'another image'
         terminal.print_text(f'{after} lowers the sigma by less than 1 %')
-    terminal.print_text(plan.in_a_sentence())
     if len(plan.steps) < args.images:
         terminal.print_text(f'no other pointing can be reached after image {len(plan.steps)}')
     if args.output:

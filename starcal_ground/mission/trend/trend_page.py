@@ -17,7 +17,7 @@ from starcal_ground.report import page, svg
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.text import printable, significant
+from starcal_ros.text import printable
 
 TREND_FILE = 'trend.html'
 _LISTED = 200
@@ -27,7 +27,6 @@ _RECALIBRATE_PX = 0.1  # change from which a new calibration is worth its upload
 _HEIGHT = 270.0
 _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
 _TICKS = 6
-_DIGITS = 1e4  # a number with more of them than a label holds is drawn as a difference
 _STEPS_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240)
 _PER = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}
 _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axis
@@ -35,12 +34,10 @@ _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axi
 
 @dataclass(frozen=True)
 class Page:
-    """Path of a page, calibrations on it, their span as text; failures, rows of the first."""
+    """Path of a page, how many calibrations are on it, and the first failures."""
 
     path: Path
     calibrations: int
-    span: str
-    failed: int
     failures: tuple[Row, ...]
 
 
@@ -70,7 +67,6 @@ def write_page(
     drawn: list[_Judged] = []
     lines: list[tuple[trends.Overview, int, str, float, str]] = []
     failed = count = 0
-    times: list[int] = []
     for rows in cameras:
         bad = [row for row in rows if row.error]
         failures += bad[: _LISTED - len(failures)]
@@ -79,9 +75,8 @@ def write_page(
             camera, px = _judged(name, group, max_p_value)
             newest = utc_text(camera.rows[-1].time_ns)[:10]
             lines.append((camera.overview, len(camera.rows), newest, px, camera.verdict[1]))
-            times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
-    lines.sort(key=lambda line: not line[0].needs_attention)
+    lines.sort(key=lambda line: (not line[0].needs_attention, -np.nan_to_num(line[3])))
     text = page.page_template('trend.html').render(
         root=printable(root),
         lines=lines if len(lines) > 1 else (),
@@ -94,11 +89,7 @@ def write_page(
     )
     path = folder / TREND_FILE
     write_atomically(path, text)
-    span_ns = max(times) - min(times) if times else 0
-    years = span_ns / NANOSECONDS_PER_SECOND / trends.SECONDS_PER_YEAR
-    long = f'{years:.2g} years' if years >= 1 else f'{significant(365.25 * years, 2)} days'
-    words = f'{count} calibration{"s" * (count != 1)}' + (f' over {long}' if span_ns else '')
-    return Page(path, count, words, failed, tuple(failures))
+    return Page(path, count, tuple(failures))
 
 
 def _order(camera: _Judged) -> tuple[bool, int, str]:
@@ -248,12 +239,6 @@ def _change_chart(rows: Sequence[Row], new: Sequence[trends.Change]) -> svg.Char
 def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
     """A number of calibrations over time with 1-sigma, its fit, and a line at each step."""
     at = _times([rows[index] for index in series.row])
-    low, high = (series.value - series.sigma).min(), (series.value + series.sigma).max()
-    # A sigma below the last digit of its value leaves no range.
-    room = max(high - low, 1e-12 * max(abs(low), abs(high)))
-    offset = _offset(float(low - room), float(high + room))
-    sign = '\N{MINUS SIGN}' if offset > 0 else '+'
-    name = f'{series.name} {sign} {svg.in_digits(abs(offset))}' if offset else series.name
     drawn = slice(None, None, _every(series.row))
     value, sigma = series.value[drawn], series.sigma[drawn]
     titles = [
@@ -261,12 +246,12 @@ def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
         for index, v, s in zip(series.row[drawn], value, sigma, strict=True)
     ]
     curves = [
-        svg.Curve(at[drawn], value - offset, svg.SERIES[0], 'calibration, 1-sigma', 'circle',
+        svg.Curve(at[drawn], value, svg.SERIES[0], 'calibration, 1-sigma', 'circle',
                   width=0, sigma=sigma, titles=titles)
     ]  # fmt: skip
     steps = sorted(term.after for term in series.trend.terms if term.kind == 'step')
     if series.trend.terms:
-        fit, gaps = series.trend.fit - offset, [step + 1 for step in steps]
+        fit, gaps = series.trend.fit, [step + 1 for step in steps]
         curves.append(
             svg.Curve(
                 np.insert(at, gaps, np.nan), np.insert(fit, gaps, np.nan), svg.SERIES[1], 'fit'
@@ -277,9 +262,8 @@ def series_figure(series: trends.Series, rows: Sequence[Row]) -> svg.Drawing:
         for step in steps:
             panel.upright(at[step : step + 2].mean(), svg.MUTED, 1.0, '5 3')
 
-    return _over_dates(
-        at, curves, f'{name} ({series.unit})' if series.unit else name, '', lines_at_steps
-    )
+    name = f'{series.name} ({series.unit})' if series.unit else series.name
+    return _over_dates(at, curves, name, '', lines_at_steps)
 
 
 def change_figure(new: Sequence[trends.Change], rows: Sequence[Row]) -> svg.Drawing:
@@ -321,15 +305,6 @@ def _times(rows: Sequence[Row]) -> Floats:
 def _date_ends(at: Floats) -> tuple[float, float]:
     margin = _MARGIN_NS / NANOSECONDS_PER_SECOND
     return float(at.min()) - margin, float(at.max()) + margin
-
-
-def _offset(low: float, high: float) -> float:
-    """Round number to draw values from ``low`` to ``high`` as differences to; 0: not needed."""
-    step = svg.round_step((high - low) / _TICKS)
-    if max(abs(low), abs(high)) < _DIGITS * step:
-        return 0.0
-    coarse = svg.round_step(50 * step)
-    return round(0.5 * (low + high) / coarse) * coarse
 
 
 def _date_ticks(low: float, high: float) -> list[tuple[float, str]]:

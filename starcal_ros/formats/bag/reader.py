@@ -524,15 +524,15 @@ def _files_of_folder(folder: Path) -> list[Path]:
     here = sorted(folder.iterdir(), key=_natural)
     listed = [folder / name for name in names if (folder / name).is_file()]
     files = listed or [path for path in here if path.suffix in _SUFFIXES and path.is_file()]
+    missing = [name for name in names if not (folder / name).is_file()]
+    packed = bool(missing) and (folder / f'{missing[0]}.zstd').is_file()
+    if missing and (listed or packed):
+        remedy = f': zstd -d {shlex.quote(str(folder))}/*.zstd' if packed else ''
+        raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing{remedy}')
     if not files:
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside else ''
         raise NotABag(f'{folder}: no .mcap files in the folder{near}', folder)
-    missing = [name for name in names if not (folder / name).is_file()]
-    if missing and listed:
-        packed = (folder / f'{missing[0]}.zstd').is_file()
-        remedy = f': zstd -d {shlex.quote(str(folder))}/*.zstd' if packed else ''
-        raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing{remedy}')
     return files
 
 

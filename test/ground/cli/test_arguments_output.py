@@ -90,10 +90,6 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda here: _link(here / 'out/thumbnails', _picture(here / 'pictures')),
         f'calibrate HERE/bag {_OWN} HERE/out',
     ),
-    'figure over a product': (
-        lambda here: (here / 'figure.svg').hardlink_to(here / 'out/calibration.json'),
-        'compare HERE/out HERE/out -o HERE/figure.svg',
-    ),
     'table over residuals': (
         lambda here: (here / 'out/residuals.npz').write_text('residuals'),
         'lookup HERE/out -o HERE/out/residuals.npz',
@@ -158,13 +154,14 @@ WRITING: dict[str, str] = {
     'report HERE/o': 'report.html',
     'calibrate HERE/bag -o HERE/o': 'params.yaml camera.yaml',
     f'plan {_OF_BAG} --images 1 -o HERE/o/plan.csv': 'plan.csv',
-    'compare HERE/out HERE/out -o HERE/o/a.svg': 'a.svg',
     'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
     'lookup HERE/out -o HERE/o/a.npz --points 2': 'a.npz',
     'simulate --scenario tiny -o HERE/o': (
         'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
     ),
-    'simulate --scenario tiny -o HERE/o/b.mcap': ('b.mcap b.json b_params.yaml b_camera.yaml'),
+    'simulate --scenario tiny -o HERE/o/b.mcap': (
+        'b.mcap b_truth.json b_params.yaml b_camera.yaml'
+    ),
     (
         'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
         ' HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o'

@@ -65,7 +65,6 @@ class Command:
 COMMANDS = (
     Command('calibrate', ('in/bag', '--params', 'in/bag/params.yaml', '-o', 'out')),
     Command('report', ('out',)),
-    Command('compare', ('in/a', 'in/b', '-o', 'out/difference.svg')),
     Command('lookup', ('in/a', '-o', 'out/table.csv', '--points', '100')),
     Command('simulate', ('--scenario', 'tiny', '--seed=3', '--images=3', '-o', 'out/sim')),
     Command('export', ('in/a', '--to', 'spice', '--spacecraft-id=-999', '-o', 'out')),
@@ -97,7 +96,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     files = ['--params', str(folder / 'in/bag/params.yaml'), '-o', str(folder / 'in/a')]
     with contextlib.redirect_stdout(io.StringIO()):  # in this process: it loads the modules
         assert main.main(['calibrate', str(folder / 'in/bag'), *files]) == 0
-    shutil.copytree(folder / 'in/a', folder / 'in/b')
     return folder
 
 
@@ -161,7 +159,7 @@ def _old_outputs(command: Command, folder: Path) -> Path:
     else:
         shutil.copytree(folder / 'in/a/thumbnails', old / 'thumbnails')
         names = [p.name for p in (folder / 'in/a').iterdir() if p.is_file()]
-        for name in (*names, 'difference.svg', 'table.csv'):
+        for name in (*names, 'table.csv'):
             write_atomically(old / name, f'an older {name}')
     return old
 

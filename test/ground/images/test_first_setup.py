@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 import re
@@ -15,6 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
+from starcal_ground.simulation.scenario import scenario
+from starcal_ground.simulation.simulated_bag import write_bag
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
@@ -109,9 +112,9 @@ def test_streaks_that_are_measured_are_identified_too(
 ) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '5']
-    assert main(line) == 0
-    capsys.readouterr()
+    tiny = scenario('tiny')
+    turn_rad = (0.0, 8.0 / tiny.truth.camera.parameters[0], 0.0)  # a streak of 8 px
+    write_bag(dataclasses.replace(tiny, image_count=5, turn_rad=turn_rad), bag)
     assert main(['calibrate', str(bag), *LENS, '-o', str(out), '--no-report']) == 0
     assert '5 of 5 images identified by their stars' in capsys.readouterr().err
     calibration = read_calibration(out / 'calibration.json')
@@ -182,10 +185,6 @@ def test_a_requirement_is_answered_for_people_and_programs(
 STATED = f'--params {TINY}/params.yaml -o out'
 WRONG = [
     ('calibrate {bag}', ['-o/--output DIR: not given', 'e.g. -o out']),
-    ('calibrate params.yaml -o out',
-     ['parameters: give a bag or images, and --params params.yaml']),
-    ('calibrate camera.yaml -o out',
-     ['a camera file: give a bag or images, and --set camera_info_url=camera.yaml']),
     ('calibrate {bag} --params camera.yaml -o out',
      ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
     ('calibrate {bag} -o out --set camera_info_url=none.yaml',
@@ -215,8 +214,7 @@ WRONG = [
     ('calibrate observations.mcap -o out', ['shows no camera: give the parameter file']),
     ('calibrate colour.mcap -o out', ['set image_channel, e.g. to green']),
     ('calibrate colour.mcap {stated}', ['set image_channel, e.g. to green']),
-    ('calibrate {bag} -o out --jsn', ['--jsn (did you mean --json?)']),
-    ('--json inspect {bag}', ['--json (write it after the command)']),
+    ('calibrate {bag} -o out --jsn', ['unrecognized arguments: --jsn', 'calibrate --help']),
     ('import --images night/0.png --attitude none.csv -o bag --camera none.yaml', ['none.yaml']),
 ]  # fmt: skip
 

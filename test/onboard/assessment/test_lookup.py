@@ -15,7 +15,6 @@ from starcal_ros.assessment.lookup import (
     Derivatives,
     line_of_sight_table,
     LineOfSightTable,
-    pixels_every,
 )
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.camera.detector_field import DetectorField, term_count
@@ -140,7 +139,7 @@ def test_structure_finer_than_the_field_moves_each_pixel_by_itself(camera: Camer
 
 def test_many_pixels_are_as_each_alone() -> None:
     covariance = covariance_of(LENS)
-    pixels = pixels_every(LENS, 8.0)
+    pixels = pixel_grid(LENS, 80, 64)
     assert len(pixels) > 4096  # more than are taken at a time
     table = line_of_sight_table(LENS, MapCovariance(covariance), pixels)
     for k in (0, 4095, 4096, len(pixels) - 1):
@@ -170,23 +169,9 @@ def test_a_pixel_without_a_line_of_sight_is_nan() -> None:
         np.testing.assert_array_equal(np.isnan(values), folds)
 
 
-@pytest.mark.parametrize(
-    ('step_px', 'of_u', 'of_v'),
-    [
-        (100.0, [0, 100, 200, 300, 400, 500, 600], [0, 100, 200, 300, 400, 500]),
-        (213.0, [0, 213, 426, 639], [0, 213, 426]),  # the last column is one of the detector
-        (255.5, [0, 255.5, 511], [0, 255.5, 511]),
-        (640.0, [0], [0]),
-    ],
-)
-def test_pixels_at_every_step(step_px: float, of_u: list[float], of_v: list[float]) -> None:
-    expected = [(u, v) for v in of_v for u in of_u]  # u fastest
-    np.testing.assert_array_equal(pixels_every(LENS, step_px), expected)
-
-
 @pytest.fixture
 def table() -> LineOfSightTable:
-    return line_of_sight_table(LENS, MapCovariance(covariance_of(LENS)), pixels_every(LENS, 200.0))
+    return line_of_sight_table(LENS, MapCovariance(covariance_of(LENS)), pixel_grid(LENS, 4, 3))
 
 
 def columns_of(table: LineOfSightTable) -> dict[str, np.ndarray]:

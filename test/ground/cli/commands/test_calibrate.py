@@ -164,9 +164,3 @@ def test_a_part_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
     main.main([*command, '--to', '+20'])  # six may be too few for the gate
     assert 'images      6 used' in capsys.readouterr().out
-
-
-def test_a_wrong_option_names_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main.main(['calibrate', str(TINY), '--params', 'x', '-o', 'y', '--frm', '3'])
-    assert 'did you mean --from?' in capsys.readouterr().err

@@ -30,8 +30,6 @@ def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[
     ]  # fmt: skip
     assert lines[first + 3].split() == ['velocity', '0.6″', '0.75″']
     assert 'stamps' not in '\n'.join(lines) and max(map(len, lines)) <= 80
-    print_calibration(record, record.geometry, verbose=True)
-    assert 'no barycentric one given: 20 km/s per axis assumed' in capsys.readouterr().out
 
 
 def test_a_calibration_without_a_budget_has_no_table_of_it(
