@@ -247,7 +247,8 @@ class Archive:
 
     def set_aside_image(self, time_ns: int, why: str) -> None:
         """Rename the file of an image that cannot be used, so that it is not read again."""
-        self._set_aside(self._images.pop(time_ns).path, why)
+        if kept := self._images.pop(time_ns, None):
+            self._set_aside(kept.path, why)
 
     def read_history(self) -> tuple[Activation, ...]:
         """
@@ -314,21 +315,24 @@ class Archive:
         self.last_event = max(self.last_event, record.event)
 
     def _keep_image(self, image: StarObservations) -> None:
-        stale = self._images.get(image.time_ns)
-        if stale is not None:
-            stale.path.unlink(missing_ok=True)
-            del self._images[image.time_ns]
         number = self._next_image
         _check_number(number)
+        stale = self._images.get(image.time_ns)
         try:
             data = observations_bag(TOPIC, image, self._frame_id)
+            is_same = stale and data == observations_bag(TOPIC, stale.image, self._frame_id)
         except BagError as error:
             raise ArchiveError(f'state_dir: image of {image.time_ns} ns: {error}') from error
+        if stale is not None and is_same:  # read anew since it was written
+            self._images[image.time_ns] = _Kept(image, stale.path)
+            return
         mark = self._seal.mark(number, data)
         name = f'{number:08d}_{mark}.mcap' if mark else f'{number:08d}.mcap'
         path = self._write(_ENSEMBLE, name, data)
         self._images[image.time_ns] = _Kept(image, path)
         self._next_image += 1
+        if stale is not None:
+            stale.path.unlink(missing_ok=True)
 
     def _write(self, folder: str, name: str, content: str | bytes) -> Path:
         path = self.folder / folder / name
