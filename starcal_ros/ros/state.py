@@ -156,7 +156,9 @@ class CalibratorState:
         if observations.refusal:
             with self._records:
                 self._details[records.counted_refusal(observations.refusal)] = observations.detail
-        self.save()
+        # A camera that sees the Sun for hours must not wear out the disk: counts come with images.
+        if grown.images is not ensemble.images:
+            self.save()
 
     def reset(self) -> Answer:
         """Empty the ensemble."""
