@@ -49,6 +49,7 @@ ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
 _EMPTIED = 'ensemble.emptied'
+_OWN = (_ENSEMBLE, _CALIBRATIONS, _EMPTIED)  # folders in which files are removed
 _REFUSED = 'refused.json'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
@@ -205,8 +206,9 @@ class Archive:
         self._events: dict[int, Path] = {}  # those on disk
         self._lock = _locked(folder)
         self._finish_emptying()
+        parts = [part for own in _OWN for part in (folder / own).glob(f'.*{PART}')]
         # That of `ros2 bag reindex` would hide the images after it from readers of the folder.
-        for stale in (*folder.glob(f'*/.*{PART}'), folder / _ENSEMBLE / 'metadata.yaml'):
+        for stale in (*parts, folder / _ENSEMBLE / 'metadata.yaml'):
             with contextlib.suppress(OSError):
                 stale.unlink()
 
@@ -513,6 +515,10 @@ def _locked(folder: Path) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        for path in (folder / own for own in _OWN):
+            # What a link leads to is of somebody else.
+            if os.path.lexists(path) and not stat.S_ISDIR(path.lstat().st_mode):
+                raise NotADirectoryError(0, 'not a folder; move it to another place', f'{path}')
     except OSError as error:
         if number >= 0:
             os.close(number)
@@ -520,5 +526,5 @@ def _locked(folder: Path) -> int:
             raise ArchiveError(f'state_dir: {folder} is in use by another calibrator') from error
         if isinstance(error, PermissionError):
             raise _unreadable(folder, error) from error
-        raise ArchiveError(f'state_dir: {folder}: {error.strerror}') from error
+        raise ArchiveError(f'state_dir: {error.filename or folder}: {error.strerror}') from error
     return number
