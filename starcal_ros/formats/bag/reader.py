@@ -65,6 +65,7 @@ _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its o
 _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
+_ZSTD = b'\x28\xb5\x2f\xfd'  # RFC 8878, 3.1.1: CDR begins with a zero
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
@@ -127,6 +128,8 @@ def read_messages(
             if channel is None or schema is None or channel.message_encoding != 'cdr':
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
             if wanted is None or channel.topic in wanted:
+                if record.data[:4] == _ZSTD:
+                    raise _compressed_singly(file.absolute().parent)
                 definition = schema.data.decode(errors='replace')
                 view = memoryview(record.data)
                 yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
@@ -514,11 +517,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
     names, compression = _metadata(folder / 'metadata.yaml')
     if compression.lower() == 'message':
-        raise BagError(
-            f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
-            f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
-            f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
-        )
+        raise _compressed_singly(folder)
     if compression:  # zstd leaves the files without the ending
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
@@ -534,6 +533,14 @@ def _files_of_folder(folder: Path) -> list[Path]:
         remedy = f': zstd -d {shlex.quote(str(folder))}/*.zstd' if packed else ''
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing{remedy}')
     return files
+
+
+def _compressed_singly(folder: Path) -> BagError:
+    return BagError(
+        f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
+        f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
+        f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
+    )
 
 
 def _metadata(path: Path) -> tuple[list[str], str]:
