@@ -331,11 +331,9 @@ def _check_size(
 ) -> None:
     """Raise OptionError where every record of a folder is of another camera."""
     prior = setup.prior.camera
-    sizes = {(image.width, image.height) for image in ensemble.images}
-    sizes |= {
-        (record.calibration.geometry.camera.width, record.calibration.geometry.camera.height)
-        for record in history
-    }
+    cameras = [record.calibration.geometry.camera for record in history]
+    sizes = {(one.width, one.height) for one in cameras}
+    sizes |= {(one.width, one.height) for one in ensemble.images}
     if sizes and (prior.width, prior.height) not in sizes:
         width, height = min(sizes)
         raise errors.OptionError(
@@ -348,16 +346,13 @@ def _of_size(
     ensemble: records.Ensemble, archive: Archive | None, setup: Setup
 ) -> records.Ensemble:
     """The ensemble with images of another size counted as refused, their files set aside."""
-    size = (setup.prior.camera.width, setup.prior.camera.height)
-    kept = tuple(image for image in ensemble.images if (image.width, image.height) == size)
-    refused = dict(ensemble.refused)
+    prior, checked = setup.prior.camera, records.Ensemble((), ensemble.refused)
     for image in ensemble.images:
-        if (image.width, image.height) != size:
-            refused['wrong_size'] = refused.get('wrong_size', 0) + 1
-            if archive is not None:
-                why = f'an image of {image.width} x {image.height}'
-                archive.set_aside_image(image.time_ns, why)
-    return records.Ensemble(kept, refused)
+        is_other = (image.width, image.height) != (prior.width, prior.height)
+        if is_other and archive is not None:
+            archive.set_aside_image(image.time_ns, f'an image of {image.width} x {image.height}')
+        checked = checked.add(replace(image, refusal='wrong_size') if is_other else image)
+    return checked
 
 
 def _archive_of(setup: Setup, options: CalibratorOptions) -> Archive:
