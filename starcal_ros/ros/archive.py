@@ -49,6 +49,7 @@ ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
 _EMPTIED = 'ensemble.emptied'
+_OWN = (_ENSEMBLE, _CALIBRATIONS, _EMPTIED)  # folders in which files are removed
 _REFUSED = 'refused.json'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
@@ -205,8 +206,9 @@ class Archive:
         self._events: dict[int, Path] = {}  # those on disk
         self._lock = _locked(folder)
         self._finish_emptying()
+        parts = [part for own in _OWN for part in (folder / own).glob(f'.*{PART}')]
         # That of `ros2 bag reindex` would hide the images after it from readers of the folder.
-        for stale in (*folder.glob(f'*/.*{PART}'), folder / _ENSEMBLE / 'metadata.yaml'):
+        for stale in (*parts, folder / _ENSEMBLE / 'metadata.yaml'):
             with contextlib.suppress(OSError):
                 stale.unlink()
 
@@ -247,7 +249,8 @@ class Archive:
 
     def set_aside_image(self, time_ns: int, why: str) -> None:
         """Rename the file of an image that cannot be used, so that it is not read again."""
-        self._set_aside(self._images.pop(time_ns).path, why)
+        if kept := self._images.pop(time_ns, None):
+            self._set_aside(kept.path, why)
 
     def read_history(self) -> tuple[Activation, ...]:
         """
@@ -314,21 +317,24 @@ class Archive:
         self.last_event = max(self.last_event, record.event)
 
     def _keep_image(self, image: StarObservations) -> None:
-        stale = self._images.get(image.time_ns)
-        if stale is not None:
-            stale.path.unlink(missing_ok=True)
-            del self._images[image.time_ns]
         number = self._next_image
         _check_number(number)
+        stale = self._images.get(image.time_ns)
         try:
             data = observations_bag(TOPIC, image, self._frame_id)
+            is_same = stale and data == observations_bag(TOPIC, stale.image, self._frame_id)
         except BagError as error:
             raise ArchiveError(f'state_dir: image of {image.time_ns} ns: {error}') from error
+        if stale is not None and is_same:  # read anew since it was written
+            self._images[image.time_ns] = _Kept(image, stale.path)
+            return
         mark = self._seal.mark(number, data)
         name = f'{number:08d}_{mark}.mcap' if mark else f'{number:08d}.mcap'
         path = self._write(_ENSEMBLE, name, data)
         self._images[image.time_ns] = _Kept(image, path)
         self._next_image += 1
+        if stale is not None:
+            stale.path.unlink(missing_ok=True)
 
     def _write(self, folder: str, name: str, content: str | bytes) -> Path:
         path = self.folder / folder / name
@@ -509,6 +515,10 @@ def _locked(folder: Path) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        for path in (folder / own for own in _OWN):
+            # What a link leads to is of somebody else.
+            if os.path.lexists(path) and not stat.S_ISDIR(path.lstat().st_mode):
+                raise NotADirectoryError(0, 'not a folder; move it to another place', f'{path}')
     except OSError as error:
         if number >= 0:
             os.close(number)
@@ -516,5 +526,5 @@ def _locked(folder: Path) -> int:
             raise ArchiveError(f'state_dir: {folder} is in use by another calibrator') from error
         if isinstance(error, PermissionError):
             raise _unreadable(folder, error) from error
-        raise ArchiveError(f'state_dir: {folder}: {error.strerror}') from error
+        raise ArchiveError(f'state_dir: {error.filename or folder}: {error.strerror}') from error
     return number

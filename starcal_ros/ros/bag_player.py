@@ -12,7 +12,7 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from starcal.msg import StarObservations as ObservationsMessage
@@ -220,7 +220,8 @@ class BagPlayer(printable_log.PrintableLog):
 def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     if topic.type_name in _LATCHED_TYPES:
         return inputs.LATCHED
-    return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
+    is_kept = DurabilityPolicy.TRANSIENT_LOCAL if topic.is_latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH, durability=is_kept)
 
 
 def _listen(executor: node.Executor) -> None:

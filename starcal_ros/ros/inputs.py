@@ -86,6 +86,7 @@ class Inputs:
         name = self._node.resolve_topic_name(topic)
         override = _reliability_override(self._node, name) if adapts else None
         adapts = adapts and not override
+        qos = with_reliability(qos, qos.reliability)  # rclpy writes the override into the profile
         entry = _Input(kinds, topic, name, callback, qos, adapts, group, override, raw)
         with self._lock:
             entry.kind = _kind_of(entry, self._node.get_publishers_info_by_topic(name))

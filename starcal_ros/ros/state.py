@@ -65,49 +65,40 @@ class CalibratorState:
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
+        self._on_disk: tuple[object, ...] = ()  # ensemble and history last written
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:
         """
         Read the state folder; without one, continue with the records in memory.
+
+        So too where they are not on disk: activations, resets and images since the folder was last
+        written.  Images of another size are set aside and counted.
 
         The last calibration is judged by the gate with the present setup before it is active.
         Where it is refused, the one that a roll-back would return to is judged, and so on; refused
         ones stay on record. Raises ArchiveError when the folder cannot be used. Raises OptionError
         when all its records are of another camera, or the key cannot be read.
         """
-        self._setup, self._options = setup, options
-        if not options.state_dir:
-            with self._records:
-                self._folder = ''
-                self._choose_active()
-            return
-        try:
-            from starcal_ros.ros.archive import Archive, read_seal
-        except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
-            raise errors.ArchiveError(
-                f'state_dir: {errors.missing_package(error)}, or leave state_dir empty: then a'
-                ' restart loses the ensemble'
-            ) from error
-        seal = read_seal(options.state_key_file)
-        archive = Archive(Path(options.state_dir), setup.frames.camera_frame, seal)
-        try:
-            ensemble, history = archive.read_ensemble(), archive.read_history()
-            _check_size(options.state_dir, ensemble, history, setup)
-            ensemble = _of_size(ensemble, archive, setup)
-        except errors.StarcalError:
-            archive.close()
-            raise
+        archive = _archive_of(setup, options) if options.state_dir else None
         with self._disk, self._records:
-            if self._folder == options.state_dir:  # not written while the disk failed
-                read = {image.time_ns for image in ensemble.images}
-                for image in self._ensemble.images:
-                    if image.time_ns not in read:
-                        ensemble = ensemble.add(image)
-                history = history or self._history
-            self._ensemble = solving.within_limit(ensemble, setup)
-            self._history, self._folder = history, options.state_dir
+            ensemble, history = self._ensemble, self._history
+            is_on_disk = self._on_disk == (ensemble, history)  # the same records
+            try:
+                if archive is not None:
+                    read = archive.read_ensemble(), archive.read_history()
+                    if is_on_disk or self._folder != options.state_dir:
+                        ensemble, history = read
+                    _check_size(options.state_dir, ensemble, history, setup)
+                ensemble = _of_size(ensemble, archive, setup)
+                ensemble = solving.within_limit(ensemble, setup)
+            except Exception:
+                if archive is not None:
+                    archive.close()
+                raise
+            self._setup, self._folder, self._archive = setup, options.state_dir, archive
+            self._ensemble, self._history = ensemble, history
             self._choose_active()
-            self._archive, self.damage = archive, tuple(archive.damage)
+            self.damage = tuple(archive.damage) if archive else ()
         self.save()
 
     def _choose_active(self) -> None:
@@ -127,8 +118,9 @@ class CalibratorState:
         self._active, self.withheld = record, tuple(withheld)
 
     def close(self) -> None:
-        """Release the state folder; safe to call twice."""
+        """Write what is not on disk, release the state folder; safe to call twice."""
         with self._disk:
+            self._save()
             if self._archive is not None:
                 self._archive.close()
             self._archive = None
@@ -153,16 +145,20 @@ class CalibratorState:
 
     def add(self, observations: records.StarObservations) -> None:
         """Add one image, or count the reason why it was refused."""
-        with self._records:
-            ensemble = self._ensemble
-        grown = solving.add_to_ensemble(ensemble, observations, self._setup)
-        with self._records:
-            if self._ensemble is not ensemble:  # emptied meanwhile: start with this image
-                grown = solving.add_to_ensemble(records.Ensemble(), observations, self._setup)
-            self._ensemble = grown
-            if observations.refusal:
+        is_added = False
+        while not is_added:
+            with self._records:
+                ensemble, setup = self._ensemble, self._setup
+            grown = solving.add_to_ensemble(ensemble, observations, setup)
+            with self._records:  # emptied or opened meanwhile: once more
+                if is_added := self._ensemble is ensemble and self._setup is setup:
+                    self._ensemble = grown
+        if observations.refusal:
+            with self._records:
                 self._details[records.counted_refusal(observations.refusal)] = observations.detail
-        self.save()
+        # A camera that sees the Sun for hours must not wear out the disk: counts come with images.
+        if grown.images is not ensemble.images:
+            self.save()
 
     def reset(self) -> Answer:
         """Empty the ensemble."""
@@ -189,10 +185,11 @@ class CalibratorState:
         force: bool = False,
     ) -> Answer:
         """Solve, and activate a calibration that the gate accepts, or any with ``force``."""
-        ensemble = self.ensemble
+        with self._records:
+            ensemble, setup = self._ensemble, self._setup
         try:
-            setup = with_method(self._setup, method, estimate)
-            calibration = solving.solve(ensemble, setup, active=self.active)[0]
+            asked = with_method(setup, method, estimate)
+            calibration = solving.solve(ensemble, asked, active=self.active)[0]
         except errors.TooFewObservations as error:
             return Answer(False, f'{error}{self._why_refused(ensemble.refused)}')
         except errors.StarcalError as error:
@@ -206,7 +203,8 @@ class CalibratorState:
         if dry_run:
             return Answer(True, f'would be activated: {summary(calibration)}', calibration)
         with self._disk:
-            if self._folder and self._archive is None:
+            # The gate has judged it with that setup, and with no other.
+            if self._setup is not setup or (self._folder and self._archive is None):
                 return Answer(False, 'not activated: the node was cleaned up meanwhile')
             before = self._active.event if self._active else 0
             calibration = self._activate(self._next_event(), before, calibration)
@@ -261,7 +259,7 @@ class CalibratorState:
             ensemble, history = self._ensemble, self._history
         try:
             self._archive.keep(ensemble, history)
-            self.trouble = ''
+            self._on_disk, self.trouble = (ensemble, history), ''
         except errors.ArchiveError as error:
             self.trouble = str(error)
         except Exception as error:  # whatever it is, the records are not on disk
@@ -333,11 +331,9 @@ def _check_size(
 ) -> None:
     """Raise OptionError where every record of a folder is of another camera."""
     prior = setup.prior.camera
-    sizes = {(image.width, image.height) for image in ensemble.images}
-    sizes |= {
-        (record.calibration.geometry.camera.width, record.calibration.geometry.camera.height)
-        for record in history
-    }
+    cameras = [record.calibration.geometry.camera for record in history]
+    sizes = {(one.width, one.height) for one in cameras}
+    sizes |= {(one.width, one.height) for one in ensemble.images}
     if sizes and (prior.width, prior.height) not in sizes:
         width, height = min(sizes)
         raise errors.OptionError(
@@ -346,11 +342,27 @@ def _check_size(
         )
 
 
-def _of_size(ensemble: records.Ensemble, archive: Archive, setup: Setup) -> records.Ensemble:
-    """The ensemble without images of another size, whose files are set aside."""
-    size = (setup.prior.camera.width, setup.prior.camera.height)
+def _of_size(
+    ensemble: records.Ensemble, archive: Archive | None, setup: Setup
+) -> records.Ensemble:
+    """The ensemble with images of another size counted as refused, their files set aside."""
+    prior, checked = setup.prior.camera, records.Ensemble((), ensemble.refused)
     for image in ensemble.images:
-        if (image.width, image.height) != size:
+        is_other = (image.width, image.height) != (prior.width, prior.height)
+        if is_other and archive is not None:
             archive.set_aside_image(image.time_ns, f'an image of {image.width} x {image.height}')
-    kept = tuple(image for image in ensemble.images if (image.width, image.height) == size)
-    return records.Ensemble(kept, ensemble.refused)
+        checked = checked.add(replace(image, refusal='wrong_size') if is_other else image)
+    return checked
+
+
+def _archive_of(setup: Setup, options: CalibratorOptions) -> Archive:
+    """The locked state folder of the options; raises as `CalibratorState.open`."""
+    try:
+        from starcal_ros.ros.archive import Archive, read_seal
+    except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
+        raise errors.ArchiveError(
+            f'state_dir: {errors.missing_package(error)}, or leave state_dir empty: then a'
+            ' restart loses the ensemble'
+        ) from error
+    seal = read_seal(options.state_key_file)
+    return Archive(Path(options.state_dir), setup.frames.camera_frame, seal)

@@ -21,9 +21,11 @@ from mission_files import attitudes, images  # type: ignore[import-not-found]
 from node_inputs import parameters  # type: ignore[import-not-found]
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import String
 
 from starcal.msg import StarObservations
 from starcal_ground.bag_writer import BagWriter
+from starcal_ros.formats.bag import typestore
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     COMPRESSED_TYPE,
@@ -78,6 +80,21 @@ def test_compressed_images_are_paced(
     client.until(lambda: len(found) == IMAGES)
     assert [one.refusal for one in found] == [''] * len(found)
     assert 'playing anyway' not in player.said()
+
+
+def test_what_was_latched_is_latched(
+    client: Client, start_node: StartNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As /tf_static, whose listeners connect to no publisher of another durability."""
+    as_recorded = {**typestore.offered_qos(), 'durability': 'transient_local'}
+    monkeypatch.setattr(typestore, 'offered_qos', lambda: as_recorded)
+    with BagWriter(tmp_path / 'latched.mcap') as writer:
+        message = make_message('std_msgs/msg/String', data='kept')
+        writer.write('/latched', 'std_msgs/msg/String', 5, message)
+    found = client.latched(String, '/latched')
+    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "latched.mcap"}'))
+    client.until(lambda: bool(found))
+    assert player.wait() == 0 and [one.data for one in found] == ['kept']
 
 
 def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:

@@ -221,14 +221,19 @@ def test_a_publisher_that_is_not_received_is_named(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
     """By its name on the graph: the image was asked for as reliable, the calibration latched."""
-    reliable = 'qos_overrides./opnav/image_raw.subscription.reliability:=reliable'
-    observer = start_node('star_observer', ros=(*parameters(tiny_bag, reliable), *REMAPS))
+    fixed = 'qos_overrides.{}.subscription.reliability:={}'.format
+    given = fixed(IMAGES, 'reliable'), fixed('/spacecraft/velocity', 'best_effort')
+    observer = start_node('star_observer', ros=(*parameters(tiny_bag, *given), *REMAPS))
     image = client.node.create_publisher(Image, IMAGES, qos_profile_sensor_data)
     refused = '/opnav/image_raw: Best effort publisher and reliable subscription'
     client.until(lambda: client.health()[1] == f'not received: {refused}')
     assert client.health()[0] == b'\x01'
     assert refused in observer.said()
     client.node.destroy_publisher(image)
+    # What is fixed for one topic is no rule for the others.
+    shown = client.node.get_subscriptions_info_by_topic
+    for topic, fixed_to in ((ATTITUDES, 'RELIABLE'), ('/spacecraft/velocity', 'BEST_EFFORT')):
+        assert [one.qos_profile.reliability.name for one in shown(topic)] == [fixed_to]
     latched = client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
     refused = '/calibration: Volatile publisher and transient local subscription'
     client.until(lambda: client.health()[1] == f'not received: {refused}')

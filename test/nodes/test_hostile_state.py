@@ -159,6 +159,23 @@ STRANGE: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.parametrize('name', ['ensemble', 'calibrations', 'ensemble.emptied', 'other'])
+def test_nothing_behind_a_link_is_removed(name: str, sound: Path, tmp_path: Path) -> None:
+    """It names the folder of another calibrator, whose files have the same names."""
+    with copied(sound) as others:
+        (others / 'ensemble/.00000003.mcap.0.part').touch()
+        (others / 'ensemble/metadata.yaml').touch()
+        before = digests(others)
+        for part in others.iterdir():
+            state = tmp_path / part.name
+            state.mkdir()
+            (state / name).symlink_to(part)
+            restarted(state)
+            assert digests(others) == before
+            (state / name).unlink()
+            assert restarted(state).trouble == ''  # the folder was let go of
+
+
 @pytest.mark.parametrize('name', STRANGE)
 def test_names_and_files_that_a_calibrator_never_writes(name: str, sound: Path) -> None:
     with copied(sound) as folder:

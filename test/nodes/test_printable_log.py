@@ -15,9 +15,25 @@ pytest.importorskip('starcal.msg')
 
 from starcal_ros.ros.bag_player import BagPlayer
 from starcal_ros.ros.node import StarcalNode
-from starcal_ros.ros.printable_log import PrintableLog
+from starcal_ros.ros.printable_log import PrintableLog, PrintableLogger
 
 pytestmark = pytest.mark.nodes
+
+
+def test_a_line_that_logs_without_end_fills_no_disk(capfd: pytest.CaptureFixture[str]) -> None:
+    """Ten images a second are refused for ten minutes; another line logs as ever."""
+    now_s = 0.0
+    logger = PrintableLogger('refusing', lambda: now_s)
+    for k in range(6000):
+        now_s = 0.1 * k
+        logger.warning(f'image {k} refused')
+    logger.warning('stamps went back')
+    said = [line.partition(']: ')[2] for line in capfd.readouterr().err.splitlines()]
+    assert said[:100] == [f'image {k} refused' for k in range(100)]
+    # One a minute is one of six hundred; the quotient may round to one image more.
+    later = [int(line.rpartition('(and ')[2].partition(' left out)')[0]) for line in said[101:-1]]
+    assert len(later) in (8, 9) and set(later) <= {599, 600}
+    assert said[-1] == 'stamps went back'
 
 
 def test_escape_sequences_do_not_reach_the_terminal(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import contextlib
 import dataclasses
 import itertools
@@ -61,6 +62,17 @@ def filled(
     for image in shown:
         state.add(image)
     return state
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """No file of this process may grow beyond 100 bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.slow
@@ -280,14 +292,10 @@ def test_a_full_disk_costs_nothing_that_memory_holds(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     state = filled(setup, shown[:-1], tmp_path)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
+    with full_disk():
         state.add(shown[-1])
         answer = state.solve()
         status = state.status()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert answer.success and 'not on disk: state_dir:' in answer.message
     assert (status.images, status.images_saved) == (len(shown), len(shown) - 1)
     assert 'cannot be written: File too large' in state.trouble
@@ -299,6 +307,92 @@ def test_a_full_disk_costs_nothing_that_memory_holds(
     state = started(setup, tmp_path)
     assert len(state.ensemble.images) == len(shown) and state.active is not None
     state.close()
+
+
+@pytest.mark.slow
+def test_what_no_disk_took_outlasts_a_clean_up(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """Activation and reset on a failing disk that is there again when the node is configured."""
+    options, state = CalibratorOptions(state_dir=str(tmp_path)), filled(setup, shown, tmp_path)
+    assert state.solve().success
+    with full_disk():
+        assert 'not on disk' in state.solve(estimate=('fx', 'fy'), force=True).message
+        state.close()
+    state.open(setup, options)
+    active = state.active
+    assert active is not None and (active.number, active.estimated) == (2, ('fx', 'fy'))
+    assert len(list((tmp_path / 'ensemble').glob('*.mcap'))) == len(shown)
+    in_the_way = tmp_path / 'ensemble.emptied'
+    in_the_way.touch()
+    assert 'not on disk' in state.reset().message
+    state.close()
+    in_the_way.unlink()
+    state.open(setup, options)
+    assert state.trouble == '' and not state.ensemble.images
+    state.close()
+    state = started(setup, tmp_path)
+    active = state.active
+    assert active is not None and active.number == 2 and not state.ensemble.images
+    state.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('on_disk', [False, True])
+def test_a_solution_is_active_only_under_the_limits_that_judged_it(
+    setup: Setup,
+    shown: tuple[StarObservations, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    on_disk: bool,
+) -> None:
+    """The node is cleaned up and configured with tighter limits while it solves."""
+    solve, options = solving.solve, CalibratorOptions(state_dir=str(tmp_path) if on_disk else '')
+    state = filled(setup, shown, options.state_dir)
+    tighter = dataclasses.replace(setup.gate, max_change_px=1e-6)
+
+    def long_solve(*arguments: Any, **given: Any) -> Any:
+        solved = solve(*arguments, **given)
+        state.close()
+        state.open(dataclasses.replace(setup, gate=tighter), options)
+        return solved
+
+    monkeypatch.setattr(solving, 'solve', long_solve)
+    assert state.solve() == Answer(False, 'not activated: the node was cleaned up meanwhile')
+    assert state.active is None
+    state.close()
+
+
+def test_an_image_that_comes_with_a_restart_is_added_to_those_on_disk(
+    setup: Setup,
+    shown: tuple[StarObservations, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They would be taken for those of a reset, and removed."""
+    add, state = solving.add_to_ensemble, filled(setup, shown[:3], tmp_path)
+
+    def long_add(*arguments: Any) -> Any:
+        monkeypatch.undo()
+        state.close()
+        state.open(setup, CalibratorOptions(state_dir=str(tmp_path)))
+        return add(*arguments)
+
+    monkeypatch.setattr(solving, 'add_to_ensemble', long_add)
+    state.add(shown[3])
+    state.close()
+    state = started(setup, tmp_path)
+    assert [image.time_ns for image in state.ensemble.images] == [i.time_ns for i in shown[:4]]
+    state.close()
+
+
+def test_images_of_another_camera_do_not_stay_in_memory(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown[:3])
+    state.close()
+    state.open(load(tmp_path, 'small'), CalibratorOptions())
+    assert state.ensemble.images == () and dict(state.ensemble.refused) == {'wrong_size': 3}
 
 
 def test_a_folder_of_another_camera_is_refused(
@@ -404,7 +498,12 @@ def test_reasons_that_a_sender_makes_up_are_one(
     for k in range(50):
         state.add(refused_image(k, 640, 512, f'reason {k}', ''))
     assert dict(state.ensemble.refused) == {'other': 50}
-    assert (tmp_path / 'ensemble' / 'refused.json').stat().st_size < 300
+    counts = tmp_path / 'ensemble' / 'refused.json'
+    assert not counts.exists()  # fifty refused images are no fifty writes
+    state.close()
+    assert counts.stat().st_size < 300
+    state = started(setup, tmp_path)
+    assert dict(state.ensemble.refused) == {'other': 50}
     state.close()
 
 

@@ -20,7 +20,7 @@ import bisect
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 import io
 import logging
@@ -65,6 +65,8 @@ _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its o
 _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
+_ZSTD = b'\x28\xb5\x2f\xfd'  # RFC 8878, 3.1.1: CDR begins with a zero
+_LATCHED = re.compile(r'durability: (1|transient_local)\b')  # of Humble, and since
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
@@ -127,6 +129,8 @@ def read_messages(
             if channel is None or schema is None or channel.message_encoding != 'cdr':
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
             if wanted is None or channel.topic in wanted:
+                if record.data[:4] == _ZSTD:
+                    raise _compressed_singly(file.absolute().parent)
                 definition = schema.data.decode(errors='replace')
                 view = memoryview(record.data)
                 yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
@@ -323,11 +327,16 @@ def log_damage(text: str) -> None:
 
 @dataclass(frozen=True)
 class Topic:
-    """Topic of a bag with its message count; ``type_name`` is ``'pkg/msg/Name'``."""
+    """
+    Topic of a bag with its message count; ``type_name`` is ``'pkg/msg/Name'``.
+
+    ``is_latched`` where the summary says that its publishers were transient local.
+    """
 
     name: str
     type_name: str
     count: int
+    is_latched: bool = False
 
 
 @dataclass(frozen=True)
@@ -390,16 +399,16 @@ def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
     """Topics with messages, by name; a file without a summary is read completely."""
-    types: dict[str, str] = {}
+    last: dict[str, Topic] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
         listed, damage, _ = _listed_now(file)
         for text in damage:
             on_damage(text)
         for topic in listed:
-            types[topic.name] = topic.type_name
+            last[topic.name] = topic
             counts[topic.name] += topic.count
-    return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
+    return tuple(replace(last[name], count=counts[name]) for name in sorted(counts))
 
 
 def _listed_now(file: Path) -> tuple[list[Topic], list[str], int]:
@@ -435,7 +444,8 @@ def _summary(summary: Summary) -> list[Topic]:
         schema = summary.schemas.get(channel.schema_id) if channel else None
         # Without a schema a message has no type: it is not of ROS 2.
         if count and channel and schema and channel.message_encoding == 'cdr':
-            listed.append(Topic(channel.topic, schema.name, count))
+            qos = channel.metadata.get('offered_qos_profiles', '')
+            listed.append(Topic(channel.topic, schema.name, count, bool(_LATCHED.search(qos))))
     return listed
 
 
@@ -514,11 +524,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
     names, compression = _metadata(folder / 'metadata.yaml')
     if compression.lower() == 'message':
-        raise BagError(
-            f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
-            f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
-            f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
-        )
+        raise _compressed_singly(folder)
     if compression:  # zstd leaves the files without the ending
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
@@ -534,6 +540,14 @@ def _files_of_folder(folder: Path) -> list[Path]:
         near = f' (did you mean {inside.parent}?)' if inside else ''
         raise NotABag(f'{folder}: no .mcap files in the folder{near}', folder)
     return files
+
+
+def _compressed_singly(folder: Path) -> BagError:
+    return BagError(
+        f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
+        f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
+        f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
+    )
 
 
 def _metadata(path: Path) -> tuple[list[str], str]:

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 import yaml
+import zstandard
 
 from starcal_ground.bag_writer import BagWriter, image_to_message
 from starcal_ground.file_kinds import explained
@@ -453,6 +454,18 @@ def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     assert [t.name for t in bag_reader.topics([file])] == ['/image']
     (read,) = images_of(file)
     assert isinstance(read, Image) and read.time_ns == 5
+
+
+def test_messages_compressed_one_by_one_are_refused_with_the_remedy(tmp_path: Path) -> None:
+    """Of such a bag the file alone, without the metadata of its folder, is given."""
+    with (tmp_path / 'bag_0.mcap').open('wb') as stream:
+        writer = typestore_module.started(stream)
+        image = typestore_module.opened(writer, '/image', IMAGE_TYPE)
+        writer.add_message(image, 5, zstandard.compress(bytes(100)), 5)
+        writer.finish()
+    remedy = f'{tmp_path}: its messages are compressed one by one: ros2 bag convert -i {tmp_path} '
+    with pytest.raises(BagError, match=re.escape(remedy)):
+        images_of(tmp_path / 'bag_0.mcap')
 
 
 MEMORY = """

@@ -62,9 +62,10 @@ def test_a_velocity_of_no_spacecraft_is_refused(axis: int, speed_m_s: float) -> 
 def test_temperature_round_trip(make: Any) -> None:
     message = temperature_to_message(7, -12.5, 'camera', make)
     assert temperature_from_message(message) == (7, -12.5)
-    # A sensor that has failed says inf or NaN: not known.
-    message = temperature_to_message(7, np.inf, 'camera', make)
-    assert np.isnan(temperature_from_message(message)[1])
+    # What a sensor says that has failed is not known: it would have each image refused.
+    for failed_degc in (np.inf, np.nan, -999.0):
+        message = temperature_to_message(7, failed_degc, 'camera', make)
+        assert np.isnan(temperature_from_message(message)[1])
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
