@@ -151,7 +151,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        return arguments.complain(missing_package(error, 'mission'))
+        extra = 'pdf' if error.name == 'weasyprint' else 'mission'
+        return arguments.complain(missing_package(error, extra))
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:

@@ -57,7 +57,7 @@ class Drawing:
     def document(self) -> str:
         """Text of an SVG file: the light palette on paper."""
         size = f'width="{self.width:g}" height="{self.height:g}"'
-        return _light(
+        return light(
             f'<svg xmlns="http://www.w3.org/2000/svg" {size}'
             f' viewBox="0 0 {self.width:g} {self.height:g}"'
             f' font-family="DejaVu Sans, Arial, sans-serif" font-size="{LETTER:g}" fill="{INK}">'
@@ -148,7 +148,7 @@ def named(scale: Scale, most: int = 6) -> list[tuple[float, str]]:
     return [(value, in_digits(value)) for value in scale.ticks(most)]
 
 
-def _light(text: str) -> str:
+def light(text: str) -> str:
     """Text with the colours of the light palette in place of the variables of its drawings."""
     css = (Path(__file__).parent / 'templates' / 'report.css').read_text()
     match = _PALETTE.search(css)

@@ -202,7 +202,7 @@ def test_every_parameter_is_in_the_interface_document_and_none_else() -> None:
 
 
 FILE_ENDINGS = (
-    *('html', 'json', 'mcap', 'md', 'npz', 'parquet', 'py', 'sqlite', 'tf', 'ti', 'yaml'),
+    *('html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'py', 'sqlite', 'tf', 'ti', 'yaml'),
 )
 
 

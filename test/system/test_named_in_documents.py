@@ -56,7 +56,7 @@ ELSEWHERE = {
 # Hypothetical files of a user, and modules that were rejected.
 NOT_OURS = {'rotation.py', 'env.sh', 'STUDY.json', '00000012.mcap'}
 SUFFIXES = (
-    *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'png'),
+    *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'png'),
     *('sh', 'sqlite', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
 )
 FOLDERS = (

@@ -23,7 +23,6 @@ from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
 from starcal_ground.products import prior_of, REPORT_FILE
 from starcal_ground.report import page as report
-from starcal_ground.report import svg
 from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
@@ -252,15 +251,6 @@ def test_damaged_files_are_named_in_one_line(
     assert main.main(['report', str(broken)]) == EXIT_BAD_INPUT
     complaint = capsys.readouterr().err
     assert complaint.count('\n') == 1 and damage in complaint
-
-
-def test_letters_of_printed_figures_have_six_points() -> None:
-    css = (Path(svg.__file__).parent / 'templates' / 'report.css').read_text()
-    rule = re.search(r'\.charts > figure \{ display: inline-block;[^}]*width: (\d+)%', css)
-    margins = re.search(r'size: A4; margin: \S+ (\d+)mm', css)
-    assert rule is not None and margins is not None
-    line_pt = (210 - 2 * int(margins[1])) / 25.4 * 72
-    assert line_pt * int(rule[1]) / 100 * svg.LETTER / svg.WIDTH >= 6
 
 
 # Put first in the page: what goes wrong is kept from the start.

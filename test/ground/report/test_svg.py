@@ -69,7 +69,7 @@ def test_marks_stand_at_their_values_and_text_is_escaped() -> None:
     document = pair.document()
     root = ElementTree.fromstring(document)
     assert (root.get('width'), root.get('height')) == ('960', '366')
-    assert 'var(--' not in document and '"#16202b"' in document  # ink of the light palette
+    assert 'var(--' not in document and svg.light(f'"{svg.SERIES[0]}"') == '"#0b62a8"'
 
 
 def test_a_cloud_is_a_picture_with_points_where_they_are() -> None:
