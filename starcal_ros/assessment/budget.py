@@ -44,6 +44,7 @@ _UNKNOWNS = {
     'stamps': ('stamps',),
     'field': ('field',),
     'mountings': ('mountings',),
+    'lateral colour': ('colour',),
     'temperature': ('focal', 'rate'),
 }
 """Entries of the list of unknowns by cause."""
@@ -294,6 +295,7 @@ def _unknowns(
 
     def text(name: str) -> str:
         sigma = float(layout[name].sigma[0])
+        ppm = significant(1e6 * float(estimate.posterior.mean[layout.places[name]][0]), 3)
         return {
             'velocity': _of_velocity(sigma, options),
             'refraction': f'{"air at the site" if _is_sited(layout) else "site not given"}:'
@@ -301,6 +303,7 @@ def _unknowns(
             'readout': _of_readout(layout[name].labels[0], sigma, options),
             'stamps': _of_stamps(layout[name].labels[0], sigma),
             'field': _estimated(_field_px(estimate), field.likelihood_ratio),
+            'colour': f'estimated: {ppm} ppm of the scale per mag of BP - RP',
             'mountings': f'{significant(sigma / ARCSECOND_RAD, 3)}″ per angle assumed',
         }.get(name, 'estimated, no prior')
 
