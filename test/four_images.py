@@ -30,6 +30,7 @@ from starcal_ros.estimation.unknowns import Assumptions, Layout, unknowns_of
 WIDTH, HEIGHT = 1200, 800
 IMAGES, STARS = 4, 20
 LIGHT_M_S = 299792458.0
+SIGMA = {'velocity': 8000.0, 'colour': 3e-4, 'readout': 0.02, 'stamps': 0.005}
 ASSUMED = Assumptions(velocity_m_s=8000.0, readout_s=(0.004, 0.02), stamp_s=0.005)
 # Images see 10 of 14 degrees; distortion moves the corners by 8 px.
 CAMERA = CameraModel(
@@ -38,6 +39,7 @@ CAMERA = CameraModel(
 HELD = ('skew', 'k3')
 OWN = 11  # unknowns of an image: its rotation, its shape, the error of its rate
 TURN_S = 0.02  # rms time of read-out
+COLOUR = np.random.default_rng(2000).normal(size=IMAGES * STARS)  # from the mean, mag
 SHAPE = np.array([0.2, 0.3, 0.4, 0.5, 0.6])
 # 1-sigma of one image's scale, stretch, shear and decentring, px
 
@@ -101,6 +103,9 @@ class Small:
                 beta = value['velocity'] / LIGHT_M_S
                 e = erfa.ab(e, beta, np.inf, np.sqrt(1.0 - beta @ beta))
             e = state.camera_from_icrf[k].apply(e)
+            if 'colour' in value:  # a longer focal length for red stars
+                scale = 1.0 + value['colour'] * COLOUR[here]
+                e = e * np.column_stack([scale, scale, np.ones(len(e))])
             if value.get('readout', np.zeros(1))[0] or y[k, 8:].any():
                 # The camera turns by its rate from the middle row's time to that of the row.
                 rows = (self.predicted_px[here, 1] - (HEIGHT - 1) / 2.0) / HEIGHT
@@ -229,6 +234,7 @@ def small(
         covariance,
         IMAGES,
     )
+    assumed = dataclasses.replace(assumed, colour=COLOUR)
     layout = unknowns_of(problem, state, given_rates, (WIDTH, HEIGHT), assumed)
     keep = np.arange(len(image)) % STARS < np.array([20, 18, 16, 13])[image]
     made = Small(problem, state, table, given_rates, layout, keep)
@@ -246,6 +252,7 @@ def small(
 # there, and the rounding of pixels is 1e-12 of such a step.
 _STEPS = {
     'velocity': 8000.0,
+    'colour': 1e-4,
     'readout': 0.02,
     'stamps': 0.005,
     'field': 0.1,
@@ -353,9 +360,8 @@ def prior_precision(given: Small, shape_px: Floats, field_px: Floats | None) -> 
             precision[problem.free] = 1.0 / problem.prior_sigma[problem.free] ** 2
         elif entry.name == 'mountings':
             precision[:] = problem.mounting_sigma_rad**-2
-        elif entry.name in ('velocity', 'readout', 'stamps'):
-            sigma = {'velocity': 8000.0, 'readout': 0.02, 'stamps': 0.005}[entry.name]
-            precision[:] = sigma**-2
+        elif entry.name in SIGMA:
+            precision[:] = SIGMA[entry.name] ** -2
         elif entry.name == 'field':
             precision[:] = np.inf
             if field_px is not None:

@@ -154,7 +154,7 @@ def _means(x: Sequence[Floats], y: Floats, edges: Floats, label: str,
 
 
 def residuals_against_colour(residuals: Residuals) -> svg.Chart | None:
-    """Mean residual against BP - RP, which shows lateral colour; None if too few colours."""
+    """Mean residual against BP - RP, which shows dispersed light; None if too few colours."""
     used = residuals.used & np.isfinite(residuals.colour_bp_rp)
     if np.count_nonzero(used) < 30:
         return None
@@ -166,7 +166,7 @@ def residuals_against_colour(residuals: Residuals) -> svg.Chart | None:
     return svg.Chart(
         'Residuals against star colour',
         _means([colour, colour], residual_px, edges, 'colour BP \N{MINUS SIGN} RP (mag)', 'uv'),
-        'A trend indicates lateral colour of the lens, which displaces red from blue stars.',
+        'A trend indicates that the air or a prism displaces red from blue stars.',
     )
 
 

@@ -44,6 +44,7 @@ _UNKNOWNS = {
     'stamps': ('stamps',),
     'field': ('field',),
     'mountings': ('mountings',),
+    'lateral colour': ('colour',),
     'temperature': ('focal', 'rate'),
 }
 """Entries of the list of unknowns by cause."""
@@ -294,13 +295,15 @@ def _unknowns(
 
     def text(name: str) -> str:
         sigma = float(layout[name].sigma[0])
+        ppm = significant(1e6 * float(estimate.posterior.mean[layout.places[name]][0]), 3)
         return {
-            'velocity': _of_velocity(sigma, options),
+            'velocity': _of_velocity(sigma, layout[name].usual, options),
             'refraction': f'{"air at the site" if _is_sited(layout) else "site not given"}:'
             f' {significant(sigma, 3)} arcsec at 45 degrees assumed',
             'readout': _of_readout(layout[name].labels[0], sigma, options),
             'stamps': _of_stamps(layout[name].labels[0], sigma),
             'field': _estimated(_field_px(estimate), field.likelihood_ratio),
+            'colour': f'estimated: {ppm} ppm of the scale per mag of BP - RP',
             'mountings': f'{significant(sigma / ARCSECOND_RAD, 3)}″ per angle assumed',
         }.get(name, 'estimated, no prior')
 
@@ -366,7 +369,7 @@ def _is_sited(layout: Layout) -> bool:
     return 'site' in layout and layout['site'].sigma[0] < layout['site'].widest
 
 
-def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
+def _of_velocity(sigma_m_s: float, usual_m_s: float, options: CalibrationOptions) -> str:
     size = (
         f'{significant(sigma_m_s / 1e3, 3)} km/s'
         if sigma_m_s >= 1e3
@@ -374,7 +377,8 @@ def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
     )
     if options.velocity_sigma_m_s >= 0:
         return f'{size} per axis stated'
-    return f'no barycentric one given: {size} per axis assumed'
+    given = 'given' if math.isinf(usual_m_s) else 'no barycentric one given'
+    return f'{given}: {size} per axis assumed'
 
 
 def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:

@@ -9,6 +9,7 @@ and the outliers from what is left, until nothing changes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -16,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
@@ -187,10 +188,15 @@ class Estimate:
 
 
 def estimate_calibration(
-    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    colours_of: Callable[[Indices], Floats] | None = None,
 ) -> Estimate:
     """
     Estimate of the camera parameters and the alignment from an ensemble.
+
+    ``colours_of`` gives BP - RP (n,) of stars by their catalog numbers (n,); NaN: not known.
 
     Raises
     ------
@@ -215,7 +221,7 @@ def estimate_calibration(
         prior,
         options,
         measured_rates(ensemble.images),
-        _assumed(ensemble, options),
+        dataclasses.replace(_assumed(ensemble, options), colour=_colours(table, colours_of)),
         observation_groups(table.measured_px, table.star, prior.camera.width),
     )
     try:
@@ -358,6 +364,15 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
     return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, usual_m_s)
 
 
+def _colours(table: StarTable, colours_of: Callable[[Indices], Floats] | None) -> Floats | None:
+    """Return colours (n,) from their mean, which stars of unknown colour have; None if all are."""
+    colour = colours_of(table.catalog_id) if colours_of else np.full(len(table), np.nan)
+    known = np.isfinite(colour)
+    weight = known / (table.covariance_px2[:, 0] + table.covariance_px2[:, 2])
+    colour = np.where(known, colour, 0.0)
+    return known * (colour - np.average(colour, weights=weight)) if known.any() else None
+
+
 def _step_sigma(found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
     in_state = found.layout.of(_IN_STATE)
@@ -410,7 +425,7 @@ def residuals_px(
                 values = found.of_images[:, at] if entry.of_image else found.mean[None, at]
                 own += (entry.camera @ values[:, :, None])[:, :, 0]
             if entry.turn is not None:
-                by = entry.turn(table.measured_px.T, e.T, table.image)
+                by = entry.turns(table.measured_px.T, e.T, table.image, np.arange(len(table)))
                 if entry.of_image:
                     turn += (by * found.of_images[table.image, at].T).sum(axis=1)
                 else:

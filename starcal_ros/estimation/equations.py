@@ -153,8 +153,8 @@ def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
             image = np.repeat(chunk.image, chunk.direction_icrf.shape[2])
             predicted_px, at = _predicted_px(chunk, J[:, -2]), p
             for entry in turning:
-                assert entry.turn is not None
-                turns, here = entry.turn(predicted_px, e, image), J[:, at : at + len(entry)]
+                turns = entry.turns(predicted_px, e, image, chunk.row)
+                here = J[:, at : at + len(entry)]
                 np.einsum('rbn,bqn->rqn', J[:, -5:-2], turns, out=here)
                 at += len(entry)
         yield chunk, J[:, :-1]

@@ -7,7 +7,8 @@ by it, and a Gaussian prior.  A shared unknown has one value for all images; an 
 one for each.  There are three forms of derivative:
 
 - ``camera``: it changes the parameters of the camera of image k by the matrix ``camera[k]``;
-- ``turn``: it turns the direction of each star by a small rotation in the camera frame;
+- ``turn``: it turns the direction of each star by a small rotation in the camera frame, in
+  proportion to a number of the star where there is one (``of_star``);
 - ``functions``: it displaces pixels along u and along v by functions of the pixel.
 
 An unknown may also turn the camera relative to the star tracker of an image (``tracker``): the
@@ -67,6 +68,7 @@ _FOCAL_MODES = {
 """Changes of fx, skew and fy."""
 _DECENTRING = ('p1', 'p2')  # of the lens models that have them
 _TREND = 1e-4  # of the focal length, rms over the images: a lens that warms by some degrees
+_SCALE_BY_COLOUR = 3e-4  # of the focal length, per mag of BP - RP: 0.5 px in a corner, blue to red
 _NO_TURN_RAD = 1e-8  # within an image: 2 milliarcseconds
 _FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
 FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
@@ -94,6 +96,8 @@ class Unknown:
     camera : (m, p, q) or None
         Change of the camera parameters of each image.
     turn : Turn or None
+    of_star : (n,) or None
+        Factor on the turn of each observation, as the colour of its star.
     functions : Scalars or None
         q is twice their number: those of u, then those of v.
     products : callable or None
@@ -119,6 +123,7 @@ class Unknown:
     of_image: bool = False
     camera: Floats | None = None
     turn: Turn | None = None
+    of_star: Floats | None = None
     functions: Scalars | None = None
     products: Callable[[Floats, Floats], Floats] | None = None
     octave: Indices | None = None
@@ -131,6 +136,12 @@ class Unknown:
     def __len__(self) -> int:
         """Return the number of unknowns of the entry."""
         return len(self.labels)
+
+    def turns(self, pixels: Floats, directions: Floats, image: Indices, row: Indices) -> Floats:
+        """Return the small rotations (3, q, n) of the observations ``row`` (n,), by ``turn``."""
+        assert self.turn is not None
+        by = self.turn(pixels, directions, image)
+        return by if self.of_star is None else by * self.of_star[row]
 
 
 @dataclass(frozen=True)
@@ -221,6 +232,8 @@ class Assumptions:
         Logarithm of the residual of the lens: mean and 1-sigma.
     usual_m_s : float
         Usual velocity against the Earth where none is given.
+    colour : (n,) or None
+        Colour of the star of each observation, mag from their mean; None: not known.
     """
 
     velocity_m_s: float
@@ -229,6 +242,7 @@ class Assumptions:
     refraction: Refraction | None = None
     lens_log_px: tuple[float, float] = UNSTATED
     usual_m_s: float = np.inf
+    colour: Floats | None = None
 
 
 def unknowns_in_state(problem: Problem, state: State) -> Layout:
@@ -377,6 +391,11 @@ def unknowns_of(
         )
     if assumed.refraction is not None:
         entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
+    if assumed.colour is not None:
+        label, sigma = ('scale_by_colour_per_mag',), np.array([_SCALE_BY_COLOUR])
+        turn = functools.partial(_by_scale, problem.model)
+        colour = Unknown('colour', label, sigma, np.zeros(1), turn=turn, of_star=assumed.colour)
+        entries.append(colour)
     entries += _of_timing(rates, height, assumed)
     entries.append(dataclasses.replace(_field(width, height), log_px=assumed.lens_log_px))
     entries.append(_shape(problem, state, size))
@@ -480,6 +499,16 @@ def _by_velocity(
     x, y, z = (np.take(camera_from_icrf[:, k].T, image, axis=1) for k in range(3))
     e_x, e_y, e_z = directions / SPEED_OF_LIGHT_M_S
     return np.stack([y * e_z - z * e_y, z * e_x - x * e_z, x * e_y - y * e_x])
+
+
+def _by_scale(model: str, pixels: Floats, directions: Floats, image: Indices) -> Floats:
+    """Small rotations (3, 1, n) of stars away from the optical axis, as a longer focal length."""
+    del pixels, image
+    x, y, z = directions
+    sine = np.hypot(x, y)
+    if model == 'equidistant':  # the angle in place of its tangent
+        z = np.arctan2(sine, z) / np.maximum(sine, 1e-12)
+    return np.stack([z * y, -z * x, 0.0 * x])[:, None]
 
 
 def _by_readout(

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment import observability
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
@@ -167,9 +168,12 @@ def solve(
 
 def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
     """The estimate with the lens model that was asked for."""
+    is_same = {image.catalog_digest for image in ensemble.images} == {setup.catalog.digest}
+    colours_of = setup.catalog.colours_bp_rp if is_same else None
+    given = ensemble, setup.prior, setup.calibration, colours_of
     if setup.frames.lens_model == 'auto':
-        return estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)[0]
-    return estimate_calibration(ensemble, setup.prior, setup.calibration)
+        return estimate_with_smallest_lens(*given)[0]
+    return estimate_calibration(*given)
 
 
 def _not_judged(
@@ -236,7 +240,10 @@ _PER_COEFFICIENT = 2.0  # Akaike 1974: less of a likelihood ratio is what any co
 
 
 def estimate_with_smallest_lens(
-    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    colours_of: Callable[[Indices], Floats] | None = None,
 ) -> tuple[Estimate, CameraGeometry]:
     """
     Return the estimate with the smallest lens model that needs no field, and the prior with it.
@@ -263,7 +270,7 @@ def estimate_with_smallest_lens(
             continue
         started = dataclasses.replace(prior, camera=camera)
         try:
-            estimate = estimate_calibration(ensemble, started, options)
+            estimate = estimate_calibration(ensemble, started, options, colours_of)
         except TooFewObservations:
             if model == prior.camera.model:
                 raise

@@ -103,6 +103,7 @@ def test_velocity_is_the_fall_of_an_estimate_that_is_given_it() -> None:
     assert part.assumption == 'no barycentric one given: 20 km/s per axis assumed'
     stated = parts(RAM, velocity_sigma_m_s=10.0)['velocity']
     assert stated.assumption == '10 m/s per axis stated'
+    assert parts(FIELDS)['velocity'].assumption == 'given: 10 m/s per axis assumed'
     assert stated.map_arcsec < 0.01 * part.map_arcsec
 
 

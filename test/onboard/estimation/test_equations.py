@@ -7,6 +7,7 @@ import dataclasses
 
 from four_images import (  # type: ignore[import-not-found]
     CAMERA,
+    COLOUR,
     Dense,
     dense,
     HEIGHT,
@@ -32,7 +33,7 @@ from starcal_ros.estimation.equations import (
     stars_alone,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.unknowns import unknowns_in_state
+from starcal_ros.estimation.unknowns import Layout, unknowns_in_state
 
 # Finite differences leave 1e-10 of a derivative, and attitude errors of 20 arcsec, which enter the
 # derivatives of the star trackers to first order, 1e-8.
@@ -152,7 +153,11 @@ def test_the_sums_do_not_depend_on_the_order_of_stars_and_images(given: Small) -
             )
         },
     )
-    shuffled = dataclasses.replace(given, table=table, keep=given.keep[order])
+    colour = dataclasses.replace(given.layout['colour'], of_star=COLOUR[order])
+    entries = tuple(colour if e.name == 'colour' else e for e in given.layout.entries)
+    shuffled = dataclasses.replace(
+        given, table=table, keep=given.keep[order], layout=Layout(entries)
+    )
     one, other = given.sums(), shuffled.sums()
     for name in ('blocks', 'field_information', 'field_cross'):
         a, b = getattr(one, name), getattr(other, name)
@@ -177,10 +182,10 @@ def test_the_chain_turns_camera_columns_into_unknowns(given: Small) -> None:
         assert np.diag(E[k])[:3] == pytest.approx(factor)
         assert E[k][:3, p] == pytest.approx(given.state.parameters[:3] * above_k)
         assert E[k][:3, p + 1] == pytest.approx(given.state.parameters[:3] * above_k**2)
-        # Rows: camera, velocity and read-out, errors of rates, rotation, residual.
-        of_stars = np.r_[np.arange(p + 2, p + 6), E.shape[2] - 4 + np.arange(3)]
-        of_stars = np.r_[of_stars, np.arange(p + 6, p + 9)]
-        assert E[k][p:-1][:, of_stars] == pytest.approx(np.eye(10))
+        # Rows: camera, velocity, colour and read-out, errors of rates, rotation, residual.
+        of_stars = np.r_[np.arange(p + 2, p + 7), E.shape[2] - 4 + np.arange(3)]
+        of_stars = np.r_[of_stars, np.arange(p + 7, p + 10)]
+        assert E[k][p:-1][:, of_stars] == pytest.approx(np.eye(11))
         scale, stretch, shear, *decentring = E[k][:p, -9:-4].T
         assert scale[:3] == pytest.approx([1.0, 0.0, 1.0]) and not scale[3:].any()
         assert stretch[:3] == pytest.approx([1.0, 0.0, -1.0]) and not stretch[3:].any()

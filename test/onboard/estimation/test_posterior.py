@@ -247,7 +247,7 @@ def test_sums_of_the_shapes_have_the_likelihood_of_contrasts_free_of_everything_
     P = made.layout.count
     precision, offset = prior_precision(made, SHAPE, None), prior_offset(made)
     # The stars alone: rotations are free, star trackers show no shape.
-    common = made.layout.of(['camera', 'focal', 'velocity', 'readout'])
+    common = made.layout.of(['camera', 'focal', 'velocity', 'colour', 'readout'])
     common = common[np.isfinite(precision[common])]
     own = P + np.arange(OWN * IMAGES).reshape(IMAGES, OWN)
     shape, rates = own[:, 3:8].ravel(), own[:, 8:].ravel()

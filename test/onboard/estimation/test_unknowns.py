@@ -94,7 +94,7 @@ def star_matrix(given: Small) -> tuple[Floats, Floats]:
     for entry in given.layout.entries:
         at = given.layout.places[entry.name]
         if entry.turn is not None:
-            turned = entry.turn(given.predicted_px.T, e.T, image)
+            turned = entry.turns(given.predicted_px.T, e.T, image, np.arange(n))
             for k in range(IMAGES):
                 here = image == k
                 own = given.state.parameters.copy()
@@ -127,7 +127,7 @@ def places(given: Small, name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    'name', ['camera', 'focal', 'velocity', 'readout', 'field', 'shape', 'rates']
+    'name', ['camera', 'focal', 'velocity', 'colour', 'readout', 'field', 'shape', 'rates']
 )
 def test_a_derivative_by_pixels_is_that_of_the_projection(
     given: Small, truth: Dense, name: str
