@@ -42,7 +42,7 @@ ARGUMENTS = (
 )
 SMALL = {
     'table1': {'trials': 2, 'images': (4,), 'stars': (20, 30), 'tracker_arcsec': (0.0, 20.0)},
-    'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},
+    'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5, 'methods': METHODS[2:]},
 }
 each_study = pytest.mark.parametrize('study', SMALL)
 
