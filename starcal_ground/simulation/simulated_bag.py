@@ -1,5 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Writer of simulated scenarios: a bag, its truth, and the files to calibrate it."""
+"""
+Writer of simulated scenarios: a bag, its truth, and the files to calibrate it.
+
+Deliberate mistakes of the set-up serve to practise their diagnosis.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +23,92 @@ from starcal_ground.comparison import truth_like
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_text, write_atomically
-from starcal_ros.records import AttitudeSample, Calibration, CameraGeometry
+from starcal_ros.records import AttitudeSample, Calibration, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.untrusted import json_value, PRODUCT_BYTES
+
+_AXIS = (0.8, 0.6, 0.0)  # axis of the alignment error, perpendicular to the line of sight
+
+
+@dataclasses.dataclass(frozen=True)
+class Mistakes:
+    """
+    Mistakes of a bag and its parameter file; none by default.
+
+    Attributes
+    ----------
+    flip : str
+        'left-right' or 'top-bottom': images are mirrored.
+    rotate_deg : int
+        Images are turned counterclockwise by 90, 180 or 270 degrees.
+    attitude_direction, quaternion_order : str
+        'inertial_to_st', 'wxyz': the attitudes of the bag, contrary to the parameter file.
+    alignment_error_deg, focal_error_percent : float
+        Errors of the prior.
+    clock_error_s : float
+        Delay of the stamps of images.
+    smear_px : int
+        Length of the streak of each star in the middle of the image, along x.
+    gamma : float
+        Pixel values are proportional to light to the power 1 / gamma.
+    """
+
+    flip: str = ''
+    rotate_deg: int = 0
+    attitude_direction: str = 'st_to_inertial'
+    quaternion_order: str = 'xyzw'
+    alignment_error_deg: float = 0.0
+    focal_error_percent: float = 0.0
+    clock_error_s: float = 0.0
+    smear_px: int = 1
+    gamma: float = 1.0
+
+    def image(self, image: Image) -> Image:
+        """The image with its mistakes, as written to the bag."""
+        pixels = image.pixels
+        full = float(np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else pixels.max())
+        if self.gamma != 1.0:
+            light = np.clip(pixels.astype(np.float64) - np.median(pixels), 0.0, None) / full
+            curved = 0.05 * full + 0.9 * full * light ** (1 / self.gamma)
+            pixels = _as_before(curved, pixels, full)
+        turned: Pixels = np.rot90(pixels, self.rotate_deg // 90)  # type: ignore[assignment]
+        if self.flip:
+            turned = turned[:, ::-1] if self.flip == 'left-right' else turned[::-1]
+        late_ns = round(self.clock_error_s * NANOSECONDS_PER_SECOND)
+        # A copy without gaps, of the same type.
+        return Image(image.time_ns + late_ns, turned.copy())
+
+    def attitude(self, icrf_from_star_tracker_xyzw: Floats) -> Floats:
+        """The attitude with its mistakes, as written to the bag."""
+        sent = np.asarray(icrf_from_star_tracker_xyzw)
+        if self.attitude_direction == 'inertial_to_st':
+            sent = sent * [-1.0, -1.0, -1.0, 1.0]
+        return sent[[3, 0, 1, 2]] if self.quaternion_order == 'wxyz' else sent
+
+    def prior(self, prior: CameraGeometry) -> CameraGeometry:
+        """The prior with its mistakes, as written to the parameter file."""
+        fx, fy = (float(prior.camera.parameters[k]) for k in (0, 2))
+        grown = 1.0 + self.focal_error_percent / 100.0
+        turn = Rotation.from_rotvec(math.radians(self.alignment_error_deg) * np.array(_AXIS))
+        alignment = prior.star_tracker_from_camera * turn
+        return CameraGeometry(
+            prior.camera.replace(fx=grown * fx, fy=grown * fy), alignment.as_quat()
+        )
+
+
+def _as_before(changed: Floats, before: Pixels, full: float) -> Pixels:
+    """Pixels converted to the given type and clipped to its range."""
+    clipped = np.clip(np.rint(changed), 0.0, full)
+    return clipped.astype(np.uint8) if before.itemsize == 1 else clipped.astype(np.uint16)
+
+
+NO_MISTAKES = Mistakes()
+
 
 _BESIDE = ('truth.json', 'params.yaml', 'camera.yaml', 'gaia.csv')
 IMAGE_TOPIC = '/opnav/image_raw'
@@ -106,6 +189,7 @@ def write_bag(
     scenario: synthetic.Scenario,
     path: Path,
     on_image: Callable[[int], None] = lambda index: None,
+    mistakes: Mistakes = NO_MISTAKES,
 ) -> SimulatedBag:
     """
     Render a scenario to a bag, and write its truth and the files to calibrate it.
@@ -118,11 +202,18 @@ def write_bag(
     ----------
     on_image : callable
         Called with the index of each image written.
+    mistakes : Mistakes
+        Mistakes of the bag and of the files to calibrate it, recorded in the truth file.
     """
     writer = BagWriter(path)
     truth, params, camera, table = map(writer.beside, _BESIDE)
     tables = [] if scenario.table is None else [table]
     products.check_outputs((*writer.outputs(), truth, params, camera, *tables))
+    length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0
+    turn_rad = length_px / float(scenario.truth.camera.parameters[0])
+    scenario = dataclasses.replace(
+        scenario, prior=mistakes.prior(scenario.prior), turn_rad=(0.0, turn_rad, 0.0)
+    )
     content = parameters(scenario, f'file://{camera.resolve()}')
     if scenario.table is not None:
         content['/**']['ros__parameters'] |= {
@@ -130,15 +221,18 @@ def write_bag(
             'magnitude_limit': scenario.magnitude_limit,
             'prior_alignment_sigma_deg': math.degrees(synthetic.MOUNTING_SIGMA_RAD),
         }
-    truth_text = json.dumps(truth_content(scenario, writer.file.name), indent=1) + '\n'
+    true = truth_content(scenario, writer.file.name)
+    if mistakes != NO_MISTAKES:
+        true['mistakes'] = dataclasses.asdict(mistakes)
+    truth_text = json.dumps(true, indent=1) + '\n'
     with writer:
         for index, image in enumerate(images(scenario)):
             samples = synthetic.attitude_samples(scenario, index)
             for sample in (s for s in samples if s.time_ns <= image.time_ns):
-                _write_telemetry(writer, sample)
-            writer.write_image(IMAGE_TOPIC, image, 'camera')
+                _write_telemetry(writer, sample, mistakes)
+            writer.write_image(IMAGE_TOPIC, mistakes.image(image), 'camera')
             for sample in (s for s in samples if s.time_ns > image.time_ns):
-                _write_telemetry(writer, sample)
+                _write_telemetry(writer, sample, mistakes)
             on_image(index)
         # Just before the bag replaces an older one, so that all files are replaced together.
         write_atomically(truth, truth_text)
@@ -149,12 +243,12 @@ def write_bag(
     return SimulatedBag(path, truth, params, camera)
 
 
-def _write_telemetry(writer: BagWriter, sample: AttitudeSample) -> None:
+def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
     # The velocity of the Earth, as in the simulated directions.
     velocity_m_s = earth_velocity_c(sample.time_ns) * SPEED_OF_LIGHT_M_S
     writer.write_velocity(VELOCITY_TOPIC, sample.time_ns, velocity_m_s, 'icrf')
-    xyzw = sample.icrf_from_star_tracker_xyzw
-    writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, xyzw, 'icrf')
+    quaternion = mistakes.attitude(sample.icrf_from_star_tracker_xyzw)
+    writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
 
 
 def parameters(

@@ -36,7 +36,6 @@ from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, Temperature
 from std_srvs.srv import Trigger
-from tiny_campaign import unsound_bag  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
@@ -141,7 +140,9 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
     client: Client, start_node: StartNode, tmp_path: Path
 ) -> None:
     """The observer measures the images that matched no star again with the first calibration."""
-    bag, out = unsound_bag(tmp_path), tmp_path / 'out'
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    wrong = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
+    assert main(['simulate', '--scenario', 'tiny', *wrong, '-o', str(bag)]) == 0
     given = ('--params', str(bag / 'params.yaml'), '--no-report')
     assert main(['calibrate', str(bag), *given, '-o', str(out)]) == 0
     for name in BOTH:

@@ -13,6 +13,8 @@ parameter file beside the bag.
   starcal simulate -o sim2 --scenario small --seed 2
   # the camera of sim with other noise, twelve stars in each image
   starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
+  # a deliberate mistake, to practise the diagnosis
+  starcal simulate -o mirrored --scenario tiny --flip
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import dataclasses
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ros.errors import OptionError
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -40,6 +43,30 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--images', type=number(int, 1), metavar='N', help=what)
     what = 'draw only the N brightest stars of each image'
     add('--stars-per-image', type=number(int, 1), metavar='N', help=what)
+    add = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"').add_argument
+    what = 'mirror the images (default where no side is given: left-right)'
+    sides = ('left-right', 'top-bottom')
+    add('--flip', nargs='?', default='', const=sides[0], choices=sides, help=what)
+    what = 'angle of a counterclockwise rotation of the images, degrees'
+    angles = (0, 90, 180, 270)
+    add('--rotate', dest='rotate_deg', type=int, choices=angles, default=0, help=what)
+    what = 'direction of the attitudes in the bag; the parameter file has st_to_inertial'
+    directions = ('st_to_inertial', 'inertial_to_st')
+    add('--attitude-direction', choices=directions, default=directions[0], help=what)
+    what = 'order of the numbers of the quaternions in the bag'
+    add('--quaternion-order', choices=('xyzw', 'wxyz'), default='xyzw', help=what)
+    for name, low, high, metavar, what in (
+        ('alignment-error', -180, 180, 'DEG', 'error of the prior alignment, degrees'),
+        ('focal-error', -90, 400, 'PERCENT', 'error of the prior focal length, percent'),
+        ('clock-error', -1e9, 1e9, 'S', 'delay of the image stamps, s, over 0.75'),
+    ):
+        add(f'--{name}', dest=f'{name.replace("-", "_")}_{metavar.lower()}',
+            type=number(float, low, high), default=0.0, metavar=metavar, help=what)  # fmt: skip
+    what = 'length of the streak of a star, px'
+    length = number(int, 1, 200)
+    add('--smear', dest='smear_px', type=length, default=1, metavar='PX', help=what)
+    what = 'tone curve: pixel values grow with light to the power 1/G'
+    add('--gamma', type=number(float, 0.2, 5), default=1.0, metavar='G', help=what)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,8 +81,17 @@ def run(args: argparse.Namespace) -> int:
         image_count=args.images or scenario.image_count,
         stars_per_image=args.stars_per_image,
     )
+    mistakes = arguments.record_of(simulated_bag.Mistakes, args)
+    still_s = max(synthetic.ATTITUDE_OFFSETS_S)
+    if 0 < abs(mistakes.clock_error_s) <= still_s:
+        raise OptionError(
+            f'--clock-error: {mistakes.clock_error_s:g} s changes no result: in the scenarios the'
+            f' camera is at rest, or turns evenly, within {still_s:g} s of an image; give more'
+        )
     with progress_bar(scenario.image_count, 'images') as advance:
-        made = simulated_bag.write_bag(scenario, args.output, on_image=lambda _: advance())
+        made = simulated_bag.write_bag(
+            scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
+        )
     print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
     print_text(f'truth {made.truth}')
     if scenario.table is not None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 import re
@@ -16,8 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.cli.main import main
-from starcal_ground.simulation.scenario import scenario
-from starcal_ground.simulation.simulated_bag import write_bag
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
@@ -112,9 +109,9 @@ def test_streaks_that_are_measured_are_identified_too(
 ) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    tiny = scenario('tiny')
-    turn_rad = (0.0, 8.0 / tiny.truth.camera.parameters[0], 0.0)  # a streak of 8 px
-    write_bag(dataclasses.replace(tiny, image_count=5, turn_rad=turn_rad), bag)
+    line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '5']
+    assert main(line) == 0
+    capsys.readouterr()
     assert main(['calibrate', str(bag), *LENS, '-o', str(out), '--no-report']) == 0
     assert '5 of 5 images identified by their stars' in capsys.readouterr().err
     calibration = read_calibration(out / 'calibration.json')

@@ -14,7 +14,6 @@ import cv2
 from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from tiny_campaign import with_wrong_prior  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bag_writer import BagWriter
@@ -184,7 +183,8 @@ def test_an_uncertainty_of_the_mounting_that_is_too_small(
 ) -> None:
     """A field of half a degree, off by another one, and stated to be known to 0.01 degrees."""
     given = dataclasses.replace(scenario('narrow'), image_count=6)
-    made = simulated_bag.write_bag(with_wrong_prior(given, 0.5), tmp_path / 'bag')
+    mistakes = simulated_bag.Mistakes(alignment_error_deg=0.5)
+    made = simulated_bag.write_bag(given, tmp_path / 'bag', mistakes=mistakes)
     write_deep_catalog(tmp_path / 'bag' / 'gaia.csv', tmp_path / 'bag' / 'gaia.npz')
     text = made.params.read_text()
     made.params.write_text(re.sub(r'(alignment_sigma_deg): .*', r'\1: 0.01', text))
@@ -249,3 +249,12 @@ def test_parameters_outside_a_section(
     assert main.main(['inspect', str(TINY), '--params', str(path)]) == 2
     wanted = 'write /**: above' if top else 'write /**: and ros__parameters: above'
     assert wanted in capsys.readouterr().err
+
+
+def test_a_clock_error_that_shows_nothing_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ['simulate', '-o', str(tmp_path / 'bag'), '--scenario', 'tiny']
+    assert main.main([*command, '--clock-error', '-0.5']) == 2
+    assert '--clock-error: -0.5 s changes no result' in capsys.readouterr().err
+    assert not (tmp_path / 'bag').exists()
