@@ -81,11 +81,6 @@ class BagWriter:
         there = [path for end in _OF_BAGS for path in self.file.parent.glob(end)]
         return [self.file, self._metadata_file, *there]
 
-    def beside(self, name: str) -> Path:
-        """A file in the folder of the bag; NAME_ and its name beside a single file NAME.mcap."""
-        start = '' if self._metadata_file else f'{self.file.stem}_'
-        return self.file.with_name(f'{start}{name}')
-
     def write(self, topic: str, type_name: str, time_ns: int, message: codec.Message) -> None:
         """Write a message; raises BagError where the disk is full or a field cannot hold it."""
         # A recording time is not negative; the stamp in the message is written as it is.

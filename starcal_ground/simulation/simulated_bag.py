@@ -195,8 +195,8 @@ def write_bag(
     Render a scenario to a bag, and write its truth and the files to calibrate it.
 
     A bag folder holds ``truth.json``, ``params.yaml``, ``camera.yaml`` and, for a deep sky,
-    ``gaia.csv``; beside a single file ``NAME.mcap`` they are ``NAME_truth.json`` and so on. Raises
-    BagError when a file cannot be written, and ProductError as `check_outputs` does.
+    ``gaia.csv``; for a single file ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and
+    so on. Raises BagError when a file cannot be written, and ProductError as `check_outputs` does.
 
     Parameters
     ----------
@@ -206,7 +206,11 @@ def write_bag(
         Mistakes of the bag and of the files to calibrate it, recorded in the truth file.
     """
     writer = BagWriter(path)
-    truth, params, camera, table = map(writer.beside, _BESIDE)
+    if path.suffix == '.mcap':
+        beside = (f'{path.stem}.json', *(f'{path.stem}_{name}' for name in _BESIDE[1:]))
+    else:
+        beside = _BESIDE
+    truth, params, camera, table = (writer.file.with_name(name) for name in beside)
     tables = [] if scenario.table is None else [table]
     products.check_outputs((*writer.outputs(), truth, params, camera, *tables))
     length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0

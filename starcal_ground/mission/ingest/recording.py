@@ -32,7 +32,6 @@ IMAGE_TOPIC = '/camera/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'
 VELOCITY_TOPIC = '/spacecraft/velocity'
 TEMPERATURE_TOPIC = '/camera/temperature'
-_BESIDE = ('import.json', 'params.yaml', 'camera.yaml')  # record, parameters, camera
 _MARGIN_NS = 60 * NANOSECONDS_PER_SECOND  # for an offset of the stamps of the camera
 _COARSE = 1 / 3  # step of the pixel values over their noise from which centroids lose accuracy
 
@@ -101,12 +100,21 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
 
     Raises ProductError naming the file.
     """
-    writer = BagWriter(bag)
-    record, params, copied = map(writer.beside, _BESIDE)
+    record, params, copied = _files_beside(bag)
     prior = [params] if camera else []
     if camera and not products.same_as_one_of(copied, [camera]):
         prior.append(copied)
-    products.check_outputs((*writer.outputs(), record, *prior), inputs)
+    products.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
+
+
+def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
+    """Paths of the record, the parameter file and the camera file of a bag."""
+    start = f'{bag.stem}_' if bag.suffix == '.mcap' else ''
+    record, params, camera = (
+        BagWriter(bag).file.with_name(f'{start}{name}')
+        for name in ('import.json', 'params.yaml', 'camera.yaml')
+    )
+    return record, params, camera
 
 
 def write_bag(
@@ -134,7 +142,7 @@ def write_bag(
     scale = photographs.common_scale(files, options)
     notes += _scale_notes(files, scale)
     writer = BagWriter(bag)
-    record, params, copied = map(writer.beside, _BESIDE)
+    record, params, copied = _files_beside(bag)
     content = {
         'bag': writer.file.name,
         'images': [file.path.name for file in files],

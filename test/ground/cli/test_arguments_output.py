@@ -159,9 +159,7 @@ WRITING: dict[str, str] = {
     'simulate --scenario tiny -o HERE/o': (
         'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
     ),
-    'simulate --scenario tiny -o HERE/o/b.mcap': (
-        'b.mcap b_truth.json b_params.yaml b_camera.yaml'
-    ),
+    'simulate --scenario tiny -o HERE/o/b.mcap': ('b.mcap b.json b_params.yaml b_camera.yaml'),
     (
         'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
         ' HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o'

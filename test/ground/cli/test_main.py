@@ -411,7 +411,7 @@ def test_simulate_writes_bag_truth_and_parameters(run: Run, tmp_path: Path) -> N
     assert run('simulate', '-o', tmp_path / 'b.mcap', *made)[0] == 0
     same = (tmp_path / 'bag' / truth['bag']).read_bytes()
     assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
-    assert json.loads((tmp_path / 'b_truth.json').read_text()) == {**truth, 'bag': 'b.mcap'}
+    assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}
 
 
 def examples() -> list[tuple[str, list[str]]]:
