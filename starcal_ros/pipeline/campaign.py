@@ -167,7 +167,10 @@ def _measured_again(
     if not wanted:
         return before, ''
     setup = replace(source.setup, prior=calibration.geometry)
-    second = bag_topics.read(source.bags, source.topics, setup, wanted=wanted.__contains__)
+    # Alone, as the nodes measure the few images that matched nothing.
+    second = bag_topics.read(
+        source.bags, source.topics, setup, wanted=wanted.__contains__, is_sequence=lacks_stars
+    )
     new = {record.time_ns: record for record in second if not record.refusal}
     records = [new.get(old.time_ns, old) if old.refusal in again else old for old in before]
     matched = sum(bool(a.refusal) - bool(b.refusal) for a, b in zip(before, records, strict=True))

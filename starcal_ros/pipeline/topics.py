@@ -153,13 +153,15 @@ def read(
     setup: Setup,
     on_image: OnImage | None = None,
     wanted: Wanted | None = None,
+    is_sequence: bool = True,
 ) -> Iterator[StarObservations]:
     """
     Observations of bags, as recorded or measured in the images, with few images in memory.
 
     ``on_image`` is called with each decoded image, its observations and the geometry that
-    predicted its stars.  Images whose stamp is not ``wanted`` are skipped.  Raises BagError when
-    the bag cannot be read or a topic is not in it.
+    predicted its stars.  Images whose stamp is not ``wanted`` are skipped.  Unless they are a
+    sequence, each is measured without those before it.  Raises BagError when the bag cannot be
+    read or a topic is not in it.
     """
     if topics.observations:
         recorded = reader.read_observations(paths, topics.observations)
@@ -172,6 +174,7 @@ def read(
             continue
         warn_of_clock(frame.image.time_ns)
         if wanted is None or wanted(frame.image.time_ns):
+            track = track if is_sequence else Track(setup.prior)
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
             if on_image is not None:
