@@ -23,6 +23,7 @@ from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.sky import astrometry, attitude
 
 BOUND_SNR = 5.0
+_AT_ONCE = 32  # stars whose pixels a processor has at hand
 
 
 def bound_names(camera: CameraModel) -> tuple[str, ...]:
@@ -153,22 +154,25 @@ def centroid_bound(
     (u, share_u, slope_u), (v, share_v, slope_v) = (
         _stamps_along(pixels_px[:, k], sigma_px, path_px[:, k], reach_px) for k in (0, 1)
     )
-    # Of all parts of the path together: products of matrices.
-    count = share_u.shape[1]
-    shape_of_star = share_v.transpose(0, 2, 1) @ share_u / count
-    by_u = share_v.transpose(0, 2, 1) @ slope_u / count
-    by_v = slope_v.transpose(0, 2, 1) @ share_u / count
-    # By log flux, which keeps the matrix well scaled.
-    gradients = flux[:, None] * np.stack([by_u, by_v, shape_of_star], axis=1)
-    mean = flux * shape_of_star
     full_electrons = (detector.full_dn - detector.offset_dn) * detector.electrons_per_dn
-    usable = (mean + detector.background_electrons < full_electrons) & (
-        ((v >= 0) & (v < height))[:, :, None] & ((u >= 0) & (u < width))[:, None, :]
-    )
-    weight = usable / (mean + detector.noise_electrons**2)
-    information = np.einsum('niyx,nyx,njyx->nij', gradients, weight, gradients)
+    on_detector = (v >= 0) & (v < height), (u >= 0) & (u < width)
+    information = np.empty((len(flux), 3, 3))
+    for first in range(0, len(flux), _AT_ONCE):
+        k = slice(first, first + _AT_ONCE)
+        # Of all parts of the path together: products of matrices.
+        of_star = flux[k] / share_u.shape[1]
+        along_u, along_v = share_u[k], share_v[k].transpose(0, 2, 1)
+        # By log flux, which keeps the matrix well scaled.
+        gradients = np.empty((len(of_star), 3, v.shape[1], u.shape[1]))
+        gradients[:, 0] = of_star * (along_v @ slope_u[k])
+        gradients[:, 1] = of_star * (slope_v[k].transpose(0, 2, 1) @ along_u)
+        gradients[:, 2] = mean = of_star * (along_v @ along_u)
+        usable = mean + detector.background_electrons < full_electrons
+        usable &= on_detector[0][k, :, None] & on_detector[1][k, None, :]
+        weight = usable / (mean + detector.noise_electrons**2)
+        information[k] = np.einsum('niyx,nyx,njyx->nij', gradients, weight, gradients)
     # The last term keeps stars without any information invertible.
-    covariance = np.linalg.inv(information + 1e-6 * np.eye(3))
+    covariance: Floats = np.asarray(np.linalg.inv(information + 1e-6 * np.eye(3)), np.float64)
     return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
 
 

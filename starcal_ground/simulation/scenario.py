@@ -12,7 +12,7 @@ or one of each sample.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import functools
 import math
@@ -291,16 +291,22 @@ def camera_from_icrf(scenario: Scenario, index: int, offset_s: float = 0.0) -> F
 
 
 def _icrf_from_star_tracker_xyzw(
-    scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True, sample: int = 0
+    scenario: Scenario, index: int, offsets_s: Sequence[float] = (0.0,), noise: bool = True
 ) -> Floats:
-    """Reported star-tracker attitude (4,): the truth with the error of a sample of the image."""
+    """
+    Reported star-tracker attitudes (n, 4) at times about an image: the truth with errors.
+
+    Each sample of a star tracker with a rate has an error of its own, else all have that of the
+    image.
+    """
     camera_from_star_tracker = scenario.truth.star_tracker_from_camera.inv()
-    icrf_from_camera = Rotation.from_matrix(camera_from_icrf(scenario, index, offset_s)).inv()
+    true = np.array([camera_from_icrf(scenario, index, offset_s) for offset_s in offsets_s])
     # The tracker's frame is off by small passive angles about its own axes.
     sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD
     rng = random_stream(scenario.seed, ATTITUDE_STREAM, index)
-    error_rad = noise * sigma_rad * rng.normal(size=(sample + 1, 3))[sample]
-    reported = icrf_from_camera * camera_from_star_tracker * Rotation.from_rotvec(error_rad)
+    count = len(offsets_s) if scenario.star_tracker_hz else 1
+    error = Rotation.from_rotvec(noise * sigma_rad * rng.normal(size=(count, 3)))
+    reported = Rotation.from_matrix(true).inv() * camera_from_star_tracker * error
     return np.asarray(reported.as_quat())
 
 
@@ -310,19 +316,19 @@ def attitude_samples(scenario: Scenario, index: int) -> tuple[AttitudeSample, ..
     if hz:
         half = int(SAMPLES_S * hz)
         offsets_s = tuple((k + 0.5) / hz for k in range(-half, half))
+    reported_xyzw = _icrf_from_star_tracker_xyzw(scenario, index, offsets_s)
     return tuple(
         AttitudeSample(
-            scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND),
-            _icrf_from_star_tracker_xyzw(scenario, index, offset_s, sample=k if hz else 0),
+            scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND), one_xyzw
         )
-        for k, offset_s in enumerate(offsets_s)
+        for offset_s, one_xyzw in zip(offsets_s, reported_xyzw, strict=True)
     )
 
 
 def _at_image_xyzw(scenario: Scenario, index: int, noise: bool) -> Floats:
     """Reported attitude (4,) at an image; between its samples, if each has its own error."""
     if not (scenario.star_tracker_hz and noise):
-        return _icrf_from_star_tracker_xyzw(scenario, index, noise=noise)
+        return np.asarray(_icrf_from_star_tracker_xyzw(scenario, index, noise=noise)[0])
     history = AttitudeHistory()
     for sample in attitude_samples(scenario, index):
         history.add(sample.time_ns, sample)

@@ -58,11 +58,12 @@ def line_of_sight_table(
 ) -> LineOfSightTable:
     """Return the lines of sight of pixels (n, 2)."""
     columns: list[tuple[Floats, ...]] = []
+    common = common_rotation(camera)
     for first in range(0, len(pixels), CHUNK):
         derivatives = Derivatives.at(camera, pixels[first : first + CHUNK])
         sigmas = (
             sigma_arcsec(derivatives.covariance_rad2(covariance, J))
-            for J in (derivatives.of_shape(camera), derivatives.J)
+            for J in (derivatives.of_shape(camera, common), derivatives.J)
         )
         columns.append((derivatives.directions, *sigmas))
     return LineOfSightTable(pixels, *map(np.concatenate, zip(*columns, strict=True)))

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table, movement
+from starcal_ros.assessment.lookup import (
+    common_rotation,
+    GRID,
+    grid_derivatives,
+    line_of_sight_table,
+    movement,
+    sigma_arcsec,
+)
 from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import information_of_images, stars_alone, StarSums
@@ -239,8 +246,10 @@ def keep_most_informative(
 
 def map_sigma_px(camera: CameraModel, covariance: MapCovariance) -> Floats:
     """1-sigma (GRID * GRID,) of the shape of the map, in pixels at the centre."""
-    table = line_of_sight_table(camera, covariance, pixel_grid(camera, GRID, GRID))
-    return np.asarray(table.shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
+    grid = grid_derivatives(camera)
+    J = grid.of_shape(camera, common_rotation(camera, grid))
+    shape_sigma_arcsec = sigma_arcsec(grid.covariance_rad2(covariance, J))
+    return np.asarray(shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
 
 
 def map_error_px(found: CameraModel, true: CameraModel) -> float:

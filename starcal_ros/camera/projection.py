@@ -143,6 +143,11 @@ class CameraModel(Record):
         seen = cosine[np.isfinite(cosine)]
         return float(np.arccos(seen).mean()) if len(seen) else np.inf
 
+    @functools.cached_property
+    def _field_radii_rad(self) -> dict[float, float]:
+        """Found by `field_radius_rad`, by the margin in px: each image asks for the same one."""
+        return {}
+
     @property
     def opencv_coefficients(self) -> Floats:
         """Distortion (c,) in OpenCV's order: for cv2, or cv2.fisheye if ``equidistant``."""
@@ -409,6 +414,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     It is the larger of the angles with and without distortion: a prior distortion may have no line
     of sight at the edge, and the estimated one may lie between the two.
     """
+    if margin_px in camera._field_radii_rad:
+        return camera._field_radii_rad[margin_px]
     w, h, m = camera.width - 1, camera.height - 1, margin_px
     edge = np.concatenate(
         [
@@ -419,7 +426,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     undistorted = np.r_[camera.intrinsics, np.zeros(len(camera.distortion))]
     pinhole = dataclasses.replace(camera, parameters=undistorted)
     z = np.r_[line_of_sight(camera, edge)[:, 2], line_of_sight(pinhole, edge)[:, 2]]
-    return float(np.arccos(np.nanmin(z)))
+    radius_rad = float(np.arccos(np.nanmin(z)))
+    return camera._field_radii_rad.setdefault(margin_px, radius_rad)
 
 
 def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:

@@ -54,7 +54,7 @@ _TAIL = 2.0  # degrees of freedom of the errors of stars
 _ROUNDING = 1e-9  # of sums over pairs, where there are none
 _ROUNDS = 8  # of the factors of stars
 # Of a floor of the centroids that is noise, and of one that is structure, each against none.
-_FLOOR_ODDS = 0.2
+_FLOOR_ODDS = 0.02
 _SHARES = 20  # of a floor that may be structure
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
@@ -204,8 +204,11 @@ def shared_errors(
     octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
     first = longest * _beside_stars(of_places, share)
     variances = chain_means(first, _increments(moments[:octaves]))
-    beyond_px2 = max(floor_px2[0] - place_px2, 0.0)
-    of_floor_px2 = _of_floor(beyond_px2, floor_px2[1], np.array(moments[:octaves]))
+    stars = np.unique(star[used])
+    places_px2 = float(usual_px2[used].mean())
+    sigma_px2 = math.hypot(floor_px2[1], places_px2 / math.sqrt(max(len(stars), 1)))
+    beyond_px2 = max(floor_px2[0] - places_px2, 0.0)
+    of_floor_px2 = _of_floor(beyond_px2, sigma_px2, np.array(moments[:octaves]))
     variances = max(variances, of_floor_px2, key=sum)
     # Strips of rows and of columns are chains of their own, from the coarser to the finer.
     for first_strip in range(octaves, len(moments), len(_STRIPS)):

@@ -459,7 +459,9 @@ def judge(
         raise NotObservable('no image has three stars that fit')
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
-        floor = (variance.floor_px2, variance.floor_sigma_px2)
+        # As the residuals have it: they are smaller than the errors by the degrees of freedom.
+        left = 0.5 * float(freedom[kept].mean())
+        floor = (left * variance.floor_px2, left * variance.floor_sigma_px2)
         errors = shared_errors(
             residual_px, own_px2, kept, data.groups, from_sky, found.last_octave, floor
         )

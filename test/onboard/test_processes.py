@@ -46,20 +46,20 @@ def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str
         ['--version'],
         # The lens is stated, so that the search for the camera, whose modules count too, is short.
         [
-            *('inspect', str(ROOT / 'bags' / 'tiny')),
+            *('inspect', 'BAG'),
             *('--focal-length-mm', '18', '--pixel-size-um', '10'),
         ],
         [
-            *('trend', str(ROOT / 'bags'), '-o', 'out', '--workers', '1'),
-            *('--params', str(ROOT / 'bags' / 'tiny' / 'params.yaml')),
+            *('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml'),
         ],
     ],
     ids=['version', 'inspect', 'trend'],
 )
 def test_modules_of_the_current_folder_are_not_run(
-    hostile: Path, start: list[str], arguments: list[str]
+    hostile: Path, few_images: Path, start: list[str], arguments: list[str]
 ) -> None:
-    done = run([*start, *arguments], hostile)
+    given = [word.replace('BAG', str(few_images)) for word in arguments]
+    done = run([*start, *given], hostile)
     assert done.returncode == 0, done.stderr
     assert not (hostile / 'marks').exists(), (hostile / 'marks').read_text()
 

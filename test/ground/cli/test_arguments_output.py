@@ -153,7 +153,7 @@ WRITING: dict[str, str] = {
     ),
     'report HERE/o': 'report.html',
     'calibrate HERE/bag -o HERE/o': 'params.yaml camera.yaml',
-    f'plan {_OF_BAG} --images 1 -o HERE/o/plan.csv': 'plan.csv',
+    f'plan {_OF_BAG} --images 1 --pointings HERE/places.csv -o HERE/o/plan.csv': 'plan.csv',
     'lookup HERE/out -o HERE/o/a.csv --points 2': 'a.csv',
     'lookup HERE/out -o HERE/o/a.npz --points 2': 'a.npz',
     'simulate --scenario tiny -o HERE/o': (
@@ -214,6 +214,7 @@ def inputs(campaign: Path) -> Path:
     rows = [','.join(map(str, row)) for row in columns]
     header = 'source_id,ra,dec,phot_g_mean_mag'
     (campaign / 'gaia.csv').write_text('\n'.join([header, *rows, '']))
+    (campaign / 'places.csv').write_text('ra_deg,dec_deg\n1,2\n')
     write_lsk(campaign / 'bag/naif0012.tls')
     write_sclk(campaign / 'bag/clock.tsc')
     return campaign

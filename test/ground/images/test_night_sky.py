@@ -299,7 +299,7 @@ TOO_FEW: dict[str, tuple[Callable[[], Sequence[Pixels]], str]] = {
     'one, compressed again': (compressed_again, r'1 different image \(3 more are copies\)'),
     'two of one field': (of_one_field, '^2 different images, 3 are needed'),
     'no sky': (
-        lambda: [*frames_of(2), lights(0)],
+        lambda: [*frames_of(2), lights(0, 15)],
         '2 of 3 images match the sky, 3 are needed: take 20 frames.*no frames of anything else',
     ),
     'no stars': (flat, 'no stars: .* take 20 frames'),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bench.frames import load_set_up
+from starcal_ground.planning import plan
 from starcal_ground.planning.plan import Cone, Plan, plan_pointings, Pointing, Request, target
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import camera_from_icrf, Inertial, scenario
@@ -50,6 +51,12 @@ def _taken(ensemble: Ensemble, planned: Plan) -> Ensemble:
     return dataclasses.replace(ensemble, images=(*ensemble.images, *more.images))
 
 
+@pytest.fixture(autouse=True)
+def few_candidates(planned: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quarter of what `planned` had, for claims that are not of their number."""
+    monkeypatch.setattr(plan, '_CANDIDATES', 40)
+
+
 def test_a_pointing_is_the_attitude_of_the_simulation() -> None:
     base = dataclasses.replace(scenario('tiny'), pointing=Inertial(((123.0, -45.0, 67.0),)))
     by_plan = Pointing(123.0, -45.0, 67.0).icrf_from_camera.inv().as_matrix()
@@ -81,8 +88,8 @@ def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
     here, there = Pointing(10.0, 40.0, 5.0), Pointing(200.0, -20.0, 70.0)
 
     def sigmas(*allowed: Pointing) -> list[float]:
-        plan = plan_pointings(ensemble, setup, Request(len(allowed), name, allowed))
-        return [plan.sigma, *(step.sigma for step in plan.steps)]
+        found = plan_pointings(ensemble, setup, Request(len(allowed), name, allowed))
+        return [found.sigma, *(step.sigma for step in found.steps)]
 
     same, pair, back = sigmas(here, here, here), sigmas(here, there), sigmas(there, here)
     for each in (same, pair):

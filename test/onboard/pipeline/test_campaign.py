@@ -89,9 +89,11 @@ def by_trend(bag: Path) -> Mapping[str, Any]:
 
 
 def by_plan(bag: Path, capsys: pytest.CaptureFixture[str]) -> Mapping[str, Any]:
-    """The sigma from which a plan starts."""
+    """The sigma from which a plan starts, whatever pointings it chooses from."""
     capsys.readouterr()
-    wanted = ['--images', '1', '--minimise', 'fx', '--json']
+    pointings = bag.parent / 'pointings.csv'
+    pointings.write_text('ra_deg,dec_deg\n1,2\n')
+    wanted = ['--images', '1', '--minimise', 'fx', '--json', '--pointings', str(pointings)]
     assert main(['plan', str(bag), '--params', str(bag / 'params.yaml'), *wanted]) == 0
     return {'sigma of fx': json.loads(capsys.readouterr().out)['sigma']}
 
