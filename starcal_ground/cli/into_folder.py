@@ -94,7 +94,13 @@ def calibrate_into(
         made = _calibrated(folder, observed, inputs(), album)
         pictures: tuple[thumbnails.Thumbnail, ...] = ()
         with drawings.kind('pictures of images'):
-            pictures = thumbnails.ordered(drawn.result())
+            again = {
+                id(old): new
+                for old, new in zip(observed.measured, made.observations, strict=True)
+                if new.measured_px is not old.measured_px
+            }
+            shown = album.thumbnails_again(again, made.calibration.geometry)
+            pictures = thumbnails.ordered((*drawn.result(), *shown))
         # The disk is waited for, twice a picture, while the report is drawn.
         places = pictures, folder / thumbnails.THUMBNAILS_FOLDER
         written = thread.submit(thumbnails.write_thumbnails, *places)

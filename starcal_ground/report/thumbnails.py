@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 import itertools
 from pathlib import Path
 import re
@@ -107,8 +107,20 @@ class Album:
 
     def thumbnails(self) -> tuple[Thumbnail, ...]:
         """All selected thumbnails."""
-        whole = [*self.used, *(one for group in self.refused.values() for one in group)]
-        return tuple(one.drawn() for one in whole)
+        return tuple(one.drawn() for one in self._selected())
+
+    def thumbnails_again(
+        self, again: Mapping[int, StarObservations], geometry: CameraGeometry
+    ) -> tuple[Thumbnail, ...]:
+        """Those of images measured again; ``again`` has what `show` was given by its `id`."""
+        return tuple(
+            replace(one, observations=again[id(one.observations)], geometry=geometry).drawn()
+            for one in self._selected()
+            if id(one.observations) in again
+        )
+
+    def _selected(self) -> list[_Reduced]:
+        return [*self.used, *(one for group in self.refused.values() for one in group)]
 
 
 def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:

@@ -53,9 +53,9 @@ _NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _ROUNDING = 1e-9  # of sums over pairs, where there are none
 _ROUNDS = 8  # of the factors of stars
-# That there is a floor of the centroids, and as much that it is structure, to none.
+# Of a floor of the centroids that is noise, and of one that is structure, each against none.
 _FLOOR_ODDS = 0.02
-_SHARES = 20  # of a floor
+_SHARES = 20  # of a floor that may be structure
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )

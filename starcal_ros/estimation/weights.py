@@ -80,10 +80,11 @@ class CentroidVariance:
     """
     Correction of the centroid covariances C: ``f(magnitude) (scale C + floor_px2 I)``.
 
-    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air.
-    The scale corrects a wrong detector gain.  The factor f covers errors that come with
-    brightness, as of saturated cores: linear between ``class_magnitude`` (k,), ascending, with
-    the values ``class_factor`` (k,), and constant outside; 1 where both are empty.
+    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air;
+    ``floor_sigma_px2`` is its 1-sigma, infinite where all C are alike.  The scale corrects a wrong
+    detector gain.  The factor f covers errors that come with brightness, as of saturated cores:
+    linear between ``class_magnitude`` (k,), ascending, with the values ``class_factor`` (k,), and
+    constant outside; 1 where both are empty.
     """
 
     scale: float
@@ -489,7 +490,7 @@ def towards(one: Judged, other: Judged, share: float) -> Judged:
     )
     scale, floor_px2 = part(a.scale, b.scale), part(a.floor_px2, b.floor_px2)
     factor = tuple(map(part, a.class_factor, b.class_factor))
-    variance = CentroidVariance(scale, floor_px2, b.class_magnitude, factor)
+    variance = dataclasses.replace(b, scale=scale, floor_px2=floor_px2, class_factor=factor)
     attitudes = dataclasses.replace(to, trackers=trackers)
     return dataclasses.replace(other, variance=variance, attitudes=attitudes)
 

@@ -171,8 +171,12 @@ def _measured_again(
     second = bag_topics.read(
         source.bags, source.topics, setup, wanted=wanted.__contains__, is_sequence=lacks_stars
     )
-    new = {record.time_ns: record for record in second if not record.refusal}
-    records = [new.get(old.time_ns, old) if old.refusal in again else old for old in before]
+    # In the order of the bag, as before: two images may have one stamp.
+    found = (record for record in second if record.time_ns in wanted)
+    records = []
+    for old in before:
+        new = next(found, old) if old.time_ns in wanted else old
+        records.append(old if new.refusal or old.refusal not in again else new)
     matched = sum(bool(a.refusal) - bool(b.refusal) for a, b in zip(before, records, strict=True))
     stars = sum(len(record) for record in records) - sum(len(record) for record in before)
     if lacks_stars and stars > 0:

@@ -29,7 +29,9 @@ import pytest
 from scipy.special import eval_jacobi
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import rotation_jacobian
+from starcal_ros.camera import CameraModel, project, rotation_jacobian
+from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.estimation import unknowns as module
 from starcal_ros.estimation.equations import star_columns, tracker_turns
 from starcal_ros.estimation.problem import attitude_errors
 from starcal_ros.estimation.tracker_errors import Rates
@@ -139,6 +141,18 @@ def test_a_derivative_by_pixels_is_that_of_the_projection(
     size = np.abs(expected).max(axis=0)
     assert (size > 0).all()
     assert np.abs(white @ X[:, at] - expected).max(axis=0) / size == pytest.approx(0.0, abs=EXACT)
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
+def test_lateral_colour_is_a_change_of_the_focal_length(model: str) -> None:
+    centre_px, angle = np.array([600.0, 400.0]), np.linspace(0.0, 1.2, 7)
+    parameters = np.r_[[900.0, 0.0, 900.0], centre_px, np.zeros(len(COEFFICIENTS[model]))]
+    camera = CameraModel(WIDTH, HEIGHT, parameters, model)
+    e = np.stack([0.8 * np.sin(angle), 0.6 * np.sin(angle), np.cos(angle)], axis=1)
+    turns = module._by_scale(model, e.T, e.T, np.zeros(7, np.int64))[:, 0]
+    moved_px = np.einsum('nab,bn->na', rotation_jacobian(camera, e), turns)
+    # Without distortion, all that the focal length changes is the distance from the centre.
+    assert moved_px == pytest.approx(project(camera, e) - centre_px, abs=1e-9)
 
 
 @pytest.mark.parametrize('name', ['alignment', 'rate', 'mountings', 'stamps'])

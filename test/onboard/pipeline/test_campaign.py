@@ -9,7 +9,8 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from mission_files import images, TINY  # type: ignore[import-not-found]
+import cv2
+from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
@@ -138,6 +139,17 @@ def test_images_measured_again_have_the_air_of_all(bag: Path, expected: Calibrat
     assert is_known == [is_unsited(bag)] * expected.images_used
 
 
+def test_pictures_of_images_measured_again_show_the_stars_found_then(
+    bag: Path, expected: Calibration
+) -> None:
+    pictures = sorted((bag.parent / 'out' / 'thumbnails').iterdir())
+    assert len(pictures) == expected.images_used
+    for path in pictures:
+        blue, green, red = np.moveaxis(np.asarray(cv2.imread(str(path)), int), 2, 0)
+        # Circles about the measured stars, as the encoding leaves them.
+        assert np.count_nonzero(green - np.maximum(blue, red) > 60) > 20, path.name
+
+
 def test_images_without_a_match_are_measured_with_the_calibration() -> None:
     """No other image is."""
     setup = read_setup(TINY / 'params.yaml')
@@ -155,6 +167,25 @@ def test_images_without_a_match_are_measured_with_the_calibration() -> None:
     # The same stars at the same places, by a search in place of a track.
     common = np.isin(again[2].catalog_id, seen[2].catalog_id)
     assert common.sum() > 0.95 * len(seen[2])
+
+
+def test_of_two_images_of_one_stamp_each_is_measured_again_for_itself(tmp_path: Path) -> None:
+    """Neither matched at first; now the first one does, and the other is out of order."""
+    bag = tmp_path / 'bag.mcap'
+    with BagWriter(bag) as writer:
+        for time_ns, quaternion in attitudes():
+            writer.write_attitude('/star_tracker/attitude', time_ns, quaternion, 'icrf')
+        for image in (*images()[:3], *images()[2:]):
+            writer.write_image('/camera/image_raw', image, 'camera')
+    setup = read_setup(TINY / 'params.yaml')
+    source = campaign.chosen(campaign.Source((bag,), Topics(), setup))
+    before = list(campaign.observe(source).measured)
+    for k in (2, 3):
+        one = before[k]
+        before[k] = refused_image(one.time_ns, one.width, one.height, 'no_match', '')
+    made = campaign.calibrate(campaign.Observed(source, before, tuple(before), ()))
+    assert made.notes[0].startswith('1 image') and made.calibration.images_used == 10
+    assert not made.observations[2].refusal and made.observations[3] is before[3]
 
 
 def test_a_calibration_refused_for_want_of_stars_finds_those_of_a_right_prior(
