@@ -171,12 +171,15 @@ def _measured_again(
     second = bag_topics.read(
         source.bags, source.topics, setup, wanted=wanted.__contains__, is_sequence=lacks_stars
     )
-    # In the order of the bag, as before: two images may have one stamp.
+    # In the order of the bag, as before: two images may have one stamp, of which one is used.
     found = (record for record in second if record.time_ns in wanted)
+    used = {record.time_ns for record in before if not (record.refusal or lacks_stars)}
     records = []
     for old in before:
         new = next(found, old) if old.time_ns in wanted else old
-        records.append(old if new.refusal or old.refusal not in again else new)
+        is_better = not new.refusal and old.refusal in again and new.time_ns not in used
+        records.append(new if is_better else old)
+        used |= {new.time_ns} if is_better else set()
     matched = sum(bool(a.refusal) - bool(b.refusal) for a, b in zip(before, records, strict=True))
     stars = sum(len(record) for record in records) - sum(len(record) for record in before)
     if lacks_stars and stars > 0:
