@@ -375,7 +375,12 @@ def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(
 
 @pytest.mark.parametrize('of_star', [True, False])
 def test_what_stars_of_one_field_share_may_be_structure_of_the_detector(of_star: bool) -> None:
-    """Each star comes to one place of the detector: neighbours tell its error from a wave."""
+    """
+    Each star comes to one place of the detector: neighbours tell its error from a wave.
+
+    Of 400 stars some 140 pairs are neighbours in a cell of the first kind; pairs in the finer
+    cells are of the same stars and count once.
+    """
     m, n, size_px, variances = 25, 400, 0.07, []
     star = np.tile(np.arange(n), m)
     for seed in range(8):
