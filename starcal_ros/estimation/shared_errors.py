@@ -204,6 +204,7 @@ def shared_errors(
     octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
     first = longest * _beside_stars(of_places, share)
     variances = chain_means(first, _increments(moments[:octaves]))
+    # What stars share is in the floor too, and known by their number.
     stars = np.unique(star[used])
     places_px2 = float(usual_px2[used].mean())
     sigma_px2 = math.hypot(floor_px2[1], places_px2 / math.sqrt(max(len(stars), 1)))

@@ -502,9 +502,9 @@ def agree(one: Judged, other: Judged, table: StarTable) -> bool:
     return (
         np.array_equal(one.kept, other.kept)
         and np.array_equal(one.attitudes.misfit, other.attitudes.misfit)
-        # No estimate moves with 2 % of the variances, nor with more of the one of a bright star
-        # that holds its image: that creeps on with a floor near zero, as the variance of places
-        # does where hardly a star is seen twice.
+        # A change of 2 % in the variances moves no estimate.  RMS, not maximum: near a zero floor
+        # the variance of one bright star keeps drifting without effect, as that of places does
+        # where hardly a star is seen twice.
         and _change(one.working_px2(table), other.working_px2(table)) < 0.02
         and math.isclose(
             pixel_variance_px2(one.errors),

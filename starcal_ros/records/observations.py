@@ -120,7 +120,7 @@ class AttitudeSample:
     icrf_from_star_tracker_xyzw: Floats
 
 
-TEMPERATURES_DEGC = (-273.15, 1000.0)
+LEAST_DEGC, MOST_DEGC = -273.15, 1000.0
 """Lowest and highest temperature of a camera."""
 _Name = Annotated[str, fields.Most(most_characters=100)]
 _Side = Annotated[int, fields.Within(0, MAX_SIDE_PX)]
@@ -220,7 +220,7 @@ class StarObservations(fields.Record):
     noise_dn: _FiniteOrNaN
     psf_sigma_px: _FiniteOrNaN
     catalog_digest: _Name
-    temperature_degc: Annotated[float, fields.Within(*TEMPERATURES_DEGC)] = math.nan
+    temperature_degc: Annotated[float, fields.Within(LEAST_DEGC, MOST_DEGC)] = math.nan
     star_tracker: _Name = ''
     first_from_star_tracker_xyzw: Annotated[_Attitude, fields.Named('first_from_star_tracker')] = (
         dataclasses.field(default_factory=_IDENTITY.copy)

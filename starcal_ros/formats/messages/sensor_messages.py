@@ -20,7 +20,7 @@ from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
-from starcal_ros.records import Image, refused_image, StarObservations, TEMPERATURES_DEGC
+from starcal_ros.records import Image, LEAST_DEGC, MOST_DEGC, refused_image, StarObservations
 
 MOST_PIXELS = 2**27  # of an image: 256 MB of 16 bit
 _SET_CHANNEL = 'is a colour image: set image_channel, e.g. to green'
@@ -402,7 +402,7 @@ def velocity_from_message(message: codec.Message) -> tuple[int, Floats]:
 def temperature_from_message(message: codec.Message) -> tuple[int, float]:
     """Stamp and degrees Celsius of a sensor_msgs/Temperature; NaN where no camera has it."""
     temperature_degc = float(message.temperature)
-    known = TEMPERATURES_DEGC[0] <= temperature_degc <= TEMPERATURES_DEGC[1]
+    known = LEAST_DEGC <= temperature_degc <= MOST_DEGC
     return codec.stamp_ns(message.header.stamp), temperature_degc if known else math.nan
 
 
