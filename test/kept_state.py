@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Writer of a state folder, for tests that kill its process."""
+"""Writer of a state folder, for tests that kill its process, and a disk that is full."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import functools
 import itertools
 from multiprocessing.connection import Connection
 from pathlib import Path
+import resource
 
 import numpy as np
 from sample_records import calibration  # type: ignore[import-not-found]
@@ -57,3 +58,14 @@ def collect(folder: Path, shown: tuple[StarObservations, ...], told: Connection)
             history = (*history, activation(archive.last_event + 1))[-3:]
             archive.keep(have, history)
             told.send((k, history[-1].event))
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """No file of this process may grow beyond 100 bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

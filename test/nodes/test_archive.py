@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import contextlib
 import dataclasses
 import json
 import multiprocessing
 from pathlib import Path
-import resource
 import shutil
 import time
 
-from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
+from kept_state import activation, collect, full_disk, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_records import assert_same  # type: ignore[import-not-found]
@@ -238,17 +236,6 @@ def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / 'file', tmp_path / 'file' / 'below'):
         with pytest.raises(ArchiveError, match=f'state_dir: {path}'):
             Archive(path, 'camera')
-
-
-@contextlib.contextmanager
-def full_disk() -> Iterator[None]:
-    """No file of this process can grow past a hundred bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_full_disk_is_told_and_tried_again(tmp_path: Path) -> None:

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import contextlib
 import dataclasses
 import itertools
 from pathlib import Path
-import resource
 from typing import Any
 
+from kept_state import full_disk  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
@@ -62,17 +61,6 @@ def filled(
     for image in shown:
         state.add(image)
     return state
-
-
-@contextlib.contextmanager
-def full_disk() -> Iterator[None]:
-    """No file of this process may grow beyond 100 bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.slow
