@@ -243,7 +243,7 @@ def _with_attitudes(given: Scenario, folder: Path) -> tuple[Calibration, Ensembl
     setup = load_set_up(given, prior_alignment_sigma_deg=sigma_deg, **values)
     frames = (render_frame(given, index) for index in range(IMAGES))
     ensemble = observed(frames, setup)
-    return solve.solve(ensemble, setup)[0], ensemble
+    return solve.solve(ensemble, setup), ensemble
 
 
 def _from_images(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:

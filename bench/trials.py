@@ -60,7 +60,7 @@ def score(
     changes, since the error is then that of using the calibration with each of them.
     """
     start_s = time.process_time()
-    found = solve(ensemble, setup)[0]
+    found = solve(ensemble, setup)
     seconds = time.process_time() - start_s
     pixels = pixel_grid(truth.camera, GRID, GRID)
     table = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)

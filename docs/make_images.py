@@ -138,7 +138,7 @@ def star_field(
 
 def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     """The estimated distortion and the star positions it was estimated from."""
-    calibration = solve.solve(ensemble, setup)[0]
+    calibration = solve.solve(ensemble, setup)
     camera = calibration.geometry.camera
     stars = np.concatenate([observed.measured_px for observed in ensemble.images])
     drawn = sheet(

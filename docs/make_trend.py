@@ -95,7 +95,7 @@ def calibrations(months: int = MONTHS) -> Iterator[tuple[Calibration, Ensemble]]
         for image in true_observations(one).images:
             warm = dataclasses.replace(image, temperature_degc=temperature_degc(month))
             ensemble = solve.add_to_ensemble(ensemble, warm, setup)
-        found = solve.solve(ensemble, setup, active=active)[0]
+        found = solve.solve(ensemble, setup, active=active)
         if month % 12 == 0:
             number += 1
             found = dataclasses.replace(

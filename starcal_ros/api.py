@@ -242,7 +242,7 @@ def calibrate_with_residuals(
     # The caller has looked the stars up: the bundled catalog has no part in the result.
     none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')
     setup, ensemble = dataclasses.replace(setup, catalog=none), solve.ensemble_of(images, setup)
-    return solve.solve(ensemble, setup)
+    return solve.solve_with_residuals(ensemble, setup)
 
 
 def calibrate_bag(

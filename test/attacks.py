@@ -56,7 +56,7 @@ def observations() -> tuple[StarObservations, ...]:
 @functools.cache
 def calibration() -> Calibration:
     """Return the calibration of that bag, which passes the gate."""
-    solved = solve.solve(functools.reduce(Ensemble.add, observations(), Ensemble()), setup())[0]
+    solved = solve.solve(functools.reduce(Ensemble.add, observations(), Ensemble()), setup())
     assert solved.accepted, solved.reasons
     return solved
 

@@ -30,7 +30,7 @@ def whole(campaign: Campaign) -> list[Result]:
 
 def estimator(campaign: Campaign) -> list[Result]:
     """From stars to a judged calibration."""
-    return [_result(campaign, *timed(lambda: solve(campaign.ensemble, campaign.setup)[0]))]
+    return [_result(campaign, *timed(lambda: solve(campaign.ensemble, campaign.setup)))]
 
 
 def _result(campaign: Campaign, found: Calibration, processor_s: float) -> Result:

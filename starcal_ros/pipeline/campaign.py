@@ -195,7 +195,7 @@ def _measured_again(
 def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
     setup = observed.source.setup
     ensemble = solve.ensemble_of(observed.observations, setup)
-    calibration, residuals = solve.solve(ensemble, setup, inputs=inputs)
+    calibration, residuals = solve.solve_with_residuals(ensemble, setup, inputs)
     notes = (*observed.notes, *_refusals(observed.observations))
     return Campaign(setup, observed.observations, ensemble, calibration, residuals, notes)
 

@@ -139,20 +139,30 @@ def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     return observability.ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
-@one_blas_thread()
 def solve(
     ensemble: Ensemble,
     setup: Setup,
     inputs: Mapping[str, str] | None = None,
     active: Calibration | None = None,
-) -> tuple[Calibration, Residuals]:
+) -> Calibration:
     """
-    A calibration of the ensemble, judged by the gate, and its residuals by star and image.
+    A calibration of the ensemble, judged by the gate.
 
     ``inputs`` names the sources of the observations, for the provenance; the gate limits the
     change from ``active``, the calibration that this one would replace. Raises TooFewObservations
     when the ensemble is too small; the text names the shortage.
     """
+    return solve_with_residuals(ensemble, setup, inputs, active)[0]
+
+
+@one_blas_thread()
+def solve_with_residuals(
+    ensemble: Ensemble,
+    setup: Setup,
+    inputs: Mapping[str, str] | None = None,
+    active: Calibration | None = None,
+) -> tuple[Calibration, Residuals]:
+    """The calibration of `solve`, and its residuals by star and image."""
     setup = aligned_by(ensemble, setup)
     result = estimated(ensemble, setup)
     provenance = provenance_of(setup, ensemble, inputs or {})

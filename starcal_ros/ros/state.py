@@ -189,7 +189,7 @@ class CalibratorState:
             ensemble, setup = self._ensemble, self._setup
         try:
             asked = with_method(setup, method, estimate)
-            calibration = solving.solve(ensemble, asked, active=self.active)[0]
+            calibration = solving.solve(ensemble, asked, active=self.active)
         except errors.TooFewObservations as error:
             return Answer(False, f'{error}{self._why_refused(ensemble.refused)}')
         except errors.StarcalError as error:

@@ -392,7 +392,7 @@ def test_camera_info_per_image(
     """The active calibration with the header of each image; never the prior or a candidate."""
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
     setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
-    active = solving.solve(tiny_observations, setup)[0]
+    active = solving.solve(tiny_observations, setup)
     assert active.accepted
     candidate = dataclasses.replace(active, accepted=False, reasons=('bad',))
     observer = start_node(

@@ -70,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope='module')
 def calibration(folder: Path) -> Calibration:
     setup = load_setup(read_parameter_file(folder / 'params.yaml', NODES))
-    return solve.solve(true_observations(SCENARIO), setup)[0]
+    return solve.solve(true_observations(SCENARIO), setup)
 
 
 def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60) -> None:

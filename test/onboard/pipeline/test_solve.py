@@ -73,7 +73,7 @@ def test_at_the_limit_an_image_goes_for_each_that_comes(camera_yaml: Path) -> No
 
 
 def test_a_solution_with_its_statistics(setup: Setup) -> None:
-    found = solve.solve(ensemble(), setup)[0]
+    found = solve.solve(ensemble(), setup)
     assert found.accepted and found.reasons == ()
     assert found.termination == 'converged'
     assert found.method == CalibrationOptions().method
@@ -108,7 +108,7 @@ def test_lateral_colour_is_estimated(setup: Setup) -> None:
         from_axis = one.measured_px - TRUTH.camera.parameters[3:5]
         moved = one.measured_px + per_mag * colour[:, None] * from_axis
         images.append(dataclasses.replace(one, measured_px=moved))
-    plain, found = (solve.solve(e, setup)[0] for e in (ensemble(), Ensemble(tuple(images))))
+    plain, found = (solve.solve(e, setup) for e in (ensemble(), Ensemble(tuple(images))))
     assert found.accepted
     (part,) = (part for part in found.sigma_budget if part.cause == 'lateral colour')
     # Thousands of stars of 0.17 px, and a few of 0.001 px, show it to 1e-5.
@@ -121,7 +121,7 @@ def test_lateral_colour_is_estimated(setup: Setup) -> None:
 
 def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
     # With the principal point held: one that is estimated trades with pitch and yaw.
-    found = solve.solve(ensemble(), with_method(setup, '', ('fx', 'skew', 'fy', 'distortion')))[0]
+    found = solve.solve(ensemble(), with_method(setup, '', ('fx', 'skew', 'fy', 'distortion')))
     maps, correlation = found.maps, found.correlation
     assert maps is not None and correlation is not None
     assert maps.stars.shape == (8, 10) and maps.stars.sum() == found.stars_used
@@ -144,7 +144,7 @@ def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
 
 @pytest.mark.slow
 def test_method_and_names_can_be_said_for_one_solution(setup: Setup) -> None:
-    found = solve.solve(ensemble(), with_method(setup, 'single', ['fx', 'fy', 'k1']))[0]
+    found = solve.solve(ensemble(), with_method(setup, 'single', ['fx', 'fy', 'k1']))
     assert (found.method, found.estimated) == ('single', ('fx', 'fy', 'k1'))
     prior, after = setup.prior.camera.parameters, found.geometry.camera.parameters
     changed = [n for n, a, b in zip(PARAMETER_NAMES, prior, after, strict=True) if a != b]
@@ -166,7 +166,7 @@ def test_too_few_images_cannot_be_solved(setup: Setup) -> None:
 @pytest.mark.slow
 def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
     strict = load_setup(values(camera_yaml, requirements=['map=1e-6px']))
-    found = solve.solve(ensemble(), strict)[0]
+    found = solve.solve(ensemble(), strict)
     assert not found.accepted
     assert len(found.reasons) == 1 and 'requirements' in found.reasons[0]
     refused = [check for check in found.gate if check.passed is False]
@@ -177,7 +177,7 @@ def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
 @pytest.mark.slow
 def test_the_gate_counts_the_stars_that_were_used(setup: Setup) -> None:
     """Those left out as outliers cover nothing."""
-    found = solve.solve(ensemble(), setup)[0]
+    found = solve.solve(ensemble(), setup)
     assert found.maps is not None
     covered = next(check for check in found.gate if check.option == 'min_coverage')
     assert covered.found == (found.maps.stars > 0).mean()
@@ -185,7 +185,7 @@ def test_the_gate_counts_the_stars_that_were_used(setup: Setup) -> None:
 
 @pytest.mark.slow
 def test_equal_inputs_give_equal_numbers(setup: Setup) -> None:
-    one, other = (solve.solve(ensemble(), setup)[0] for _ in range(2))
+    one, other = (solve.solve(ensemble(), setup) for _ in range(2))
     np.testing.assert_array_equal(one.covariance, other.covariance)
     np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
     assert one.provenance == other.provenance
@@ -202,7 +202,7 @@ def test_from_pixels_to_a_calibration_that_is_true(setup: Setup) -> None:
         found = observe.observe_next(image(index), held, setup)[0]
         collected = solve.add_to_ensemble(collected, found, setup)
     assert len(collected.images) == 10
-    calibration = solve.solve(collected, setup)[0]
+    calibration = solve.solve(collected, setup)
     assert calibration.accepted
     free = [PARAMETER_NAMES.index(name) for name in calibration.estimated]
     error = (calibration.geometry.camera.parameters - TRUTH.camera.parameters)[free]
@@ -231,7 +231,7 @@ def test_a_bag_with_temperatures_to_a_calibration_with_terms(
     plain = list(topics.read(paths, Topics('/image', '/attitude'), warm))
     assert all(np.isnan(one.temperature_degc) for one in plain)
     # The simulated camera does not change with temperature, and that is what is found.
-    terms = solve.solve(Ensemble(tuple(found)), warm)[0].temperature
+    terms = solve.solve(Ensemble(tuple(found)), warm).temperature
     assert terms is not None and terms.reference_degc == 20.0
     assert terms.note == ''
     for values_found, sigma in (
@@ -239,5 +239,5 @@ def test_a_bag_with_temperatures_to_a_calibration_with_terms(
         (terms.alignment_rate_rad_per_degc, terms.alignment_rate_rad_per_degc_sigma),
     ):
         assert values_found and (np.abs(values_found) < 4 * np.array(sigma)).all()
-    terms = solve.solve(Ensemble(tuple(plain)), warm)[0].temperature
+    terms = solve.solve(Ensemble(tuple(plain)), warm).temperature
     assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'

@@ -76,7 +76,7 @@ def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
     setup = setup_with()
     records = observed(bag_of(tmp_path / 'two'), setup)
     assert used(records) == {'': 5, 'other': 5}
-    calibration = solve.solve(Ensemble(tuple(records)), setup)[0]
+    calibration = solve.solve(Ensemble(tuple(records)), setup)
     first, other = calibration.star_trackers
     assert (first.frame, other.frame) == ('star_tracker', 'other')
     assert (first.images, other.images) == (5, 5)
