@@ -66,7 +66,7 @@ def _summary(world: World, found: list[Score]) -> tuple[str | float | int, ...]:
 def trial(world: World, seed: int) -> Score:
     """Render, measure and solve one campaign in a world."""
     scenario = scenario_of(world, seed)
-    setup = load_set_up(scenario)
+    setup = load_set_up(scenario, **dict(world.options))
     pixels = pixel_grid(scenario.truth.camera, GRID, GRID)
     ensemble = observed(frames(world, scenario), setup, has_velocity=False)
     cameras = range(scenario.image_count if world.focal_change else 1)

@@ -18,7 +18,7 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, project
-from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
 from studies.worlds import aberrated, eighth_order, keystone
@@ -31,6 +31,8 @@ IMAGES = 14
 COPIES = 30
 _WANDER_IMAGES = 10.0  # correlation length of the star tracker that wanders
 _ABBBA = (0, 1, 1, 1, 0)
+_EXPOSURE_S = 0.1  # of a camera that turns
+_READOUT_S = 0.02  # from its first row to the last
 
 
 def _as_modelled(camera: CameraModel, size: float, rng: Generator, pixels: Floats) -> Floats:
@@ -44,7 +46,9 @@ class World:
 
     The other fields are the parts of a campaign that a fault changes: ``geometries`` the truth and
     the prior; ``lens`` the pixels of stars; ``focal_change`` the focal length in an image, in
-    units of the size; ``read_out`` the pixels of an image, by ``mean_shift_px`` along a row.
+    units of the size; ``read_out`` the pixels of an image, by ``mean_shift_px`` along a row.  A
+    camera that turns does so by the size, in deg/s, about an axis across the line of sight, is
+    smeared during the exposure and reads its rows one after another.
     """
 
     name: str
@@ -60,6 +64,10 @@ class World:
     has_one_image: bool = False
     has_aberration_reversed: bool = False
     has_wandering_tracker: bool = False
+    is_turning: bool = False
+    tracker_hz: float = 0.0  # of samples with errors of their own; 0: one error of an image
+    tracker_arcsec: float = 20.0  # each axis
+    options: tuple[tuple[str, object], ...] = ()  # that are stated
 
 
 def scenario_of(world: World, seed: int) -> Scenario:
@@ -81,7 +89,17 @@ def scenario_of(world: World, seed: int) -> Scenario:
         start_ns=base.start_ns + seed * 8_640_000_000_000,
         cadence_s=60.0,
         image_count=count,
+        star_tracker_sigma_arcsec=(world.tracker_arcsec,) * 3,
+        star_tracker_hz=world.tracker_hz,
+        turn_rad=tuple((_EXPOSURE_S * _rate_rad_s(world, seed)).tolist()),
     )
+
+
+def _rate_rad_s(world: World, seed: int) -> Floats:
+    """Angular rate (3,) of the camera, camera frame."""
+    angle = np.random.default_rng([seed, 76]).uniform(0.0, 2.0 * np.pi)
+    axis = np.array([math.cos(angle), math.sin(angle), 0.0])
+    return np.asarray(math.radians(world.size) * world.is_turning * axis)
 
 
 def frames(world: World, scenario: Scenario) -> Iterator[tuple[Image, list[AttitudeSample]]]:
@@ -93,7 +111,9 @@ def frames(world: World, scenario: Scenario) -> Iterator[tuple[Image, list[Attit
     first: Image | None = None
     for index in range(scenario.image_count):
         shown = synthetic.scene(scenario, index)
-        moved = dataclasses.replace(shown, pixel_px=_seen_at(world, scenario, shown, index))
+        at_px = _seen_at(world, scenario, shown, index)
+        seen = line_of_sight(scenario.truth.camera, at_px) @ shown.camera_from_icrf
+        moved = dataclasses.replace(shown, pixel_px=at_px, direction_icrf=seen)
         if world.has_one_image and first is not None:
             noise = rng.integers(-1, 2, first.pixels.shape)
             pixels = np.clip(first.pixels.astype(np.int64) + noise, 0, scenario.detector.full_dn)
@@ -102,6 +122,9 @@ def frames(world: World, scenario: Scenario) -> Iterator[tuple[Image, list[Attit
             image = rendering.render(scenario, moved, index, pattern)
         first = first or image
         samples = list(synthetic.attitude_samples(scenario, index))
+        if world.is_turning:
+            rate_icrf = shown.camera_from_icrf.T @ _rate_rad_s(world, scenario.seed)
+            samples = [_turned(sample, shown.time_ns, rate_icrf) for sample in samples]
         if world.has_wandering_tracker:
             sigma_rad = world.size * ARCSECOND_RAD
             keep, add = (step, math.sqrt(1.0 - step**2)) if index else (0.0, 1.0)
@@ -119,6 +142,14 @@ def _rotated(sample: AttitudeSample, error_rad: Floats) -> AttitudeSample:
     return dataclasses.replace(sample, icrf_from_star_tracker_xyzw=rotated.as_quat())
 
 
+def _turned(sample: AttitudeSample, image_ns: int, rate_icrf_rad_s: Floats) -> AttitudeSample:
+    """Sample of a camera that has turned since the image."""
+    after_s = (sample.time_ns - image_ns) / NANOSECONDS_PER_SECOND
+    turn = Rotation.from_rotvec(after_s * rate_icrf_rad_s)
+    reported = turn * Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
+    return dataclasses.replace(sample, icrf_from_star_tracker_xyzw=reported.as_quat())
+
+
 def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floats:
     """Pixels (n, 2) of the stars of a scene on the detector of a world."""
     camera, seen = _camera_at(world, scenario, index), shown.direction_icrf
@@ -126,7 +157,19 @@ def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floa
         seen = aberrated(seen, -2.0 * earth_velocity_c(shown.time_ns) * SPEED_OF_LIGHT_M_S)
     if world.has_aberration_reversed or world.focal_change:
         return np.asarray(project(camera, seen @ shown.camera_from_icrf.T))
-    return np.asarray(shown.pixel_px + _displacement(world, scenario, shown.pixel_px))
+    pixels = shown.pixel_px
+    if world.is_turning:
+        pixels = _read_out(camera, _rate_rad_s(world, scenario.seed), pixels)
+    return np.asarray(pixels + _displacement(world, scenario, pixels))
+
+
+def _read_out(camera: CameraModel, rate_rad_s: Floats, pixels: Floats) -> Floats:
+    """Pixels (n, 2) where the row that shows a star is read before or after the middle one."""
+    in_camera, at = line_of_sight(camera, pixels), pixels
+    for _ in range(5):  # the shift changes by a thousandth of itself
+        after_s = _READOUT_S * (at[:, 1:] / (camera.height - 1) - 0.5)
+        at = project(camera, Rotation.from_rotvec(-after_s * rate_rad_s).apply(in_camera))
+    return at
 
 
 def _camera_at(world: World, scenario: Scenario, index: int) -> CameraModel:
@@ -271,6 +314,20 @@ WORLDS = (
         has_aberration_reversed=True,
     ),
     World('tracker wanders', 60.0, 'arcsec', _WANDER, 2 * IMAGES, has_wandering_tracker=True),
+    *(
+        World(
+            *(f'turning, {name} shutter', s, 'deg/s'),
+            is_turning=True,
+            tracker_hz=10.0,
+            tracker_arcsec=10.0,
+            options=options,
+        )
+        for name, options in (
+            ('unknown', (('shutter', 'unknown'),)),
+            ('stated', (('shutter', 'rolling'), ('readout_s', _READOUT_S))),
+        )
+        for s in (0.05, 0.1, 0.3)
+    ),
 )
 
 

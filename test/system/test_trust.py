@@ -13,6 +13,7 @@ ACCEPTED = (
     world('tilted detector', 1.0),
     world('ripple', 0.1),
     world('two lenses as ABBBA', 0.3),
+    world('turning, unknown shutter', 0.1),
 )
 REFUSED = (world('two lenses as ABBBA', 1.0), world('aberration reversed', 0.5))
 
