@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from functools import partial
 import math
 
+import erfa
 import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
-from starcal_ground.simulation.scenario import Inertial, Scenario, Scene
+from starcal_ground.simulation.deep_sky import deep_sky
+from starcal_ground.simulation.scenario import Detector, Inertial, Scenario, Scene
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -33,6 +35,10 @@ _WANDER_IMAGES = 10.0  # correlation length of the star tracker that wanders
 _ABBBA = (0, 1, 1, 1, 0)
 _EXPOSURE_S = 0.1  # of a camera that turns
 _READOUT_S = 0.02  # from its first row to the last
+_COARSE_PX = 330.0  # focal length of pixels of 10 arcminutes, in which stars blend
+_COARSE = Detector(psf_sigma_px=0.6, zero_point_electrons=4e6, bits=14, electrons_per_dn=8.0)
+_SPREAD_DEG = 20.0  # of the fields with faint stars
+_SKY_RAD = math.radians(90.0)  # about their middle
 
 
 def _as_modelled(camera: CameraModel, size: float, rng: Generator, pixels: Floats) -> Floats:
@@ -48,7 +54,8 @@ class World:
     the prior; ``lens`` the pixels of stars; ``focal_change`` the focal length in an image, in
     units of the size; ``read_out`` the pixels of an image, by ``mean_shift_px`` along a row.  A
     camera that turns does so by the size, in deg/s, about an axis across the line of sight, is
-    smeared during the exposure and reads its rows one after another.
+    smeared during the exposure and reads its rows one after another.  Faint stars are those below
+    the catalog, to the size, in magnitudes.
     """
 
     name: str
@@ -64,6 +71,7 @@ class World:
     has_one_image: bool = False
     has_aberration_reversed: bool = False
     has_wandering_tracker: bool = False
+    has_faint_stars: bool = False
     is_turning: bool = False
     tracker_hz: float = 0.0  # of samples with errors of their own; 0: one error of an image
     tracker_arcsec: float = 20.0  # each axis
@@ -78,6 +86,11 @@ def scenario_of(world: World, seed: int) -> Scenario:
     fields = np.stack([ra_deg, np.degrees(np.arcsin(z)), rng.uniform(0.0, 360.0, count)], axis=-1)
     if world.has_one_image:
         fields[:] = fields[0]
+    if world.has_faint_stars:
+        fields = fields[0] * [1.0, 0.6, 1.0] + _SPREAD_DEG * rng.normal(size=(count, 3))
+        ra_rad, dec_rad = np.radians(fields[0, :2]).tolist()
+        sky = deep_sky(erfa.s2c(ra_rad, dec_rad), _SKY_RAD, world.size, rng)
+        base = dataclasses.replace(base, sky=sky, magnitude_limit=world.size, detector=_COARSE)
     truth, prior = base.truth, base.prior
     if world.geometries:
         truth, prior = world.geometries((truth, prior), world.size, rng)
@@ -245,6 +258,21 @@ def _wide(pair: Pair, size: float, rng: Generator) -> Pair:
     return wide(pair[0]), wide(pair[1])
 
 
+def _coarse(pair: Pair, size: float, rng: Generator) -> Pair:
+    """Cameras with a fifth of the pixels along each axis, and twice the field."""
+
+    def coarse(geometry: CameraGeometry) -> CameraGeometry:
+        camera, width, height = geometry.camera, 240, 256
+        scale = _COARSE_PX / camera.parameters[0]
+        numbers = camera.parameters.copy()
+        middle = np.array([camera.width - 1, camera.height - 1]) / 2
+        numbers[:3] *= scale
+        numbers[3:5] = scale * (numbers[3:5] - middle) + [(width - 1) / 2, (height - 1) / 2]
+        return dataclasses.replace(geometry, camera=CameraModel(width, height, numbers))
+
+    return coarse(pair[0]), coarse(pair[1])
+
+
 def _off_axis(pair: Pair, size_px: float, rng: Generator) -> Pair:
     """True principal point off the prior."""
     angle, (truth, prior) = rng.uniform(0.0, 2.0 * np.pi), pair
@@ -314,6 +342,10 @@ WORLDS = (
         has_aberration_reversed=True,
     ),
     World('tracker wanders', 60.0, 'arcsec', _WANDER, 2 * IMAGES, has_wandering_tracker=True),
+    *(
+        World('stars below the catalog', s, 'mag', geometries=_coarse, has_faint_stars=True)
+        for s in (10.5, 12.0)
+    ),
     *(
         World(
             *(f'turning, {name} shutter', s, 'deg/s'),
