@@ -469,7 +469,6 @@ def _expected(
 
 
 _MOST_IMAGES = 20  # that reach a requirement
-_LISTED = 2  # pointings in a sentence
 
 
 def with_images_to_reach(campaign: Campaign) -> Campaign:
@@ -502,15 +501,15 @@ def _planned(campaign: Campaign, quantity: str, check: GateCheck) -> GateCheck:
     scale = check.found / plan.sigma
     enough = [k for k, step in enumerate(plan.steps, 1) if scale * step.sigma <= check.limit]
     if not enough:
+        if not check.note.endswith(gate.REMEDIES['stars']):
+            return check  # its remedy is another
         last = significant(scale * plan.steps[-1].sigma, 2)
         unit = check.unit and f' {check.unit}'
         words = f'{len(plan.steps)} more images reach {last}{unit}'
     else:
-        count = enough[0]
-        words = f'{count} more image{"s reach" if count > 1 else " reaches"} it'
-        places = '; '.join(
-            f'RA {place.ra_deg:.1f}, Dec {place.dec_deg:+.1f}, roll {place.roll_deg:.0f}'
-            for place in (step.pointing for step in plan.steps[:count])
-        )
-        words += f', at {places} degrees' if count <= _LISTED else ' (starcal plan)'
-    return dataclasses.replace(check, note=f'{check.note}; {words}')
+        place = plan.steps[0].pointing
+        words = f'{enough[0]} more images reach it (starcal plan)'
+        if enough[0] == 1:
+            at = f'RA {place.ra_deg:.1f}, Dec {place.dec_deg:+.1f}, roll {place.roll_deg:.0f}'
+            words = f'1 more image reaches it, at {at} degrees'
+    return dataclasses.replace(check, note=f'{check.note.partition("; ")[0]}; {words}')

@@ -127,16 +127,14 @@ def in_sentences(calibration: records.Calibration) -> list[str]:
 
 
 def next_step(calibration: records.Calibration) -> str:
-    """The measures against a refusal, or against the largest causes of the sigma."""
+    """The measures against the largest causes of the sigma; a reason to refuse has its own."""
     if calibration.accepted:
         return ' '.join(_against_sigma(calibration))
-    failed = [check.option for check in calibration.gate if check.passed is False]
-    measures = dict.fromkeys(REMEDIES[option] for option in failed if option in REMEDIES)
-    causes = (
-        f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
+    failed = {check.option for check in calibration.gate if check.passed is False}
+    text = (
+        'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'
     )
-    text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
-    if {*failed} == {REQUIREMENTS}:
+    if failed == {REQUIREMENTS}:
         text = 'The sigmas hold, but miss a requirement.'
     steps = _against_sigma(calibration) if REQUIREMENTS in failed else []
     return ' '.join([text, *steps])

@@ -30,6 +30,7 @@ from starcal_ros.records import (
     HeldTerm,
     ModelChecks,
     ResidualBin,
+    SigmaPart,
     StarTrackerAlignment,
     TOTAL,
 )
@@ -240,12 +241,14 @@ def _fit(
     stars = max(calibration.stars_used + calibration.stars_rejected, 1)
     images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
     rejected = (
-        (calibration.stars_rejected / stars, 'fraction of stars left out as outliers'),
-        (misfits / max(images, 1), 'fraction of images whose attitude does not fit'),
+        (calibration.stars_rejected / stars, 'stars left out as outliers'),
+        (misfits / max(images, 1), 'images whose attitude does not fit'),
     )
-    fraction, name = max(rejected)
-    yield limit_check(options, 'max_rejected_fraction', name, fraction)
-    yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
+    found, what = max(rejected)
+    name, remedy = f'fraction of {what}', REMEDIES[what]
+    yield limit_check(options, 'max_rejected_fraction', name, found, remedy=remedy)
+    name, remedy = 'number of images that fit', REMEDIES['stars']
+    yield limit_check(estimation, 'min_images', name, images - misfits, remedy=remedy)
 
 
 def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
@@ -258,6 +261,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         'min_coverage',
         'fraction of the detector with stars that fit',
         float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
+        remedy=REMEDIES['coverage'],
     )
     yield from requirement_checks(calibration, options.requirements)
 
@@ -303,7 +307,7 @@ def _changes(
             f'rotation of the lines of sight from {name}',
             math.degrees(rotation_rad),
             'deg',
-            REMEDIES['change of the mounting'] if active else '',
+            REMEDIES['change of the mounting' if active else 'mounting of the prior'],
             factors[1],
             centre_deg,
         ),
@@ -495,12 +499,11 @@ class Requirement:
         what = {
             LINE_OF_SIGHT: '1-sigma of a line of sight',
             MAP: '1-sigma of the distortion map',
-            POINTING: '1-sigma of the pointing, rms over the detector',
+            POINTING: 'rms 1-sigma of the pointing',
         }.get(self.quantity, f'1-sigma of {self.quantity}')
         if self.quantity not in (LINE_OF_SIGHT, MAP):
             return what
-        share = f'{what} over {100 * self.share:g} % of the detector'
-        return share if self.share < 1.0 else f'largest {what}'
+        return f'{what} over {100 * self.share:g} %' if self.share < 1.0 else f'largest {what}'
 
     def sigma(self, calibration: Calibration) -> float:
         """The sigma of a calibration in the unit; NaN where a part of it is not known."""
@@ -528,6 +531,19 @@ class Requirement:
         # One that is held has no sigma of its own.
         return float(np.max([sigma.get(name, 0.0) or math.nan for name in names])) / scale
 
+    def remedy(self, calibration: Calibration) -> str:
+        """The remedy of the largest cause of the sigma, of that of a map where it is worst."""
+
+        def variance(part: SigmaPart) -> float:
+            if self.quantity in (POINTING, *ALIGNMENT_NAMES):
+                return part.pointing_arcsec**2
+            of_map = max(part.map_over_detector_arcsec, default=part.map_arcsec) ** 2
+            turned = part.pointing_arcsec**2 - part.map_arcsec**2
+            return of_map + turned * (self.quantity == LINE_OF_SIGHT)
+
+        causes = [part for part in calibration.sigma_budget if part.cause != TOTAL]
+        return REMEDIES.get(max(causes, key=variance).cause, '') if causes else ''
+
     def _over(self, sigma: Floats) -> float:
         """Upper limit of a sigma over the share; NaN where it has none."""
         known = np.where(np.isfinite(sigma), sigma, np.inf)
@@ -542,7 +558,7 @@ def requirements_of(texts: Iterable[str]) -> tuple[Requirement, ...]:
 
 def requirement_checks(calibration: Calibration, texts: Iterable[str]) -> Iterator[GateCheck]:
     """
-    A check of each requirement, with by how much it is missed.
+    A check of each requirement, with by how much it is missed and what lowers the sigma.
 
     Raises ValueError when the calibration has no maps.
     """
@@ -552,7 +568,8 @@ def requirement_checks(calibration: Calibration, texts: Iterable[str]) -> Iterat
         note = 'met' if passed else 'it is not estimated'
         if sigma > wanted.limit:
             unit = wanted.unit and f' {wanted.unit}'
-            note = f'missed by {significant(sigma - wanted.limit, 2)}{unit}'
+            missed = f'missed by {significant(sigma - wanted.limit, 2)}{unit}'
+            note = '; '.join(filter(None, [missed, wanted.remedy(calibration)]))
         yield GateCheck(wanted.name, REQUIREMENTS, sigma, wanted.limit, wanted.unit, passed, note)
 
 
@@ -589,12 +606,11 @@ REMEDIES: Mapping[str, str] = {
     ),
     'no_match': 'ask the diagnostics of the star observer, or starcal diagnose, for the cause',
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
-    # Checks of the gate, by option, with the section of the report.
-    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals), and check the'
-    ' attitudes and stamps of misfit images (Alignment)',
-    'min_images': 'take more images',
-    'min_coverage': 'take images with stars in the empty cells (Coverage)',
-    'max_rotation_deg': 'check the alignment assumed (prior_alignment) and the mounting',
+    # Checks of the gate, with the section of the report.
+    'stars left out as outliers': 'look for smeared or misidentified stars (Residuals)',
+    'images whose attitude does not fit': 'check their attitudes and stamps (Alignment)',
+    'coverage': 'take images with stars in the empty cells (Coverage)',
+    'mounting of the prior': 'check the alignment assumed (prior_alignment) and the mounting',
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Assumed values that the stars contradict, by the start of their label, and faults they show.
@@ -607,20 +623,18 @@ REMEDIES: Mapping[str, str] = {
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
     # Causes of the sigma of a line of sight (`SigmaPart.cause`).
     'stars': 'take more images',
-    'velocity': 'state the barycentric velocity: the topic velocity or observer_velocity_m_s; '
-    'of photographs, observer and their times (EXIF, FITS)',
+    'velocity': 'state the velocity (topic, observer_velocity_m_s; photographs: observer)',
     'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'use temperatures, or one focus; unstated air (observer:'
-    ' ground) changes it too',
-    'star places': 'take more images of other star fields, with a catalog that has proper motions',
+    'change from image to image': 'use temperatures or one focus; unstated air (observer:'
+    ' ground) changes it',
+    'star places': 'take images of other star fields, with a catalog that has proper motions',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',
     'star tracker noise': 'take more images',
-    'star tracker slow error': 'take images in more attitudes of the star tracker; if it is over'
-    ' the data sheet, run starcal diagnose',
+    'star tracker slow error': 'take images in more attitudes; try starcal diagnose',
     'held parameters': 'estimate the held parameters (estimate)',
 }
-"""Name -> remedy; a check of the gate that has none states it in its note."""
+"""Name -> remedy; that of a check of the gate which failed is in its note."""

@@ -130,7 +130,7 @@ def test_a_good_calibration_passes() -> None:
             0.099,
             (
                 'fraction of stars left out as outliers is 0.1, over the limit of 0.099 '
-                '(max_rejected_fraction)'
+                '(max_rejected_fraction); look for smeared or misidentified stars (Residuals)'
             ),
         ),
         (
@@ -140,7 +140,7 @@ def test_a_good_calibration_passes() -> None:
             0.51,
             (
                 'fraction of the detector with stars that fit is 0.5, under the limit of 0.51 '
-                '(min_coverage)'
+                '(min_coverage); take images with stars in the empty cells (Coverage)'
             ),
         ),
         (
@@ -150,7 +150,7 @@ def test_a_good_calibration_passes() -> None:
             0.29,
             (
                 'fraction of images whose attitude does not fit is 0.3, over the limit of 0.29 '
-                '(max_rejected_fraction)'
+                '(max_rejected_fraction); check their attitudes and stamps (Alignment)'
             ),
         ),
         (
@@ -160,7 +160,8 @@ def test_a_good_calibration_passes() -> None:
             ('line_of_sight=1.9arcsec',),
             (
                 'largest 1-sigma of a line of sight is 2 arcsec, over the limit of 1.9 arcsec '
-                '(requirements); missed by 0.1 arcsec'
+                '(requirements); missed by 0.1 arcsec; state the velocity (topic, '
+                'observer_velocity_m_s; photographs: observer)'
             ),
         ),
         (
@@ -225,8 +226,8 @@ def test_a_good_calibration_passes() -> None:
             0.2,
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
-                'of 0.2 px (max_image_variation_px); use temperatures, or one focus; '
-                'unstated air (observer: ground) changes it too'
+                'of 0.2 px (max_image_variation_px); use temperatures or one focus; '
+                'unstated air (observer: ground) changes it'
             ),
         ),
         (
@@ -295,9 +296,10 @@ def test_each_limit_of_a_change_trips_alone(
     changed = {
         ('max_change_px', True): '(lens_model)',
         ('max_change_px', False): 'find out if the camera has changed',
+        ('max_rotation_deg', True): 'alignment assumed (prior_alignment) and the mounting',
         ('max_rotation_deg', False): 'find out if the mounting has changed',
     }
-    assert reason.endswith(changed.get((limit, active is None), f'({limit})'))
+    assert reason.endswith(changed[limit, active is None]) and len(reason) <= 200
     assert ('active calibration' in reason) == (active is not None)
 
 
@@ -319,7 +321,7 @@ def test_the_remaining_images_must_be_enough() -> None:
         GOOD, misfit_images_ns=tuple(range(18)), stars_used=50, stars_rejected=0
     )
     assert reasons(found, options) == (
-        'number of images that fit is 2, under the limit of 3 (min_images)',
+        'number of images that fit is 2, under the limit of 3 (min_images); take more images',
     )
 
 

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from sample_records import calibration  # type: ignore[import-not-found]
 
-from starcal_ros.assessment.gate import Requirement, requirement_checks, requirements_of
+from starcal_ros.assessment.gate import (
+    reasons_of,
+    REMEDIES,
+    Requirement,
+    requirement_checks,
+    requirements_of,
+)
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
@@ -69,6 +75,40 @@ def test_the_camera_alone_has_its_own_lines_of_sight() -> None:
     assert not alone.has_alignment
     assert Requirement.of('line_of_sight=5arcsec').sigma(alone) == 0.9
     assert np.isnan(Requirement.of('pointing=5arcsec').sigma(alone))
+
+
+def with_causes(*causes: SigmaPart) -> Calibration:
+    total = SigmaPart('total', 1.0, 9.0, '', (1.0,) * 62 + (20.0,))
+    return dataclasses.replace(FOUND, sigma_budget=(total, *causes))
+
+
+def test_what_is_missed_names_what_lowers_that_sigma_most() -> None:
+    """The stars are the largest cause in a corner, the read-out elsewhere, a slow error of all."""
+    found = with_causes(
+        SigmaPart('read-out', 0.8, 0.8, '', (0.8,) * 63),
+        SigmaPart('stars', 0.6, 0.7, '', (0.5,) * 62 + (19.0,)),
+        SigmaPart('star tracker slow error', 0.0, 8.9, '', (0.0,) * 63),
+    )
+    texts = 'map=1e-3arcsec', 'line_of_sight=1arcsec', 'f=1e-3px', 'pointing=0.1arcsec'
+    notes = [check.note.partition('; ')[2] for check in requirement_checks(found, texts)]
+    slow = REMEDIES['star tracker slow error']
+    assert notes == ['take more images', 'take more images', 'take more images', slow]
+    # A calibration of an earlier version has no causes at pixels.
+    parts = [dataclasses.replace(part, map_over_detector_arcsec=()) for part in found.sigma_budget]
+    without = dataclasses.replace(found, sigma_budget=tuple(parts))
+    notes = [check.note.partition('; ')[2] for check in requirement_checks(without, texts)]
+    assert notes == [REMEDIES['read-out'], slow, REMEDIES['read-out'], slow]
+
+
+def test_the_reason_that_a_requirement_is_missed_has_at_most_200_characters() -> None:
+    maps = DetectorMaps(np.ones((10, 10), np.int64), 1234.5 * CELLS, 123.45 * CELLS)
+    texts = 'line_of_sight=1234arcsec', 'map=123.4arcsec@99.5%', 'pointing=1.234arcsec'
+    causes = list(REMEDIES)[list(REMEDIES).index('stars') :]
+    for cause in (*causes, 'colour'):  # the last has no remedy
+        parts = with_causes(SigmaPart(cause, 1.0, 9.0, ''))
+        reasons = reasons_of(requirement_checks(dataclasses.replace(parts, maps=maps), texts))
+        assert len(reasons) == 3 and max(map(len, reasons)) <= 200
+        assert all(reason.endswith(REMEDIES.get(cause, 'arcsec')) for reason in reasons)
 
 
 @pytest.mark.parametrize('held', [0, 2])
