@@ -105,22 +105,21 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     """
     Return unknowns that are held or have a stated prior, with what the stars ask for.
 
-    A held parameter is tested by one more Newton step with it free; an unknown with a prior by its
-    estimate without the prior: what contradicts a narrow prior moves other unknowns, first the
-    field and the shapes of the images, and hardly its own.  Free unknowns also fit what is of the
-    lens: more than `_CLEAR_SIGMA` counts only where the data are likelier without the prior, too.
+    A held parameter is tested by its estimate with it free, an unknown with a prior by that
+    without the prior: what contradicts it moves other unknowns, first the field and the shapes of
+    the images, and hardly its own.  Free unknowns also fit what is of the lens: more than
+    `_CLEAR_SIGMA` counts only where the data are likelier without the prior, too.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
-        cross = found.equations.information[k]
-        information = float(cross[k] - cross @ found.working @ cross)
-        if information <= 1e-9 * cross[k]:
-            continue
-        step = float(found.equations.gradient[k] - cross @ found.mean) / information
-        held = float(estimate.linear.state.parameters[k - camera[0]])
-        terms.append(HeldTerm(layout.labels[k], held, held + step, information**-0.5))
+        own = int(k - camera[0])
+        means, variances, _ = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
+        if np.isfinite(variances[own]):
+            held = float(estimate.linear.state.parameters[own])
+            sigma = math.sqrt(variances[own])
+            terms.append(HeldTerm(layout.labels[k], held, held + float(means[own]), sigma))
     total, working = np.diag(found.covariance), np.diag(found.working)
     first = layout.places['mountings'].start if 'mountings' in layout else layout.count
     for entry in layout.shared:

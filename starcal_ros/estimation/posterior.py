@@ -180,10 +180,12 @@ def posterior(
 
 
 def without_prior(
-    sums: StarSums, linear: Linearisation, name: str, near: Posterior
+    sums: StarSums, linear: Linearisation, name: str, near: Posterior, held: int | None = None
 ) -> tuple[Floats, Floats, float]:
     """
     Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
+
+    With ``held`` only that number of the entry, which is held, is free.
 
     The amplitudes are found again: field and shapes may hide that a prior is wrong.  A trend keeps
     its value of the posterior ``near`` with the prior, and its cost: together with a free velocity
@@ -198,7 +200,7 @@ def without_prior(
     entries = []
     for entry in linear.layout.entries:
         if entry.name == name:
-            entry = dataclasses.replace(entry, sigma=_without_prior(entry))
+            entry = dataclasses.replace(entry, sigma=_without_prior(entry, held))
         elif entry.name == 'trend':
             entry = dataclasses.replace(entry, sigma=_KEPT * entry.sigma, offset=-trend)
         entries.append(entry)
@@ -219,8 +221,10 @@ def without_prior(
     return np.where(seen, alone, 0.0), variance, found.log_evidence - cost
 
 
-def _without_prior(entry: Unknown) -> Floats:
+def _without_prior(entry: Unknown, held: int | None) -> Floats:
     """Return the sigma (q,) of an entry without its prior: of what is possible at all."""
+    if held is not None:
+        return np.where(np.arange(len(entry)) == held, np.inf, entry.sigma)
     widest = np.minimum(_WITHOUT * entry.sigma, entry.widest)
     return np.asarray(np.maximum(entry.sigma, widest))
 

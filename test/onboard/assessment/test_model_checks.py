@@ -53,12 +53,14 @@ def test_a_sound_camera_contradicts_nothing() -> None:
         assert checks.field_rms_px < 0.01 and checks.image_variation_px < 0.05
 
 
-def test_a_principal_point_that_is_held_where_it_is_not_is_named() -> None:
-    given = with_cx_off(of_random_pointings(8), 30.0)
+@pytest.mark.parametrize('off_px', [30.0, -30.0, 3.0])
+def test_a_principal_point_that_is_held_where_it_is_not_is_named(off_px: float) -> None:
+    given = with_cx_off(of_random_pointings(8), off_px)
     cx = held(model_checks(estimated(given, true_observations(given), estimate=WITHOUT_CX)), 'cx')
     assert cx.assumed == pytest.approx(given.prior.camera.parameters[3], abs=1e-9)
-    # One step from where a field has taken what it can: the side is right, not the size.
-    assert cx.significance > 2 * LIMIT_SIGMA and cx.estimated > cx.assumed + 5 * cx.sigma
+    # A field of tenths of a pixel takes the shift, and hid it from one step of the estimate.
+    assert cx.significance > 2 * LIMIT_SIGMA
+    assert cx.estimated - cx.assumed == pytest.approx(off_px, abs=1.5)
 
 
 def test_a_prior_that_is_right_is_not_contradicted_and_a_weak_one_moves_nothing() -> None:
@@ -245,4 +247,4 @@ def test_a_velocity_that_takes_the_place_of_a_tilt_is_no_contradiction() -> None
     options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0,) * 3, shutter='global')
     found = estimate_calibration(made.ensemble, made.scenario.prior, options)
     terms = [term for term in model_checks(found).held if 'velocity' in term.name]
-    assert 4.0 < max(term.significance for term in terms) <= LIMIT_SIGMA
+    assert 3.0 < max(term.significance for term in terms) <= LIMIT_SIGMA
