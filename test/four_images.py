@@ -156,8 +156,8 @@ class Small:
 
 
 def cosine(pixel: Floats, half_waves: int, size: int) -> Floats:
-    """Cosine of a mean square of one over a domain a fifth longer than the detector."""
-    first, length = -0.5 - 0.1 * size, 1.2 * size
+    """Cosine of a mean square of one over a domain a third longer than the detector."""
+    first, length = -0.5 - 0.175 * size, 1.35 * size
     values = np.cos(np.pi * half_waves * (pixel - first) / length)
     return np.asarray(values * np.sqrt(2.0) if half_waves else values)
 
@@ -376,7 +376,7 @@ def octaves(given: Small) -> Indices:
     found = []
     for label in given.layout['field'].labels:
         i, j = map(int, label.split('_')[1:3])
-        waves_per_px = np.hypot(i / (2.4 * WIDTH), j / (2.4 * HEIGHT))
+        waves_per_px = np.hypot(i / (2.7 * WIDTH), j / (2.7 * HEIGHT))
         found.append(sum(waves_per_px * WIDTH > limit * (1 + 1e-9) for limit in (1, 2)))
     return np.array(found)
 

@@ -121,11 +121,11 @@ def calibration() -> Calibration:
         model_checks=model_checks(),
         field=ResidualField(
             1,
-            np.array([[11, -7, 3, 2, -1], [5, 2.5, -12.5, 1, 4]]) / 1000,
+            np.array([[11, -7, 3, 2, -1, 0.5], [5, 2.5, -12.5, 1, 4, -3]]) / 1000,
             unresolved_px=0.0625,
-            covariance_factor=np.arange(46.0).reshape(23, 2) / 11,
-            remainder_unit_px=np.asarray(np.arange(1.0, 11.0) / 7e4, np.float64),
-            remainder=np.arange(-10, 45, dtype=np.int16),
+            covariance_factor=np.arange(50.0).reshape(25, 2) / 11,
+            remainder_unit_px=np.asarray(np.arange(1.0, 13.0) / 7e4, np.float64),
+            remainder=np.arange(-10, 68, dtype=np.int16),
         ),
         sigma_budget=(
             SigmaPart('total', 0.7, 12.5, ''),

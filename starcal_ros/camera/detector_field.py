@@ -3,7 +3,7 @@
 Smooth vector fields over a detector: displacements that no lens model describes.
 
 A field is a sum of functions of the pixel, one sum for each pixel axis.  The functions are
-products of cosines over a domain a fifth longer than the detector, ordered by wavelength.  An
+products of cosines over a domain a third longer than the detector, ordered by wavelength.  An
 octave has wavelengths from its longest to half of that; the first also has everything longer than
 the detector.  A field is as rough at the border as in the middle.
 
@@ -23,7 +23,7 @@ from starcal_ros.arrays import Floats, Indices, Integers
 from starcal_ros.record_fields import Record
 
 # Domain of the cosines in detector sides: a field need not be flat at the border.
-COSINE_DOMAIN = 1.2
+COSINE_DOMAIN = 1.35
 
 
 @functools.lru_cache(maxsize=16)
@@ -67,13 +67,30 @@ def basis_products(
     """
     terms, _ = cosine_terms(width, height, octaves)
     along = _waves(pixels, (width, height), 2 * terms.max(axis=0))
-    table = np.stack([(along[0] * row) @ along[1].T for row in weights])
-    (i, j), size = terms.T, _sizes(terms)
-    products = np.zeros((len(weights), len(terms), len(terms)))
-    for by_u in (np.add.outer(i, i), np.abs(np.subtract.outer(i, i))):
-        for by_v in (np.add.outer(j, j), np.abs(np.subtract.outer(j, j))):
-            products += table[:, by_u, by_v]
-    return np.asarray(0.25 * np.outer(size, size) * products)
+    first, second, places, size = _pairs(width, height, octaves)
+    products = np.empty((len(weights), len(terms), len(terms)))
+    for row, product in zip(weights, products, strict=True):
+        table = ((along[0] * row) @ along[1].T).ravel()
+        values = size * sum(table.take(place) for place in places)
+        product[first, second] = product[second, first] = values
+    return products
+
+
+@functools.lru_cache(maxsize=16)
+def _pairs(width: int, height: int, octaves: int) -> tuple[Indices, Indices, Indices, Floats]:
+    """
+    Pairs of functions (p,), (p,), and the size (p,) of their products.
+
+    Also the places (4, p) of the sums and differences of their half waves in a table of twice the
+    most half waves along u and v.
+    """
+    terms, _ = cosine_terms(width, height, octaves)
+    first, second = np.tril_indices(len(terms))
+    (i, j), most = terms.T, 2 * int(terms[:, 1].max()) + 1
+    by_u = i[first] + i[second], np.abs(i[first] - i[second])
+    by_v = j[first] + j[second], np.abs(j[first] - j[second])
+    places = np.stack([u * most + v for u in by_u for v in by_v])
+    return first, second, places, 0.25 * (_sizes(terms)[first] * _sizes(terms)[second])
 
 
 def _waves(pixels: Floats, sizes: tuple[int, int], most: Indices) -> list[Floats]:

@@ -39,8 +39,8 @@ OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0
-# The gradient vanishes near zero: the search starts from several amplitudes, px.
-_STARTS_PX = (1e-4, 1e-2, 1e-1)
+# The gradient vanishes near zero: the search starts from a small amplitude and a large one, px.
+_STARTS_PX = (1e-4, 2e-2)
 _MOST_STEPS = 12
 _SETTLED = 1e-3  # change of the log likelihood that moves no sigma by a thousandth
 _NO_EFFECT = 1e-6  # information on an unknown times its prior variance

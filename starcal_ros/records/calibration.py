@@ -751,8 +751,8 @@ def check_drawable(geometry: CameraGeometry) -> None:
 
 
 _DIGITS = 9  # parameters and field cancel to a thousandth and less in the factor
-# Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 3e-4.
-_STEPS = 1000
+# Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 6e-4.
+_STEPS = 5000
 _NO_VARIANCE = 1e-12  # times the largest eigenvalue: smaller ones are rounding
 
 
@@ -761,7 +761,7 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
     Return the record of a field with the covariance of lines of sight as factor and remainder.
 
     The factor has the parameters exactly, and the field as it follows them.  The remainder, that
-    of the field with the parameters known, displaces pixels without cancellation: a thousandth of
+    of the field with the parameters known, displaces pixels with little cancellation: a part of
     the sigma of each coefficient is enough.
     """
     count, matrix = of.coefficients.size, covariance.matrix

@@ -12,12 +12,18 @@ from random_pointings import HEIGHT, WIDTH  # type: ignore[import-not-found]
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import detector_field, line_of_sight, pixel_grid, project
-from starcal_ros.camera.detector_field import basis, cosine_terms, DetectorField, term_count
+from starcal_ros.camera.detector_field import (
+    basis,
+    COSINE_DOMAIN,
+    cosine_terms,
+    DetectorField,
+    term_count,
+)
 
 
-def test_cosines_are_orthonormal_over_a_domain_a_fifth_longer() -> None:
+def test_cosines_are_orthonormal_over_a_domain_a_third_longer() -> None:
     count = 60
-    places = 1.2 * ((np.arange(count) + 0.5) / count - 0.5) + 0.5
+    places = COSINE_DOMAIN * ((np.arange(count) + 0.5) / count - 0.5) + 0.5
     u, v = np.meshgrid(places * WIDTH - 0.5, places * HEIGHT - 0.5)
     phi = basis(np.stack([u.ravel(), v.ravel()], -1), WIDTH, HEIGHT, 3)
     # The midpoint rule is exact for cosines: rounding is left.
@@ -26,7 +32,7 @@ def test_cosines_are_orthonormal_over_a_domain_a_fifth_longer() -> None:
 
 def test_an_octave_of_cosines_ends_at_half_its_longest_wave() -> None:
     terms, octave = cosine_terms(WIDTH, HEIGHT, 3)
-    length_px = 2.0 * 1.2 / np.hypot(terms[:, 0] / WIDTH, terms[:, 1] / HEIGHT)
+    length_px = 2.0 * COSINE_DOMAIN / np.hypot(terms[:, 0] / WIDTH, terms[:, 1] / HEIGHT)
     for k in range(3):
         assert length_px[octave == k].min() >= 0.5**k * WIDTH * (1 - 1e-12)
     for k in (1, 2):

@@ -230,7 +230,7 @@ def test_octaves_are_of_wavelengths_down_to_a_width_its_half_and_its_quarter(
     # All cosines down to a quarter of the width but the constant, for u and for v.
     most = 12
     i, j = np.meshgrid(np.arange(most), np.arange(2 * most), indexing='ij')
-    waves = np.hypot(i / 2.4, j * WIDTH / (2.4 * HEIGHT))
+    waves = np.hypot(i / 2.7, j * WIDTH / (2.7 * HEIGHT))
     assert len(entry) == 2 * (np.count_nonzero(waves <= 4.0) - 1)
     assert {'field_9_0_u_px', 'field_0_6_v_px', 'field_1_0_v_px'} <= set(entry.labels)
 
@@ -248,8 +248,9 @@ def test_an_amplitude_of_one_is_about_the_rms_of_its_octave_along_each_axis(
         for octave in range(3):
             terms = entry.octave[axis] == octave
             variance = (entry.sigma[axis][terms, None] ** 2 * phi[terms] ** 2).sum(axis=0)
-            # The mean square is one over the longer domain of the cosines.
-            assert np.sqrt(variance.mean()) == pytest.approx(1.0, abs=0.15)
+            # The mean square is one over the longer domain of the cosines, of which the longest
+            # waves have their extremes beyond the detector: 0.8 on it.
+            assert np.sqrt(variance.mean()) == pytest.approx(1.0, abs=0.22)
     k = entry.labels.index('field_3_1_u_px')
     assert phi[k] == pytest.approx(cosine(grid[0], 3, WIDTH) * cosine(grid[1], 1, HEIGHT))
 

@@ -24,7 +24,7 @@ enum {
 static const unsigned char MAGIC[8] = {'S', 'T', 'A', 'R', 'C', 'A', 'L', 'T'};
 static const uint32_t COEFFICIENT_COUNT[5] = {5, 8, 12, 14, 4};
 static const double PI = 3.14159265358979323846;
-static const double DOMAIN_SIDES = 1.2;      /* length of the cosines in sides of the detector */
+static const double DOMAIN_SIDES = 1.35;     /* length of the cosines in sides of the detector */
 static const double INVERSE_TOLERANCE = 1e-14;
 static const double SAME_DIRECTION = 1e-12;
 static const double SAME_COVARIANCE = 1e-6;  /* relative to the trace: large parts cancel */

@@ -81,7 +81,7 @@ def field_at(pixel: np.ndarray) -> np.ndarray:
     b = (2 * pixel[1] + 1) / pool('PIXEL_LINES')[0] - 1
 
     def P(n: int, x: float) -> float:
-        return float(np.sqrt(2.0) * np.cos(np.pi * n * (x / 2.4 + 0.5))) if n else 1.0
+        return float(np.sqrt(2.0) * np.cos(np.pi * n * (x / 2.7 + 0.5))) if n else 1.0
 
     orders = zip(pool('FIELD_ORDERS_U'), pool('FIELD_ORDERS_V'), strict=True)
     terms = [P(int(i), a) * P(int(j), b) for i, j in orders]

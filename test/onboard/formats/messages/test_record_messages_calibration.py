@@ -98,9 +98,9 @@ def test_every_field_of_a_record_has_its_field_in_the_message() -> None:
         ('maps', 'line_of_sight_sigma_arcsec', 'sigma_arcsec: 1 numbers, not 4 x 3'),
         ('maps', 'shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
         ('correlation', 'matrix', 'matrix: 1 numbers, not 2 x 2'),
-        ('field', 'coefficients', 'coefficients: 1 numbers, not 2 x 5'),
-        ('field', 'covariance_factor', 'covariance_factor: 1 numbers, not 23 x 2'),
-        ('field', 'remainder', 'remainder: 1 numbers, not 55'),
+        ('field', 'coefficients', 'coefficients: 1 numbers, not 2 x 6'),
+        ('field', 'covariance_factor', 'covariance_factor: 1 numbers, not 25 x 2'),
+        ('field', 'remainder', 'remainder: 1 numbers, not 78'),
         ('temperature', 'focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
         (
             'temperature',

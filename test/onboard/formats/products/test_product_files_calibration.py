@@ -144,11 +144,11 @@ def test_a_row_of_a_grid_is_a_line(tmp_path: Path) -> None:
 def test_a_covariance_of_a_field_is_its_factor_and_remainder(tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / 'c.json')
     found = read_calibration(tmp_path / 'c.json')
-    F = np.arange(46.0).reshape(23, 2) / 11
+    F = np.arange(50.0).reshape(25, 2) / 11
     expected = F @ F.T
-    R = np.zeros((10, 10))
-    R[np.tril_indices(10)] = np.arange(-10, 45)
-    R *= np.arange(1.0, 11.0)[:, None] / 7e4
+    R = np.zeros((12, 12))
+    R[np.tril_indices(12)] = np.arange(-10, 68)
+    R *= np.arange(1.0, 13.0)[:, None] / 7e4
     expected[13:, 13:] += R @ R.T
     np.testing.assert_allclose(found.map_covariance.matrix, expected, rtol=1e-14)
     assert found.map_covariance.unresolved_px == 0.0625
@@ -211,21 +211,21 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
             lambda c: c['model_checks']['held'][1].update(sigma='a'),
             r"model_checks.held\[1\].sigma: 'a' is not a number",
         ),
-        (lambda c: c['field'].update(octaves=2), 'field.coefficients: 5 for an axis, not 17'),
+        (lambda c: c['field'].update(octaves=2), 'field.coefficients: 6 for an axis, not 22'),
         (lambda c: c['field'].update(octaves=40), 'field.octaves: 40 is not within 1 to 8'),
         (lambda c: c.pop('model'), "key 'model' is missing"),
         (lambda c: c['gate'][0].update(kept=c['gate'][0].pop('passed')), 'passed. is missing'),
         (lambda c: c['field'].pop('covariance_factor'), "key 'field.covariance_factor' is miss"),
-        (lambda c: c['field']['remainder'].pop(), 'field.remainder: 54 numbers, not 55'),
+        (lambda c: c['field']['remainder'].pop(), 'field.remainder: 77 numbers, not 78'),
         (
             lambda c: c['field']['remainder'].__setitem__(0, 40000),
             'field.remainder: a number is out of the range of int16',
         ),
         (
             lambda c: c['field'].update(remainder_unit_px=[1.0], remainder=[1]),
-            'field.remainder_unit_px: 1 numbers, not 10',
+            'field.remainder_unit_px: 1 numbers, not 12',
         ),
-        (lambda c: c['field']['covariance_factor'].pop(), 'field: covariance of 22 rows, not 23'),
+        (lambda c: c['field']['covariance_factor'].pop(), 'field: covariance of 24 rows, not 25'),
         (
             lambda c: c['sigma_budget'][1].update(map_arcsec='a'),
             r"sigma_budget\[1\].map_arcsec: 'a' is not a number",
