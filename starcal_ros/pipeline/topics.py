@@ -169,11 +169,13 @@ def read(
         return
     track = Track(setup.prior)
     for frame in _frames(paths, topics, setup):
+        time_ns = frame.time_ns if isinstance(frame, StarObservations) else frame.image.time_ns
+        if wanted is not None and not wanted(time_ns):
+            continue
         if isinstance(frame, StarObservations):
             yield frame
-            continue
-        warn_of_clock(frame.image.time_ns)
-        if wanted is None or wanted(frame.image.time_ns):
+        else:
+            warn_of_clock(time_ns)
             track = track if is_sequence else Track(setup.prior)
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
