@@ -48,8 +48,9 @@ class Source:
     @property
     def image_count(self) -> int:
         """Number of images, or of recorded observations."""
-        wanted = self.topics.observations or self.topics.image
-        return sum(topic.count for topic in reader.topics(self.bags) if topic.name == wanted)
+        kinds = self.topics.read - self.topics.telemetry
+        there = reader.topics(self.bags)
+        return sum(topic.count for topic in there if (topic.name, topic.type_name) in kinds)
 
 
 @dataclass(frozen=True)

@@ -53,25 +53,16 @@ class BagPlayer(printable_log.PrintableLog):
         )
         if not self.own.bag:
             raise BagError('bag: path of the bag to play is missing')
-        self._topics = reader.topics([self.own.bag])
+        self._topics = self._played()
         # A star observer reads the raw images or the compressed ones.
         self._images = set(
             self._of(message_codec.IMAGE_TYPE) or self._of(message_codec.COMPRESSED_TYPE)
         )
         self._players = {}
         for topic in self._topics:
-            if self.own.clock and topic.name == '/clock':
-                continue  # the player publishes its own
-            try:
-                kind = node.message_class(topic.type_name)
-            except ImportError:
-                text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
-                self.get_logger().warning(text)
-                continue
             offer = _offer(topic, topic.name in self._images)
+            kind = node.message_class(topic.type_name)
             self._players[topic.name] = self.create_publisher(kind, topic.name, offer)
-        if not self._players:
-            raise BagError(f'{self.own.bag}: no topic has an installed message type')
         self._clock_publisher = (
             self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
             if self.own.clock
@@ -88,6 +79,25 @@ class BagPlayer(printable_log.PrintableLog):
             self._observations = self.create_subscription(
                 ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
             )
+
+    def _played(self) -> list[reader.Topic]:
+        """Topics of the bag with an installed type; of several types that of most messages."""
+        played: dict[str, reader.Topic] = {}
+        for topic in sorted(reader.topics([self.own.bag]), key=lambda topic: -topic.count):
+            if self.own.clock and topic.name == '/clock':
+                continue  # the player publishes its own
+            try:
+                node.message_class(topic.type_name)
+                why = f'is not {played[topic.name].type_name}' if topic.name in played else ''
+            except ImportError:
+                why = 'is not installed here'
+            if why:
+                self.get_logger().warning(f'{topic.name}: {topic.type_name} {why}: skipped')
+            else:
+                played[topic.name] = topic
+        if not played:
+            raise BagError(f'{self.own.bag}: no topic has an installed message type')
+        return list(played.values())
 
     def play(self) -> int:
         """Play the bag; 0 if all subscribers have acknowledged all messages."""
@@ -106,7 +116,8 @@ class BagPlayer(printable_log.PrintableLog):
         sent_images, small_s = 0, time.monotonic()
         with self._observed:
             self._observed_count = 0
-        for raw in reader.read_raw([self.own.bag], self._players, self._on_damage):
+        channels = {(topic.name, topic.type_name) for topic in self._topics}
+        for raw in reader.read_raw([self.own.bag], channels, self._on_damage):
             if first_ns is None:
                 first_ns = raw.log_time_ns
             if self.own.rate:

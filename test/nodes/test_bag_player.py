@@ -97,6 +97,28 @@ def test_what_was_latched_is_latched(
     assert player.wait() == 0 and [one.data for one in found] == ['kept']
 
 
+def test_of_several_types_on_a_topic_one_is_played(
+    client: Client, start_node: StartNode, tmp_path: Path
+) -> None:
+    """The bytes of the others went out as messages of it."""
+    with BagWriter(tmp_path / 'mixed.mcap') as writer:
+        for k, kind in enumerate(('String', 'Empty', 'String')):
+            fields = (
+                {'data': str(k)}
+                if kind == 'String'
+                else {'structure_needs_at_least_one_member': 0}
+            )
+            message = make_message(f'std_msgs/msg/{kind}', **fields)
+            writer._channels.pop('/mixed', None)
+            writer.write('/mixed', f'std_msgs/msg/{kind}', k, message)
+    found: list[Any] = client.collect(String, '/mixed')
+    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "mixed.mcap"}'))
+    assert player.wait() == 0, player.said()
+    client.until(lambda: len(found) == 2)
+    assert [one.data for one in found] == ['0', '2']
+    assert '/mixed: std_msgs/msg/Empty is not std_msgs/msg/String: skipped' in player.said()
+
+
 def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:
     """
     An executor may wait again between the two steps by which rclpy answers a signal.

@@ -23,6 +23,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 import functools
 import io
+import itertools
 import logging
 import os
 from pathlib import Path
@@ -34,6 +35,7 @@ import zlib
 
 from starcal_ros.errors import BagError, errors_as, NotABag
 from starcal_ros.formats.bag import rosbag2
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of
@@ -57,6 +59,7 @@ if not rosbag2.READS_BAGS:
     _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
 
 Damage = Callable[[str], None]
+Wanted = str | tuple[str, str]  # a topic, or its messages of one type
 
 MAGIC = b'\x89MCAP0\r\n'
 _MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
@@ -103,9 +106,9 @@ def _lacks_checksum(stream: IO[bytes]) -> bool:
 
 
 def read_messages(
-    file: Path, wanted: frozenset[str] | None, on_damage: Damage
+    file: Path, wanted: frozenset[Wanted] | None, on_damage: Damage
 ) -> Iterator[RawMessage]:
-    """Intact messages of the wanted topics (None: all), in file order (rosbag2: in its own)."""
+    """Intact messages that are wanted (None: all), in file order (rosbag2: in its own)."""
     if rosbag2.READS_BAGS:
         types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
         for topic, data, log_time_ns in rosbag2.read_messages(file, wanted, on_damage):
@@ -128,7 +131,7 @@ def read_messages(
             schema = schemas.get(channel.schema_id) if channel else None
             if channel is None or schema is None or channel.message_encoding != 'cdr':
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
-            if wanted is None or channel.topic in wanted:
+            if wanted is None or wanted & {channel.topic, (channel.topic, schema.name)}:
                 if record.data[:4] == _ZSTD:
                     raise _compressed_singly(file.absolute().parent)
                 definition = schema.data.decode(errors='replace')
@@ -328,7 +331,7 @@ def log_damage(text: str) -> None:
 @dataclass(frozen=True)
 class Topic:
     """
-    Topic of a bag with its message count; ``type_name`` is ``'pkg/msg/Name'``.
+    Messages of one type, ``'pkg/msg/Name'``, on a topic of a bag, and their number.
 
     ``is_latched`` where the summary says that its publishers were transient local.
     """
@@ -356,10 +359,18 @@ class Topics:
     more_attitudes: tuple[str, ...] = ()
 
     @property
-    def telemetry(self) -> tuple[str, ...]:
-        """Topics of attitudes, velocity and temperature."""
-        single = (self.attitude, self.velocity, self.temperature)
-        return tuple(filter(None, (*single, *self.more_attitudes)))
+    def telemetry(self) -> frozenset[tuple[str, str]]:
+        """Topics of attitudes, velocity and temperature, each with a type that is read there."""
+        attitudes = itertools.product((self.attitude, *self.more_attitudes), codec.ATTITUDE_TYPES)
+        single = (self.velocity, codec.VELOCITY_TYPE), (self.temperature, codec.TEMPERATURE_TYPE)
+        return frozenset(pair for pair in (*attitudes, *single) if pair[0])
+
+    @property
+    def read(self) -> frozenset[tuple[str, str]]:
+        """Topics of images and telemetry, or of observations, each with a type that is read."""
+        images = {(self.image, kind) for kind in codec.IMAGE_TYPES} if self.image else set()
+        recorded = {(self.observations, codec.OBSERVATIONS_TYPE)} if self.observations else set()
+        return self.telemetry | images | recorded
 
 
 def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
@@ -398,17 +409,17 @@ def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
 
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
-    """Topics with messages, by name; a file without a summary is read completely."""
-    last: dict[str, Topic] = {}
-    counts: Counter[str] = Counter()
+    """Topics with messages, by name and type; a file without a summary is read completely."""
+    last: dict[tuple[str, str], Topic] = {}
+    counts: Counter[tuple[str, str]] = Counter()
     for file in mcap_files(paths):
         listed, damage, _ = _listed_now(file)
         for text in damage:
             on_damage(text)
         for topic in listed:
-            last[topic.name] = topic
-            counts[topic.name] += topic.count
-    return tuple(replace(last[name], count=counts[name]) for name in sorted(counts))
+            last[topic.name, topic.type_name] = topic
+            counts[topic.name, topic.type_name] += topic.count
+    return tuple(replace(last[key], count=counts[key]) for key in sorted(counts))
 
 
 def _listed_now(file: Path) -> tuple[list[Topic], list[str], int]:
@@ -471,9 +482,11 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
 
 
 def read_raw(
-    paths: Iterable[Path | str], only: Iterable[str] | None = None, on_damage: Damage = log_damage
+    paths: Iterable[Path | str],
+    only: Iterable[Wanted] | None = None,
+    on_damage: Damage = log_damage,
 ) -> Iterator[RawMessage]:
-    """Serialised messages of the given topics (None: all), in file order."""
+    """Serialised messages of the given topics, or of types on them (None: all), in file order."""
     wanted = None if only is None else frozenset(only)
     for file in mcap_files(paths):
         yield from read_messages(file, wanted, on_damage)
@@ -487,7 +500,7 @@ def read_images(
     channel: str = '',
 ) -> Iterator[Image | StarObservations]:
     """Images of a topic, as `image_of` reads them."""
-    for raw in read_raw(paths, [topic], on_damage):
+    for raw in read_raw(paths, Topics(topic).read, on_damage):
         yield image_of(raw, stamp_offset_s, channel=channel)
 
 
@@ -499,7 +512,7 @@ def read_observations(
 
     Raises BagError if this version cannot convert a message to observations.
     """
-    for raw in read_raw(paths, [topic], on_damage):
+    for raw in read_raw(paths, Topics(observations=topic).read, on_damage):
         try:
             yield checked_observations(decode(raw))
         except (AttributeError, ValueError) as error:
