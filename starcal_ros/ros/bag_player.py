@@ -72,6 +72,7 @@ class BagPlayer(printable_log.PrintableLog):
         self._unacked = dict.fromkeys(self._players, 0)
         self._observed = threading.Condition()
         self._observed_count = 0
+        self._told: set[str] = set()
         # Observations in the bag itself must not pace the player or count as subscribers.
         kinds = {topic.type_name for topic in self._topics}
         self._paced = bool(self._images) and message_codec.OBSERVATIONS_TYPE not in kinds
@@ -132,7 +133,11 @@ class BagPlayer(printable_log.PrintableLog):
                 small_s = max(small_s + 1.0 / _SMALL_PER_S, time.monotonic() - 0.05)
                 self._sleep_until(small_s)
             player = self._players[raw.topic]
-            player.publish(raw.data)
+            try:
+                player.publish(reader.cdr_of_this_version(raw))
+            except BagError as error:
+                self._on_damage(str(error))
+                continue
             self._unacked[raw.topic] += 1
             if self._unacked[raw.topic] >= _UNACKED[is_image]:
                 player.wait_for_all_acked(_timeout())
@@ -225,7 +230,10 @@ class BagPlayer(printable_log.PrintableLog):
             self._observed.notify()
 
     def _on_damage(self, text: str) -> None:
-        self.get_logger().warning(text)
+        """Warn of damage of the bag, each text once."""
+        if text not in self._told:
+            self._told.add(text)
+            self.get_logger().warning(text)
 
 
 def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:

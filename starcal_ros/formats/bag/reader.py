@@ -20,6 +20,7 @@ import bisect
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
 from dataclasses import dataclass, replace
 import functools
 import io
@@ -53,7 +54,7 @@ if not rosbag2.READS_BAGS:
     from mcap.stream_reader import get_chunk_data_stream, StreamReader
     from mcap.summary import Summary
 
-    from starcal_ros.formats.bag.typestore import typestore_of
+    from starcal_ros.formats.bag.typestore import of_this_version, typestore_of
 
     # Damaged bytes are parsed as an arbitrary record: the exceptions have no common base class.
     _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
@@ -134,7 +135,8 @@ def read_messages(
             if wanted is None or wanted & {channel.topic, (channel.topic, schema.name)}:
                 if record.data[:4] == _ZSTD:
                     raise _compressed_singly(file.absolute().parent)
-                definition = schema.data.decode(errors='replace')
+                is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
+                definition = schema.data.decode(errors='replace') if is_text else ''
                 view = memoryview(record.data)
                 yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
     if summary is None and pieces.complete:
@@ -521,11 +523,28 @@ def read_observations(
 
 def decode(raw: RawMessage) -> Message:
     """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
-    try:
+    with _decoding(raw):
         if rosbag2.READS_BAGS:
             return rosbag2.decode(raw.view, raw.type_name)
         store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.view, raw.type_name)
+
+
+def cdr_of_this_version(raw: RawMessage) -> bytes:
+    """Bytes of a message for ROS, whose definition is that of this version; raises BagError."""
+    with _decoding(raw):
+        if rosbag2.READS_BAGS:
+            return raw.data
+        return bytes(of_this_version(raw.type_name, raw.definition, raw.view))
+
+
+@contextlib.contextmanager
+def _decoding(raw: RawMessage) -> Iterator[None]:
+    """Raise BagError with the topic of a message whose definition or bytes are wrong."""
+    try:
+        yield
+    except BagError as error:
+        raise BagError(f'{raw.topic}: {raw.type_name} is {error}') from error
     # The exceptions of wrong bytes depend on the field and have no common base class.
     except Exception as error:
         raise BagError(

@@ -64,7 +64,7 @@ def observations_from_message(message: codec.Message) -> StarObservations:
     if len(reasons) != len(counts):
         raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
     values['refused_stars'] = dict(zip(reasons, counts, strict=True))
-    values['detail'] = values['detail'][:_LONGEST_DETAIL]
+    values['detail'] = values.get('detail', '')[:_LONGEST_DETAIL]
     _forget_zeros(values)
     record = read_record(StarObservations, values)
     _check_stars(record)
@@ -74,8 +74,8 @@ def observations_from_message(message: codec.Message) -> StarObservations:
 def _forget_zeros(values: dict[str, Any]) -> None:
     """Replace zeros that no sender means, as ROS fills them in, by numbers that are not known."""
     nowhere = np.full(3, math.nan)
-    if not np.any(values['first_from_star_tracker']):
-        del values['first_from_star_tracker']
+    if not np.any(values.get('first_from_star_tracker', 0)):
+        values.pop('first_from_star_tracker', None)
     sigma = values.get('star_tracker_rate_sigma_rad_s', nowhere)
     values['star_tracker_rate_sigma_rad_s'] = np.where(sigma == 0, math.nan, sigma)
     is_stated = bool((sigma > 0).any())
