@@ -42,7 +42,13 @@ from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.text import printable
-from starcal_ros.untrusted import METADATA_BYTES, read_text, regular_file, yaml_value
+from starcal_ros.untrusted import (
+    ARCHIVE_BYTES,
+    METADATA_BYTES,
+    read_text,
+    regular_file,
+    yaml_value,
+)
 
 if not rosbag2.READS_BAGS:
     from mcap.data_stream import ReadDataStream
@@ -53,6 +59,7 @@ if not rosbag2.READS_BAGS:
     from mcap.records import Message as McapMessage
     from mcap.stream_reader import get_chunk_data_stream, StreamReader
     from mcap.summary import Summary
+    import zstandard
 
     from starcal_ros.formats.bag.typestore import of_this_version, typestore_of
 
@@ -113,6 +120,9 @@ def read_messages(
     if rosbag2.READS_BAGS:
         types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
         for topic, data, log_time_ns in rosbag2.read_messages(file, wanted, on_damage):
+            if data[:4] == _ZSTD:
+                what = 'its messages are compressed one by one, which rosbag2 leaves'
+                raise BagError(f'{file}: {what}: {rosbag2.INSTALL}')
             yield RawMessage(topic, types[topic], '', log_time_ns, memoryview(data))
         return
     summary = read_summary(file)
@@ -133,11 +143,9 @@ def read_messages(
             if channel is None or schema is None or channel.message_encoding != 'cdr':
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
             if wanted is None or wanted & {channel.topic, (channel.topic, schema.name)}:
-                if record.data[:4] == _ZSTD:
-                    raise _compressed_singly(file.absolute().parent)
                 is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
                 definition = schema.data.decode(errors='replace') if is_text else ''
-                view = memoryview(record.data)
+                view = memoryview(_message(record.data))
                 yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
     if summary is None and pieces.complete:
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
@@ -149,6 +157,15 @@ def read_messages(
     nameless = {number: n for number, n in read.items() if number not in channels}
     if lost or nameless:
         pieces.report(_loss(lost, expected, channels, nameless))
+
+
+def _message(data: bytes) -> bytes:
+    """Bytes of a message, which rosbag2 may have compressed by itself; as they are if damaged."""
+    if data[:4] == _ZSTD:
+        with contextlib.suppress(zstandard.ZstdError, MemoryError):
+            if zstandard.frame_content_size(data) <= ARCHIVE_BYTES:
+                return zstandard.decompress(data)
+    return data
 
 
 def _loss(
@@ -555,8 +572,6 @@ def _decoding(raw: RawMessage) -> Iterator[None]:
 def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
     names, compression = _metadata(folder / 'metadata.yaml')
-    if compression.lower() == 'message':
-        raise _compressed_singly(folder)
     if compression:  # zstd leaves the files without the ending
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
@@ -572,14 +587,6 @@ def _files_of_folder(folder: Path) -> list[Path]:
         near = f' (did you mean {inside.parent}?)' if inside else ''
         raise NotABag(f'{folder}: no .mcap files in the folder{near}', folder)
     return files
-
-
-def _compressed_singly(folder: Path) -> BagError:
-    return BagError(
-        f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
-        f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
-        f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
-    )
 
 
 def _metadata(path: Path) -> tuple[list[str], str]:

@@ -456,16 +456,34 @@ def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     assert isinstance(read, Image) and read.time_ns == 5
 
 
-def test_messages_compressed_one_by_one_are_refused_with_the_remedy(tmp_path: Path) -> None:
-    """Of such a bag the file alone, without the metadata of its folder, is given."""
-    with (tmp_path / 'bag_0.mcap').open('wb') as stream:
+def test_messages_compressed_one_by_one_are_read(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by ``ros2 bag record --compression-mode message``; damaged ones are counted as ever."""
+    sound = list(bag_reader.read_raw([folder], ['/image', '/attitude']))
+    (tmp_path / 'bag').mkdir()
+    with (tmp_path / 'bag/bag_0.mcap').open('wb') as stream:
         writer = typestore_module.started(stream)
-        image = typestore_module.opened(writer, '/image', IMAGE_TYPE)
-        writer.add_message(image, 5, zstandard.compress(bytes(100)), 5)
+        numbers: dict[str, int] = {}
+        for raw in sound:
+            if raw.topic not in numbers:
+                numbers[raw.topic] = typestore_module.opened(writer, raw.topic, raw.type_name)
+            writer.add_message(numbers[raw.topic], 5, zstandard.compress(raw.data), 5)
+        writer.add_message(numbers['/image'], 5, zstandard.compress(bytes(100))[:-9], 5)
         writer.finish()
-    remedy = f'{tmp_path}: its messages are compressed one by one: ros2 bag convert -i {tmp_path} '
-    with pytest.raises(BagError, match=re.escape(remedy)):
-        images_of(tmp_path / 'bag_0.mcap')
+    files = {'relative_file_paths': ['bag_0.mcap'], 'compression_mode': 'MESSAGE'}
+    (tmp_path / 'bag/metadata.yaml').write_text(
+        yaml.safe_dump({'rosbag2_bagfile_information': files})
+    )
+    for path in (tmp_path / 'bag', tmp_path / 'bag/bag_0.mcap'):
+        read = list(bag_reader.read_raw([path]))
+        assert [one.data for one in read[:-1]] == [one.data for one in sound]
+        *images, last = images_of(path)
+        assert all(isinstance(image, Image) for image in images)
+        assert isinstance(last, StarObservations) and last.refusal == 'bad_layout'
+    # One that claims to be larger is not inflated.
+    monkeypatch.setattr(bag_reader, 'ARCHIVE_BYTES', 600 * 602 * 2)
+    assert not any(isinstance(image, Image) for image in images_of(tmp_path / 'bag'))
 
 
 MEMORY = """
