@@ -40,7 +40,7 @@ from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of
-from starcal_ros.records import Image, StarObservations
+from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import (
     ARCHIVE_BYTES,
@@ -527,15 +527,16 @@ def read_observations(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[StarObservations]:
     """
-    Recorded observations of a topic; an image with impossible values becomes a refused one.
+    Recorded observations of a topic.
 
-    Raises BagError if this version cannot convert a message to observations.
+    Those with impossible values, or that cannot be decoded, become refused ones.
     """
     for raw in read_raw(paths, Topics(observations=topic).read, on_damage):
         try:
             yield checked_observations(decode(raw))
-        except (AttributeError, ValueError) as error:
-            raise BagError(f'{topic}: not readable as observations: {error}') from error
+        except BagError as error:
+            time_ns = codec.nearest_stamp_ns(raw.log_time_ns)
+            yield refused_image(time_ns, 0, 0, 'bad_observations', str(error))
 
 
 def decode(raw: RawMessage) -> Message:

@@ -60,7 +60,8 @@ def observations_from_message(message: codec.Message) -> StarObservations:
     star can have.
     """
     values = codec.plain_message(StarObservations, message)
-    reasons, counts = message.refused_star_reasons, message.refused_star_counts
+    names = ('refused_star_reasons', 'refused_star_counts')
+    reasons, counts = (getattr(message, name, ()) for name in names)
     if len(reasons) != len(counts):
         raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
     values['refused_stars'] = dict(zip(reasons, counts, strict=True))
@@ -93,8 +94,6 @@ def checked_observations(message: codec.Message) -> StarObservations:
     Observations of a starcal/StarObservations, refused where they hold impossible values.
 
     The refusal is ``bad_observations``, with the field and its value.
-
-    Raises AttributeError when the message lacks fields.
     """
     try:
         return observations_from_message(message)

@@ -242,6 +242,19 @@ def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     assert isinstance(last, Image)
 
 
+def test_a_bad_message_of_observations_does_not_end_the_run(tmp_path: Path) -> None:
+    record = refused_image(5, 3, 2, 'no_stars', 'sound')
+    with BagWriter(tmp_path / 'b') as writer:
+        writer.write_observations('/observations', record, 'camera')
+        number, _ = writer._channels['/observations']
+        writer._writer.add_message(number, 6, b'\x00\x01\x00\x00rubbish', 6)
+        writer.write_observations('/observations', record, 'camera')
+    first, bad, last = bag_reader.read_observations([tmp_path / 'b'], '/observations')
+    assert first.detail == last.detail == 'sound'
+    assert (bad.refusal, bad.time_ns) == ('bad_observations', 6)
+    assert bad.detail == '/observations: cannot decode 11 bytes as starcal/msg/StarObservations'
+
+
 def test_invalid_attitude_sample(tmp_path: Path) -> None:
     """An attitude that is not a unit quaternion gives the refusal bad_attitude."""
     with BagWriter(tmp_path / 'b') as writer:
