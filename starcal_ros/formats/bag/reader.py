@@ -396,9 +396,10 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     """
     MCAP files of bags in the order of their first messages, each once.
 
-    Raises BagError where a path has none.
+    An .mcap file that does not begin as one, as a crash leaves the last of a split bag, is damaged
+    if there are others.  Raises BagError where a path has none.
     """
-    files = []
+    files, others = [], []
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
@@ -411,6 +412,9 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         with errors_as(BagError, file), regular_file(file) as stream:
             is_bag = stream.read(max(map(len, _MAGICS))).startswith(_MAGICS)
         if not is_bag:
+            others.append(file)
+    for file in others:
+        if len(others) == len(files) or file.suffix != '.mcap':
             raise NotABag(f'{file}: not an MCAP bag', file)
     # A shell sorts rec_10 before rec_2.
     return sorted(dict.fromkeys(files), key=_first_ns)
@@ -495,7 +499,7 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
-        listed = ', '.join(topic.name for topic in there) or 'none'
+        listed = ', '.join(topic.name for topic in there) or 'none in cdr, the encoding of ROS 2'
         raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
     raise BagError(f'{where}: several topics of type {type_name}: {listed}')
 

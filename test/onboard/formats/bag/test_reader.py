@@ -216,13 +216,20 @@ def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) 
     assert '\n' not in said
 
 
-def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
-    """Files of a split bag are read in recording order: 10 after 9."""
+@pytest.mark.parametrize(('content', 'kind'), [(b'', 'truncated'), (bytes(4096), 'damaged')])
+def test_split_bag_is_read_in_order(tmp_path: Path, content: bytes, kind: str) -> None:
+    """Files of a split bag are read in recording order: 10 after 9; a crash lost the last."""
     (tmp_path / 'split').mkdir()
     for k in (0, 9, 10):
         with BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
             writer.write_image('/image', Image(k, np.zeros((2, 2), np.uint8)), '')
-    assert [image.time_ns for image in images_of(tmp_path / 'split')] == [0, 9, 10]
+    (tmp_path / 'split' / 'split_11.mcap').write_bytes(content)
+    for paths in ([tmp_path / 'split'], sorted((tmp_path / 'split').iterdir())):
+        told: list[str] = []
+        images = bag_reader.read_raw(paths, ['/image'], told.append)
+        assert [image.log_time_ns for image in images] == [0, 9, 10]
+        (sentence,) = told
+        assert f'split_11.mcap: {kind} after byte 0 of {len(content)}' in sentence
 
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
@@ -467,6 +474,18 @@ def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     assert [t.name for t in bag_reader.topics([file])] == ['/image']
     (read,) = images_of(file)
     assert isinstance(read, Image) and read.time_ns == 5
+
+
+def test_a_bag_without_messages_of_ros_2_is_named(tmp_path: Path) -> None:
+    """As those that other tools make of ROS 1 bags."""
+    with (tmp_path / 'b.mcap').open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros1')
+        schema = writer.register_schema('sensor_msgs/Image', 'ros1msg', b'uint32 height')
+        writer.add_message(writer.register_channel('/image', 'ros1', schema), 1, b'', 1)
+        writer.finish()
+    with pytest.raises(BagError, match=r'\(topics: none in cdr, the encoding of ROS 2\)'):
+        bag_reader.choose_topic([tmp_path / 'b.mcap'], IMAGE_TYPE)
 
 
 def test_messages_compressed_one_by_one_are_read(
