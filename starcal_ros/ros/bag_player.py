@@ -82,16 +82,19 @@ class BagPlayer(printable_log.PrintableLog):
             )
 
     def _played(self) -> list[reader.Topic]:
-        """Topics of the bag with an installed type; of several types that of most messages."""
+        """Topics that ROS can have, of an installed type; of several that of most messages."""
         played: dict[str, reader.Topic] = {}
         for topic in sorted(reader.topics([self.own.bag]), key=lambda topic: -topic.count):
             if self.own.clock and topic.name == '/clock':
                 continue  # the player publishes its own
             try:
                 node.message_class(topic.type_name)
+                self.resolve_topic_name(topic.name)
                 why = f'is not {played[topic.name].type_name}' if topic.name in played else ''
             except ImportError:
                 why = 'is not installed here'
+            except RuntimeError:
+                why = 'is on no topic that ROS can have'
             if why:
                 self.get_logger().warning(f'{topic.name}: {topic.type_name} {why}: skipped')
             else:

@@ -35,6 +35,7 @@ from starcal_ros.formats.messages.message_codec import (
     OBSERVATIONS_TYPE,
     POSE_TYPE,
     quaternion_to_message,
+    TEMPERATURE_TYPE,
 )
 from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
@@ -107,23 +108,25 @@ def test_what_was_latched_is_latched(
 def test_of_several_types_on_a_topic_one_is_played(
     client: Client, start_node: StartNode, tmp_path: Path
 ) -> None:
-    """The bytes of the others went out as messages of it."""
+    """The bytes of the others went out as messages of it; a name of another tool ended it."""
     with BagWriter(tmp_path / 'mixed.mcap') as writer:
-        for k, kind in enumerate(('String', 'Empty', 'String')):
+        for k, topic in enumerate(('/mixed', '/mixed', '/mixed', '/of another tool')):
+            kind = 'std_msgs/msg/String' if k != 1 else TEMPERATURE_TYPE
+            header = make_header(k, '', make_message)
             fields = (
                 {'data': str(k)}
-                if kind == 'String'
-                else {'structure_needs_at_least_one_member': 0}
+                if k != 1
+                else {'header': header, 'temperature': 0.0, 'variance': 0.0}
             )
-            message = make_message(f'std_msgs/msg/{kind}', **fields)
-            writer._channels.pop('/mixed', None)
-            writer.write('/mixed', f'std_msgs/msg/{kind}', k, message)
+            writer._channels.pop(topic, None)
+            writer.write(topic, kind, k, make_message(kind, **fields))
     found: list[Any] = client.collect(String, '/mixed')
     player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "mixed.mcap"}'))
     assert player.wait() == 0, player.said()
     client.until(lambda: len(found) == 2)
     assert [one.data for one in found] == ['0', '2']
-    assert '/mixed: std_msgs/msg/Empty is not std_msgs/msg/String: skipped' in player.said()
+    assert f'/mixed: {TEMPERATURE_TYPE} is not std_msgs/msg/String: skipped' in player.said()
+    assert 'String is on no topic that ROS can have: skipped' in player.said()
 
 
 def test_messages_of_another_version_are_played_as_those_of_this_one(
