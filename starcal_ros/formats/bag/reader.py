@@ -581,7 +581,10 @@ def _files_of_folder(folder: Path) -> list[Path]:
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
     listed = [folder / name for name in names if (folder / name).is_file()]
-    files = listed or [path for path in here if path.suffix in _SUFFIXES and path.is_file()]
+    there = [path for path in here if path.suffix in _SUFFIXES and path.is_file()]
+    files = listed or there
+    for path in (path for path in there if path not in files):
+        log_damage(f'{path}: not read, as metadata.yaml does not list it')
     missing = [name for name in names if not (folder / name).is_file()]
     packed = bool(missing) and (folder / f'{missing[0]}.zstd').is_file()
     if missing and (listed or packed):

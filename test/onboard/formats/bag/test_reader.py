@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import io
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -230,6 +231,18 @@ def test_split_bag_is_read_in_order(tmp_path: Path, content: bytes, kind: str) -
         assert [image.log_time_ns for image in images] == [0, 9, 10]
         (sentence,) = told
         assert f'split_11.mcap: {kind} after byte 0 of {len(content)}' in sentence
+
+
+def test_a_file_that_the_metadata_do_not_list_is_named(
+    tmp_path: Path, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its images were missing without a word."""
+    bag = Path(shutil.copytree(folder, tmp_path / 'bag'))
+    shutil.copy(bag / 'six_0.mcap', bag / 'six_1.mcap')
+    assert len(images_of(bag)) == 6
+    assert caplog.messages == [
+        f'{bag / "six_1.mcap"}: not read, as metadata.yaml does not list it'
+    ]
 
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
