@@ -142,7 +142,8 @@ def read_messages(
             schema = schemas.get(channel.schema_id) if channel else None
             if channel is None or schema is None or channel.message_encoding != 'cdr':
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
-            if wanted is None or wanted & {channel.topic, (channel.topic, schema.name)}:
+            names = channel.topic, (channel.topic, schema.name)
+            if wanted is None or not wanted.isdisjoint(names):
                 is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
                 definition = schema.data.decode(errors='replace') if is_text else ''
                 view = memoryview(_message(record.data))
@@ -545,33 +546,31 @@ def read_observations(
 
 def decode(raw: RawMessage) -> Message:
     """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
-    with _decoding(raw):
+    try:
         if rosbag2.READS_BAGS:
             return rosbag2.decode(raw.view, raw.type_name)
         store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.view, raw.type_name)
+    # The exceptions of wrong bytes depend on the field and have no common base class.
+    except Exception as error:
+        raise _undecodable(raw, error) from error
 
 
 def cdr_of_this_version(raw: RawMessage) -> bytes:
     """Bytes of a message for ROS, whose definition is that of this version; raises BagError."""
-    with _decoding(raw):
-        if rosbag2.READS_BAGS:
-            return raw.data
-        return bytes(of_this_version(raw.type_name, raw.definition, raw.view))
-
-
-@contextlib.contextmanager
-def _decoding(raw: RawMessage) -> Iterator[None]:
-    """Raise BagError with the topic of a message whose definition or bytes are wrong."""
+    if rosbag2.READS_BAGS:
+        return raw.data
     try:
-        yield
-    except BagError as error:
-        raise BagError(f'{raw.topic}: {raw.type_name} is {error}') from error
-    # The exceptions of wrong bytes depend on the field and have no common base class.
+        return bytes(of_this_version(raw.type_name, raw.definition, raw.view))
     except Exception as error:
-        raise BagError(
-            f'{raw.topic}: cannot decode {len(raw.view)} bytes as {raw.type_name}'
-        ) from error
+        raise _undecodable(raw, error) from error
+
+
+def _undecodable(raw: RawMessage, error: Exception) -> BagError:
+    """Error of a message whose definition or bytes are wrong, with its topic."""
+    if isinstance(error, BagError):
+        return BagError(f'{raw.topic}: {raw.type_name} is {error}')
+    return BagError(f'{raw.topic}: cannot decode {len(raw.view)} bytes as {raw.type_name}')
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
