@@ -43,6 +43,7 @@ class FileKind:
 MCAP = FileKind('an MCAP bag')
 SQLITE_BAG = FileKind('an SQLite bag')
 ROS_1_BAG = FileKind('a ROS 1 bag')
+ZSTD = FileKind('a file compressed by zstd')
 UNKNOWN = FileKind('a file of no known format')
 JPEG, PNG, TIFF, FITS, RAW = (
     FileKind(name, is_image=True)
@@ -53,6 +54,7 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, b'\x89MCAP0\r\n', MCAP),
     (0, b'SQLite format 3', SQLITE_BAG),
     (0, b'#ROSBAG V', ROS_1_BAG),
+    (0, b'\x28\xb5\x2f\xfd', ZSTD),
     (0, b'\xff\xd8\xff', JPEG),
     (0, b'\x89PNG\r\n\x1a\n', PNG),
     (0, b'SIMPLE  =', FITS),
@@ -104,6 +106,8 @@ def _instead(place: Path) -> str:
             start = f', but {file.name}: {kind.name}' if is_folder else f' but {kind.name}'
             if kind.is_image:
                 return start + _OF_IMAGES
+            if kind is ZSTD:
+                return f'{start}: {shlex.join(["zstd", "-d", str(file)])}'
             if kind in (SQLITE_BAG, ROS_1_BAG):
                 return f'{start}: {_conversion(file, kind)} makes one'
     return ''

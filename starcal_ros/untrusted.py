@@ -30,7 +30,7 @@ import yaml
 PARAMETER_BYTES = 256 * 1024  # of a parameter or camera file: thirty times the longest in use
 METADATA_BYTES = 4 * 1024 * 1024  # 5000 topics
 PRODUCT_BYTES = 8 * 1024 * 1024  # a calibration.json with the covariance of a field has 1 MB
-ARCHIVE_BYTES = 1 << 30  # of a catalog or of residuals, also inflated: 30 million stars
+ARCHIVE_BYTES = 1 << 30  # of a catalog, residuals or a message, inflated: 30 million stars
 
 _DEPTH = 32
 _VALUES = 100_000  # of a YAML document; containers of a JSON document

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
+import functools
 from pathlib import Path
 import threading
 
@@ -125,7 +126,8 @@ def _calibrated(
 ) -> campaign.Campaign:
     """The calibration of observed images; a failure is recorded in the folder."""
     try:
-        made = campaign.calibrate(observed, inputs)
+        progress = functools.partial(progress_bar, label='images again')
+        made = campaign.calibrate(observed, inputs, progress)
     except TooFewObservations as error:
         failure = _failure(str(error), observed)
         if not observed.source.setup.has_tracker:  # its bags are temporary

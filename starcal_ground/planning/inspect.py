@@ -25,9 +25,8 @@ from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
-_IMAGES = (message_codec.IMAGE_TYPE, message_codec.COMPRESSED_TYPE)
 _STAMPED = (
-    *_IMAGES,
+    *message_codec.IMAGE_TYPES,
     message_codec.ATTITUDE_TYPE,
     message_codec.VELOCITY_TYPE,
     message_codec.TEMPERATURE_TYPE,
@@ -165,43 +164,40 @@ def inspect(
 
 
 def _contents(paths: Sequence[Path], on_damage: reader.Damage) -> tuple[TopicContent, ...]:
-    """Statistics of every topic, sorted by name, from one pass over the files."""
-    type_names: dict[str, str] = {}
-    stamps: defaultdict[str, list[int]] = defaultdict(list)
-    kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    bad: Counter[str] = Counter()
+    """Statistics of every topic, sorted by name and type, from one pass over the files."""
+    stamps: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+    kinds: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+    bad: Counter[tuple[str, str]] = Counter()
     for raw in frames.read_ahead(reader.read_raw(paths, on_damage=on_damage)):
-        type_names[raw.topic] = raw.type_name
-        stamp_ns = raw.log_time_ns
+        topic, stamp_ns = (raw.topic, raw.type_name), raw.log_time_ns
         if raw.type_name in _STAMPED:
             try:
                 message = reader.decode(raw)
             except BagError:
-                bad[raw.topic] += 1
+                bad[topic] += 1
             else:
                 stamp_ns = message_codec.stamp_ns(message.header.stamp)
-                if raw.type_name in _IMAGES:
-                    kinds[raw.topic][_kind(message)] += 1
+                if raw.type_name in message_codec.IMAGE_TYPES:
+                    kinds[topic][_kind(message)] += 1
                 elif raw.type_name == message_codec.ATTITUDE_TYPE:
                     sample = attitude_sample(*sensor_messages.attitude_from_message(message), '')
-                    bad[raw.topic] += sample is None
-        stamps[raw.topic].append(stamp_ns)
+                    bad[topic] += sample is None
+        stamps[topic].append(stamp_ns)
     contents = []
-    for name, type_name in sorted(type_names.items()):
-        steps_s = np.diff(sorted(stamps[name])) / NANOSECONDS_PER_SECOND
+    for topic, there_ns in sorted(stamps.items()):
+        steps_s = np.diff(sorted(there_ns)) / NANOSECONDS_PER_SECOND
         middle_s = float(np.median(steps_s)) if steps_s.size else 0.0
         contents.append(
             TopicContent(
-                name=name,
-                type_name=type_name,
-                count=len(stamps[name]),
+                *topic,
+                count=len(there_ns),
                 rate_hz=1.0 / middle_s if middle_s > 0 else 0.0,
-                first_ns=min(stamps[name]),
-                last_ns=max(stamps[name]),
+                first_ns=min(there_ns),
+                last_ns=max(there_ns),
                 longest_gap_s=float(steps_s.max(initial=0.0)),
-                backward=int((np.diff(stamps[name]) < 0).sum()),
-                kinds=dict(kinds[name]),
-                bad=bad[name],
+                backward=int((np.diff(there_ns) < 0).sum()),
+                kinds=dict(kinds[topic]),
+                bad=bad[topic],
             )
         )
     return tuple(contents)

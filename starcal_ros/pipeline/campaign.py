@@ -12,6 +12,7 @@ that match no star they keep the last few only.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +29,8 @@ _FOR_WANT_OF_STARS = {REQUIREMENTS, 'min_coverage'}  # checks that fail, of a so
 
 ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations], str]]
 """Observations with the refraction that they show, and a sentence on it or an empty one."""
+Progress = Callable[[int], contextlib.AbstractContextManager[Callable[[], None]]]
+"""Shows the progress through a number of images by a function to call for each."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,9 @@ class Source:
     @property
     def image_count(self) -> int:
         """Number of images, or of recorded observations."""
-        wanted = self.topics.observations or self.topics.image
-        return sum(topic.count for topic in reader.topics(self.bags) if topic.name == wanted)
+        kinds = self.topics.read - self.topics.telemetry
+        there = reader.topics(self.bags)
+        return sum(topic.count for topic in there if (topic.name, topic.type_name) in kinds)
 
 
 @dataclass(frozen=True)
@@ -132,19 +136,24 @@ def _observed(source: Source, measured: Sequence[StarObservations], *notes: str)
     return Observed(source, measured, tuple(observations), (*source.notes, *found))
 
 
-def calibrate(observed: Observed, inputs: Mapping[str, str] | None = None) -> Campaign:
+def calibrate(
+    observed: Observed,
+    inputs: Mapping[str, str] | None = None,
+    progress: Progress = lambda _: contextlib.nullcontext(lambda: None),
+) -> Campaign:
     """
     Calibration of observed bags; ``inputs`` are the digests of the input files by name.
 
-    Raises TooFewObservations when the images do not determine the parameters to be estimated.
+    ``progress`` is that of the images that are measured again.  Raises TooFewObservations when
+    the images do not determine the parameters to be estimated.
     """
     campaign = _solved(observed, inputs)
-    again, note = _measured_again(observed, campaign.calibration)
+    again, note = _measured_again(observed, campaign.calibration, progress)
     return _solved(_observed(observed.source, again, note), inputs) if note else campaign
 
 
 def _measured_again(
-    observed: Observed, calibration: Calibration
+    observed: Observed, calibration: Calibration, progress: Progress
 ) -> tuple[Sequence[StarObservations], str]:
     """
     Observations with those measured again with a calibration, and a sentence if any gained stars.
@@ -171,15 +180,18 @@ def _measured_again(
     second = bag_topics.read(
         source.bags, source.topics, setup, wanted=wanted.__contains__, is_sequence=lacks_stars
     )
-    # In the order of the bag, as before: two images may have one stamp, of which one is used.
-    found = (record for record in second if record.time_ns in wanted)
     used = {record.time_ns for record in before if not (record.refusal or lacks_stars)}
     records = []
-    for old in before:
-        new = next(found, old) if old.time_ns in wanted else old
-        is_better = not new.refusal and old.refusal in again and new.time_ns not in used
-        records.append(new if is_better else old)
-        used |= {new.time_ns} if is_better else set()
+    with progress(sum(record.time_ns in wanted for record in before)) as advance:
+        # In the order of the bag, as before: two images may have one stamp, of which one is used.
+        for old in before:
+            new = old
+            if old.time_ns in wanted:
+                new = next(second, old)
+                advance()
+            is_better = not new.refusal and old.refusal in again and new.time_ns not in used
+            records.append(new if is_better else old)
+            used |= {new.time_ns} if is_better else set()
     matched = sum(bool(a.refusal) - bool(b.refusal) for a, b in zip(before, records, strict=True))
     stars = sum(len(record) for record in records) - sum(len(record) for record in before)
     if lacks_stars and stars > 0:

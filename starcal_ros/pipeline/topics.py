@@ -29,7 +29,6 @@ Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
 _RAW = codec.IMAGE_TYPE
-_IMAGE_TYPES = {_RAW, codec.COMPRESSED_TYPE}
 _WITHOUT = {
     'image': 'record the images, or make a bag of image files with starcal import',
     'attitude': (
@@ -49,10 +48,11 @@ def choose_topics(paths: Sequence[Path], requested: Topics, setup: Setup | None 
     """
     there = reader.topics(paths)
     kinds = {topic.type_name for topic in there}
-    only_recorded = not kinds & _IMAGE_TYPES and codec.OBSERVATIONS_TYPE in kinds
+    only_recorded = kinds.isdisjoint(codec.IMAGE_TYPES) and codec.OBSERVATIONS_TYPE in kinds
     if requested.observations or (only_recorded and not requested.image):
         kind = codec.OBSERVATIONS_TYPE
-        return Topics(observations=_choose(paths, kind, requested.observations, 'observations'))
+        recorded = _choose(paths, kind, requested.observations, 'observations')
+        return _without_others(there, Topics(observations=recorded))
     image = choose_image_topic(paths, requested)
     attitude, more = _choose_attitudes(paths, there, requested.attitude, setup)
     velocity, temperature = requested.velocity, requested.temperature
@@ -64,12 +64,24 @@ def choose_topics(paths: Sequence[Path], requested: Topics, setup: Setup | None 
     # A spacecraft has many: the topic must be unique only if the calibration uses it.
     if temperature or thermometers == 1 or (thermometers and used):
         temperature = _choose(paths, codec.TEMPERATURE_TYPE, temperature, 'temperature')
-    return Topics(image, attitude, velocity, temperature, more_attitudes=more)
+    chosen = Topics(image, attitude, velocity, temperature, more_attitudes=more)
+    return _without_others(there, chosen)
+
+
+def _without_others(there: Sequence[reader.Topic], chosen: Topics) -> Topics:
+    """Return the chosen topics, with a warning of messages on them that are not read."""
+    names = {name for name, _ in chosen.read}
+    for topic in there:
+        if topic.name in names and (topic.name, topic.type_name) not in chosen.read:
+            reader.log_damage(
+                f'{topic.name}: {topic.count} messages of {topic.type_name} are not read'
+            )
+    return chosen
 
 
 def choose_image_topic(paths: Sequence[Path], requested: Topics) -> str:
     """Topic of the images of bags; raises BagError when it is missing, or there are several."""
-    there = [t for t in reader.topics(paths) if t.type_name in _IMAGE_TYPES]
+    there = [t for t in reader.topics(paths) if t.type_name in codec.IMAGE_TYPES]
     there.sort(key=lambda t: (t.name != f'/{requested.image.lstrip("/")}', t.type_name != _RAW))
     return _choose(paths, there[0].type_name if there else _RAW, requested.image, 'image')
 
@@ -82,8 +94,12 @@ def _choose_attitudes(
 
     A star tracker may drop out, but not all of them.
     """
+    # Of several types on a topic all are read; the first of them states what it is for.
     kinds = {
-        topic.name: topic.type_name for topic in there if topic.type_name in codec.ATTITUDE_TYPES
+        topic.name: kind
+        for kind in reversed(codec.ATTITUDE_TYPES)
+        for topic in there
+        if topic.type_name == kind
     }
     named = [f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings] if setup else []
     more = tuple(name if name in kinds else '' for name in named)
@@ -92,7 +108,7 @@ def _choose_attitudes(
             f'{name}: no such topic of attitudes; the star tracker that more_star_trackers names'
             ' is left out'
         )
-    first = [name for name in kinds if name not in named]
+    first = [name for name in sorted(kinds) if name not in named]
     if setup and not (requested or first) and any(more):
         reader.log_damage(
             'no topic of attitudes but those of more_star_trackers; the first star tracker,'
@@ -169,11 +185,13 @@ def read(
         return
     track = Track(setup.prior)
     for frame in _frames(paths, topics, setup):
+        time_ns = frame.time_ns if isinstance(frame, StarObservations) else frame.image.time_ns
+        if wanted is not None and not wanted(time_ns):
+            continue
         if isinstance(frame, StarObservations):
             yield frame
-            continue
-        warn_of_clock(frame.image.time_ns)
-        if wanted is None or wanted(frame.image.time_ns):
+        else:
+            warn_of_clock(time_ns)
             track = track if is_sequence else Track(setup.prior)
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
@@ -215,7 +233,7 @@ def without_attitudes(
     is then missing; and all bags if the camera alone is requested.
     """
     kinds = {topic.type_name for topic in reader.topics(bags)}
-    has_images = bool(kinds & _IMAGE_TYPES)
+    has_images = not kinds.isdisjoint(codec.IMAGE_TYPES)
     if camera_alone:
         return has_images
     others = {*codec.ATTITUDE_TYPES, codec.OBSERVATIONS_TYPE}

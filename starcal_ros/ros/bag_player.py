@@ -53,25 +53,16 @@ class BagPlayer(printable_log.PrintableLog):
         )
         if not self.own.bag:
             raise BagError('bag: path of the bag to play is missing')
-        self._topics = reader.topics([self.own.bag])
+        self._topics = self._played()
         # A star observer reads the raw images or the compressed ones.
         self._images = set(
             self._of(message_codec.IMAGE_TYPE) or self._of(message_codec.COMPRESSED_TYPE)
         )
         self._players = {}
         for topic in self._topics:
-            if self.own.clock and topic.name == '/clock':
-                continue  # the player publishes its own
-            try:
-                kind = node.message_class(topic.type_name)
-            except ImportError:
-                text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
-                self.get_logger().warning(text)
-                continue
             offer = _offer(topic, topic.name in self._images)
+            kind = node.message_class(topic.type_name)
             self._players[topic.name] = self.create_publisher(kind, topic.name, offer)
-        if not self._players:
-            raise BagError(f'{self.own.bag}: no topic has an installed message type')
         self._clock_publisher = (
             self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
             if self.own.clock
@@ -81,6 +72,7 @@ class BagPlayer(printable_log.PrintableLog):
         self._unacked = dict.fromkeys(self._players, 0)
         self._observed = threading.Condition()
         self._observed_count = 0
+        self._told: set[str] = set()
         # Observations in the bag itself must not pace the player or count as subscribers.
         kinds = {topic.type_name for topic in self._topics}
         self._paced = bool(self._images) and message_codec.OBSERVATIONS_TYPE not in kinds
@@ -88,6 +80,28 @@ class BagPlayer(printable_log.PrintableLog):
             self._observations = self.create_subscription(
                 ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
             )
+
+    def _played(self) -> list[reader.Topic]:
+        """Topics that ROS can have, of an installed type; of several that of most messages."""
+        played: dict[str, reader.Topic] = {}
+        for topic in sorted(reader.topics([self.own.bag]), key=lambda topic: -topic.count):
+            if self.own.clock and topic.name == '/clock':
+                continue  # the player publishes its own
+            try:
+                node.message_class(topic.type_name)
+                self.resolve_topic_name(topic.name)
+                why = f'is not {played[topic.name].type_name}' if topic.name in played else ''
+            except ImportError:
+                why = 'is not installed here'
+            except RuntimeError:
+                why = 'is on no topic that ROS can have'
+            if why:
+                self.get_logger().warning(f'{topic.name}: {topic.type_name} {why}: skipped')
+            else:
+                played[topic.name] = topic
+        if not played:
+            raise BagError(f'{self.own.bag}: no topic has an installed message type')
+        return list(played.values())
 
     def play(self) -> int:
         """Play the bag; 0 if all subscribers have acknowledged all messages."""
@@ -106,7 +120,8 @@ class BagPlayer(printable_log.PrintableLog):
         sent_images, small_s = 0, time.monotonic()
         with self._observed:
             self._observed_count = 0
-        for raw in reader.read_raw([self.own.bag], self._players, self._on_damage):
+        channels = {(topic.name, topic.type_name) for topic in self._topics}
+        for raw in reader.read_raw([self.own.bag], channels, self._on_damage):
             if first_ns is None:
                 first_ns = raw.log_time_ns
             if self.own.rate:
@@ -121,7 +136,11 @@ class BagPlayer(printable_log.PrintableLog):
                 small_s = max(small_s + 1.0 / _SMALL_PER_S, time.monotonic() - 0.05)
                 self._sleep_until(small_s)
             player = self._players[raw.topic]
-            player.publish(raw.data)
+            try:
+                player.publish(reader.cdr_of_this_version(raw))
+            except BagError as error:
+                self._on_damage(str(error))
+                continue
             self._unacked[raw.topic] += 1
             if self._unacked[raw.topic] >= _UNACKED[is_image]:
                 player.wait_for_all_acked(_timeout())
@@ -214,7 +233,10 @@ class BagPlayer(printable_log.PrintableLog):
             self._observed.notify()
 
     def _on_damage(self, text: str) -> None:
-        self.get_logger().warning(text)
+        """Warn of damage of the bag, each text once."""
+        if text not in self._told:
+            self._told.add(text)
+            self.get_logger().warning(text)
 
 
 def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:

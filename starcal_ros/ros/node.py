@@ -528,12 +528,15 @@ def make_message(type_name: str, /, **fields: Any) -> Message:
 
 @functools.lru_cache(maxsize=64)
 def message_class(type_name: str) -> Any:
-    """Generated class of a type; raises ImportError if its package is not installed."""
-    package, folder, name = type_name.split('/')
+    """Generated class of a type; raises ImportError if there is none of this name installed."""
+    package, _, name = type_name.partition('/msg/')
     try:
-        return getattr(importlib.import_module(f'{package}.{folder}'), name)
-    except AttributeError as error:
+        kind = getattr(importlib.import_module(f'{package}.msg'), name)
+    except (AttributeError, TypeError) as error:  # no such class; no package
         raise ImportError(f'{package} has no {name}') from error
+    if not isinstance(kind, type):  # a module within the package
+        raise ImportError(f'{type_name} is no type of a message')
+    return kind
 
 
 @functools.lru_cache(maxsize=64)

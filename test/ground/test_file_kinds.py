@@ -78,6 +78,11 @@ def write_compressed(folder: Path) -> None:
     assert 'FILE' in metadata.read_text()
 
 
+def write_compressed_file(path: Path) -> None:
+    """Write the file of such a bag, without its folder."""
+    subprocess.run(['zstd', '-q', TINY / 'tiny_0.mcap', '-o', path], check=True)
+
+
 def run_remedy(words: str, folder: Path) -> None:
     """Run the command that an error message names."""
     command = re.search(r'((rosbags-convert|zstd) .*?)( makes one)?$', words)
@@ -96,12 +101,13 @@ def run_remedy(words: str, folder: Path) -> None:
         (write_sqlite, 'a flight', 'a flight_mcap'),
         (write_ros_1, 'a.bag', 'a_mcap'),
         (write_compressed, 'flight', 'flight'),
+        (write_compressed_file, 'a flight.mcap.zstd', 'a flight.mcap'),
     ],
 )
 def test_the_command_that_is_named_makes_a_bag_that_is_read(
     write: Callable[[Path], None], name: str, read: str, tmp_path: Path
 ) -> None:
-    if write is write_compressed and shutil.which('zstd') is None:
+    if 'compressed' in write.__name__ and shutil.which('zstd') is None:
         pytest.skip('zstd is not installed')
     write(tmp_path / name)
     with pytest.raises(BagError) as error:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import itertools
 from pathlib import Path
 import threading
@@ -21,6 +22,7 @@ from mission_files import attitudes, images  # type: ignore[import-not-found]
 from node_inputs import parameters  # type: ignore[import-not-found]
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from sample_records import assert_same, observations  # type: ignore[import-not-found]
 from std_msgs.msg import String
 
 from starcal.msg import StarObservations
@@ -30,8 +32,14 @@ from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     COMPRESSED_TYPE,
     make_header,
+    OBSERVATIONS_TYPE,
     POSE_TYPE,
     quaternion_to_message,
+    TEMPERATURE_TYPE,
+)
+from starcal_ros.formats.messages.record_messages import (
+    observations_from_message,
+    observations_to_message,
 )
 from starcal_ros.ros import bag_player
 
@@ -95,6 +103,63 @@ def test_what_was_latched_is_latched(
     player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "latched.mcap"}'))
     client.until(lambda: bool(found))
     assert player.wait() == 0 and [one.data for one in found] == ['kept']
+
+
+def test_of_several_types_on_a_topic_one_is_played(
+    client: Client, start_node: StartNode, tmp_path: Path
+) -> None:
+    """The bytes of the others went out as messages of it; a name of another tool ended it."""
+    with BagWriter(tmp_path / 'mixed.mcap') as writer:
+        for k, topic in enumerate(('/mixed', '/mixed', '/mixed', '/of another tool')):
+            kind = 'std_msgs/msg/String' if k != 1 else TEMPERATURE_TYPE
+            header = make_header(k, '', make_message)
+            fields = (
+                {'data': str(k)}
+                if k != 1
+                else {'header': header, 'temperature': 0.0, 'variance': 0.0}
+            )
+            writer._channels.pop(topic, None)
+            writer.write(topic, kind, k, make_message(kind, **fields))
+    found: list[Any] = client.collect(String, '/mixed')
+    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "mixed.mcap"}'))
+    assert player.wait() == 0, player.said()
+    client.until(lambda: len(found) == 2)
+    assert [one.data for one in found] == ['0', '2']
+    assert f'/mixed: {TEMPERATURE_TYPE} is not std_msgs/msg/String: skipped' in player.said()
+    assert 'String is on no topic that ROS can have: skipped' in player.said()
+
+
+def test_messages_of_another_version_are_played_as_those_of_this_one(
+    client: Client, start_node: StartNode, tmp_path: Path
+) -> None:
+    """Their bytes went out as they were, and their fields were read as others."""
+    now = typestore.described(OBSERVATIONS_TYPE)[0]
+    definition = now.replace('string detail\n', 'float64 later\n')
+    store = typestore.typestore_of(OBSERVATIONS_TYPE, definition)
+    message = observations_to_message(observations(), 'camera', make_message)
+    names = [name for name, _ in store.fielddefs[OBSERVATIONS_TYPE][1] if name != 'later']
+    older = {name: getattr(message, name) for name in names}
+    data = store.serialize_cdr(
+        store.types[OBSERVATIONS_TYPE](**older, later=0.5), OBSERVATIONS_TYPE
+    )
+    bag = tmp_path / 'older.mcap'
+    with bag.open('wb') as stream:
+        writer = typestore.started(stream)
+        for topic, text in (('/older', definition), ('/other', 'int8 x\n')):
+            schema = writer.register_schema(OBSERVATIONS_TYPE, 'ros2msg', text.encode())
+            channel = writer.register_channel(topic, 'cdr', schema)
+            for k in range(3):
+                writer.add_message(channel, k, bytes(data), publish_time=k)
+        writer.finish()
+    found: list[Any] = client.collect(StarObservations, '/older')
+    player = start_node('bag_player', ros=('-p', f'bag:={bag}'))
+    assert player.wait() == 0, player.said()
+    client.until(lambda: len(found) == 3)
+    for one in found:
+        assert_same(observations_from_message(one), replace(observations(), detail=''))
+    assert (
+        player.said().count('/other: starcal/msg/StarObservations is defined in the bag as') == 1
+    )
 
 
 def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:

@@ -80,6 +80,17 @@ def test_numbers_are_handed_over_as_rclpy_takes_them_whole() -> None:
 
 
 def test_unknown_types_are_import_errors() -> None:
-    for name in ('no_such_msgs/msg/Thing', 'sensor_msgs/msg/NoSuchThing'):
+    """As a bag may have them; no other module is imported for its name."""
+    for name in (
+        *('no_such_msgs/msg/Thing', 'sensor_msgs/msg/NoSuchThing', 'sensor_msgs/msg/_image'),
+        *(
+            '',
+            '/msg/Image',
+            'sensor_msgs/Image',
+            'os/path/join',
+            'std_srvs/srv/Empty',
+            'a/msg/b/c',
+        ),
+    ):
         with pytest.raises(ImportError):
             message_class(name)

@@ -45,11 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ros.formats.bag import reader
     from starcal_ros.formats.messages import message_codec
 
-    kinds = (
-        message_codec.IMAGE_TYPE,
-        message_codec.COMPRESSED_TYPE,
-        message_codec.OBSERVATIONS_TYPE,
-    )
+    kinds = (*message_codec.IMAGE_TYPES, message_codec.OBSERVATIONS_TYPE)
     given = arguments.given(args)
     bags, topics, (setup, _) = tuple(given.paths), given.topics, given.checked()
     through_air, problem = None, ''

@@ -25,7 +25,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages import sensor_messages
+from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.formats.messages.message_codec import RawMessage
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import ARC_S, attitude_sample, AttitudeHistory, AttitudeOptions
@@ -83,11 +83,11 @@ class Telemetry:
             self._topics.attitude: self.attitudes,
             **dict(zip(self._topics.more_attitudes, self.more_attitudes, strict=True)),
         }
-        if raw.topic in by_topic:
+        if raw.type_name in message_codec.ATTITUDE_TYPES:
             time_ns, quaternion = sensor_messages.attitude_from_message(message)
             sample = attitude_sample(time_ns, quaternion, self._options.attitude_direction)
             by_topic[raw.topic].add(time_ns, sample)
-        elif raw.topic == self._topics.velocity:
+        elif raw.type_name == message_codec.VELOCITY_TYPE:
             try:
                 time_ns, velocity_m_s = sensor_messages.velocity_from_message(message)
             except ValueError as error:
@@ -181,10 +181,10 @@ def read_frames(
     )
     waiting: deque[Image | StarObservations] = deque()
     taken: list[tuple[int, Floats]] = []
-    messages = reader.read_raw(paths, [topics.image, *topics.telemetry], on_damage)
+    messages = reader.read_raw(paths, topics.read, on_damage)
     for raw in read_ahead(messages):
         in_order = True
-        if raw.topic == topics.image:
+        if raw.type_name in message_codec.IMAGE_TYPES:
             waiting.append(sensor_messages.image_of(raw, options.stamp_offset_s, size, channel))
         elif not is_complete:
             in_order = telemetry.add(raw)

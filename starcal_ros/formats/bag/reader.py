@@ -20,9 +20,11 @@ import bisect
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
 from dataclasses import dataclass, replace
 import functools
 import io
+import itertools
 import logging
 import os
 from pathlib import Path
@@ -34,12 +36,19 @@ import zlib
 
 from starcal_ros.errors import BagError, errors_as, NotABag
 from starcal_ros.formats.bag import rosbag2
+from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of
-from starcal_ros.records import Image, StarObservations
+from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
-from starcal_ros.untrusted import METADATA_BYTES, read_text, regular_file, yaml_value
+from starcal_ros.untrusted import (
+    ARCHIVE_BYTES,
+    METADATA_BYTES,
+    read_text,
+    regular_file,
+    yaml_value,
+)
 
 if not rosbag2.READS_BAGS:
     from mcap.data_stream import ReadDataStream
@@ -50,13 +59,15 @@ if not rosbag2.READS_BAGS:
     from mcap.records import Message as McapMessage
     from mcap.stream_reader import get_chunk_data_stream, StreamReader
     from mcap.summary import Summary
+    import zstandard
 
-    from starcal_ros.formats.bag.typestore import typestore_of
+    from starcal_ros.formats.bag.typestore import of_this_version, typestore_of
 
     # Damaged bytes are parsed as an arbitrary record: the exceptions have no common base class.
     _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
 
 Damage = Callable[[str], None]
+Wanted = str | tuple[str, str]  # a topic, or its messages of one type
 
 MAGIC = b'\x89MCAP0\r\n'
 _MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
@@ -103,12 +114,15 @@ def _lacks_checksum(stream: IO[bytes]) -> bool:
 
 
 def read_messages(
-    file: Path, wanted: frozenset[str] | None, on_damage: Damage
+    file: Path, wanted: frozenset[Wanted] | None, on_damage: Damage
 ) -> Iterator[RawMessage]:
-    """Intact messages of the wanted topics (None: all), in file order (rosbag2: in its own)."""
+    """Intact messages that are wanted (None: all), in file order (rosbag2: in its own)."""
     if rosbag2.READS_BAGS:
         types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
         for topic, data, log_time_ns in rosbag2.read_messages(file, wanted, on_damage):
+            if data[:4] == _ZSTD:
+                what = 'its messages are compressed one by one, which rosbag2 leaves'
+                raise BagError(f'{file}: {what}: {rosbag2.INSTALL}')
             yield RawMessage(topic, types[topic], '', log_time_ns, memoryview(data))
         return
     summary = read_summary(file)
@@ -128,11 +142,11 @@ def read_messages(
             schema = schemas.get(channel.schema_id) if channel else None
             if channel is None or schema is None or channel.message_encoding != 'cdr':
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
-            if wanted is None or channel.topic in wanted:
-                if record.data[:4] == _ZSTD:
-                    raise _compressed_singly(file.absolute().parent)
-                definition = schema.data.decode(errors='replace')
-                view = memoryview(record.data)
+            names = channel.topic, (channel.topic, schema.name)
+            if wanted is None or not wanted.isdisjoint(names):
+                is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
+                definition = schema.data.decode(errors='replace') if is_text else ''
+                view = memoryview(_message(record.data))
                 yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
     if summary is None and pieces.complete:
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
@@ -144,6 +158,15 @@ def read_messages(
     nameless = {number: n for number, n in read.items() if number not in channels}
     if lost or nameless:
         pieces.report(_loss(lost, expected, channels, nameless))
+
+
+def _message(data: bytes) -> bytes:
+    """Bytes of a message, which rosbag2 may have compressed by itself; as they are if damaged."""
+    if data[:4] == _ZSTD:
+        with contextlib.suppress(zstandard.ZstdError, MemoryError):
+            if zstandard.frame_content_size(data) <= ARCHIVE_BYTES:
+                return zstandard.decompress(data)
+    return data
 
 
 def _loss(
@@ -328,7 +351,7 @@ def log_damage(text: str) -> None:
 @dataclass(frozen=True)
 class Topic:
     """
-    Topic of a bag with its message count; ``type_name`` is ``'pkg/msg/Name'``.
+    Messages of one type, ``'pkg/msg/Name'``, on a topic of a bag, and their number.
 
     ``is_latched`` where the summary says that its publishers were transient local.
     """
@@ -356,19 +379,28 @@ class Topics:
     more_attitudes: tuple[str, ...] = ()
 
     @property
-    def telemetry(self) -> tuple[str, ...]:
-        """Topics of attitudes, velocity and temperature."""
-        single = (self.attitude, self.velocity, self.temperature)
-        return tuple(filter(None, (*single, *self.more_attitudes)))
+    def telemetry(self) -> frozenset[tuple[str, str]]:
+        """Topics of attitudes, velocity and temperature, each with a type that is read there."""
+        attitudes = itertools.product((self.attitude, *self.more_attitudes), codec.ATTITUDE_TYPES)
+        single = (self.velocity, codec.VELOCITY_TYPE), (self.temperature, codec.TEMPERATURE_TYPE)
+        return frozenset(pair for pair in (*attitudes, *single) if pair[0])
+
+    @property
+    def read(self) -> frozenset[tuple[str, str]]:
+        """Topics of images and telemetry, or of observations, each with a type that is read."""
+        images = {(self.image, kind) for kind in codec.IMAGE_TYPES} if self.image else set()
+        recorded = {(self.observations, codec.OBSERVATIONS_TYPE)} if self.observations else set()
+        return self.telemetry | images | recorded
 
 
 def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     """
     MCAP files of bags in the order of their first messages, each once.
 
-    Raises BagError where a path has none.
+    An .mcap file that does not begin as one, as a crash leaves the last of a split bag, is damaged
+    if there are others.  Raises BagError where a path has none.
     """
-    files = []
+    files, others = [], []
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
@@ -381,6 +413,9 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         with errors_as(BagError, file), regular_file(file) as stream:
             is_bag = stream.read(max(map(len, _MAGICS))).startswith(_MAGICS)
         if not is_bag:
+            others.append(file)
+    for file in others:
+        if len(others) == len(files) or file.suffix != '.mcap':
             raise NotABag(f'{file}: not an MCAP bag', file)
     # A shell sorts rec_10 before rec_2.
     return sorted(dict.fromkeys(files), key=_first_ns)
@@ -398,17 +433,17 @@ def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
 
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
-    """Topics with messages, by name; a file without a summary is read completely."""
-    last: dict[str, Topic] = {}
-    counts: Counter[str] = Counter()
+    """Topics with messages, by name and type; a file without a summary is read completely."""
+    last: dict[tuple[str, str], Topic] = {}
+    counts: Counter[tuple[str, str]] = Counter()
     for file in mcap_files(paths):
         listed, damage, _ = _listed_now(file)
         for text in damage:
             on_damage(text)
         for topic in listed:
-            last[topic.name] = topic
-            counts[topic.name] += topic.count
-    return tuple(replace(last[name], count=counts[name]) for name in sorted(counts))
+            last[topic.name, topic.type_name] = topic
+            counts[topic.name, topic.type_name] += topic.count
+    return tuple(replace(last[key], count=counts[key]) for key in sorted(counts))
 
 
 def _listed_now(file: Path) -> tuple[list[Topic], list[str], int]:
@@ -465,15 +500,17 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
-        listed = ', '.join(topic.name for topic in there) or 'none'
+        listed = ', '.join(topic.name for topic in there) or 'none in cdr, the encoding of ROS 2'
         raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
     raise BagError(f'{where}: several topics of type {type_name}: {listed}')
 
 
 def read_raw(
-    paths: Iterable[Path | str], only: Iterable[str] | None = None, on_damage: Damage = log_damage
+    paths: Iterable[Path | str],
+    only: Iterable[Wanted] | None = None,
+    on_damage: Damage = log_damage,
 ) -> Iterator[RawMessage]:
-    """Serialised messages of the given topics (None: all), in file order."""
+    """Serialised messages of the given topics, or of types on them (None: all), in file order."""
     wanted = None if only is None else frozenset(only)
     for file in mcap_files(paths):
         yield from read_messages(file, wanted, on_damage)
@@ -487,7 +524,7 @@ def read_images(
     channel: str = '',
 ) -> Iterator[Image | StarObservations]:
     """Images of a topic, as `image_of` reads them."""
-    for raw in read_raw(paths, [topic], on_damage):
+    for raw in read_raw(paths, Topics(topic).read, on_damage):
         yield image_of(raw, stamp_offset_s, channel=channel)
 
 
@@ -495,15 +532,16 @@ def read_observations(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[StarObservations]:
     """
-    Recorded observations of a topic; an image with impossible values becomes a refused one.
+    Recorded observations of a topic.
 
-    Raises BagError if this version cannot convert a message to observations.
+    Those with impossible values, or that cannot be decoded, become refused ones.
     """
-    for raw in read_raw(paths, [topic], on_damage):
+    for raw in read_raw(paths, Topics(observations=topic).read, on_damage):
         try:
             yield checked_observations(decode(raw))
-        except (AttributeError, ValueError) as error:
-            raise BagError(f'{topic}: not readable as observations: {error}') from error
+        except BagError as error:
+            time_ns = codec.nearest_stamp_ns(raw.log_time_ns)
+            yield refused_image(time_ns, 0, 0, 'bad_observations', str(error))
 
 
 def decode(raw: RawMessage) -> Message:
@@ -515,21 +553,37 @@ def decode(raw: RawMessage) -> Message:
         return store.deserialize_cdr(raw.view, raw.type_name)
     # The exceptions of wrong bytes depend on the field and have no common base class.
     except Exception as error:
-        raise BagError(
-            f'{raw.topic}: cannot decode {len(raw.view)} bytes as {raw.type_name}'
-        ) from error
+        raise _undecodable(raw, error) from error
+
+
+def cdr_of_this_version(raw: RawMessage) -> bytes:
+    """Bytes of a message for ROS, whose definition is that of this version; raises BagError."""
+    if rosbag2.READS_BAGS:
+        return raw.data
+    try:
+        return bytes(of_this_version(raw.type_name, raw.definition, raw.view))
+    except Exception as error:
+        raise _undecodable(raw, error) from error
+
+
+def _undecodable(raw: RawMessage, error: Exception) -> BagError:
+    """Error of a message whose definition or bytes are wrong, with its topic."""
+    if isinstance(error, BagError):
+        return BagError(f'{raw.topic}: {raw.type_name} is {error}')
+    return BagError(f'{raw.topic}: cannot decode {len(raw.view)} bytes as {raw.type_name}')
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
     names, compression = _metadata(folder / 'metadata.yaml')
-    if compression.lower() == 'message':
-        raise _compressed_singly(folder)
     if compression:  # zstd leaves the files without the ending
         names = [name.removesuffix('.zstd') for name in names]
     here = sorted(folder.iterdir(), key=_natural)
     listed = [folder / name for name in names if (folder / name).is_file()]
-    files = listed or [path for path in here if path.suffix in _SUFFIXES and path.is_file()]
+    there = [path for path in here if path.suffix in _SUFFIXES and path.is_file()]
+    files = listed or there
+    for path in (path for path in there if path not in files):
+        log_damage(f'{path}: not read, as metadata.yaml does not list it')
     missing = [name for name in names if not (folder / name).is_file()]
     packed = bool(missing) and (folder / f'{missing[0]}.zstd').is_file()
     if missing and (listed or packed):
@@ -540,14 +594,6 @@ def _files_of_folder(folder: Path) -> list[Path]:
         near = f' (did you mean {inside.parent}?)' if inside else ''
         raise NotABag(f'{folder}: no .mcap files in the folder{near}', folder)
     return files
-
-
-def _compressed_singly(folder: Path) -> BagError:
-    return BagError(
-        f'{folder}: its messages are compressed one by one: ros2 bag convert -i'
-        f' {shlex.quote(str(folder))} -o out.yaml, with a file out.yaml of the line'
-        f' "output_bags: [{{uri: {folder.name}_mcap, storage_id: mcap, all_topics: true}}]"'
-    )
 
 
 def _metadata(path: Path) -> tuple[list[str], str]:

@@ -8,7 +8,7 @@ rosbag2 may end without an error, so the messages are counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 import contextlib
 import importlib
 import importlib.util
@@ -46,13 +46,15 @@ def topics(file: Path) -> tuple[list[tuple[str, str, int]], int]:
 
 
 def read_messages(
-    file: Path, wanted: frozenset[str] | None, on_damage: Callable[[str], None]
+    file: Path, wanted: Collection[object] | None, on_damage: Callable[[str], None]
 ) -> Iterator[tuple[str, bytes, int]]:
-    """Topic, CDR with its header and time of the messages of the wanted topics (None: all)."""
+    """Topic, CDR with its header and time of the messages that are wanted (None: all)."""
     from rosbag2_py import StorageFilter
 
     there, _ = topics(file)
-    counts = {name: n for name, _, n in there if wanted is None or name in wanted}
+    counts = {
+        name: n for name, *kind, n in there if wanted is None or {name, (name, *kind)} & {*wanted}
+    }
     if not counts:
         return
     reader = _opened(file)
@@ -62,7 +64,7 @@ def read_messages(
         while reader.has_next():
             yield reader.read_next()
             missing -= 1
-    if missing:
+    if missing > 0:  # of a topic with two types more are read than are wanted
         on_damage(f'{file}: damaged, rosbag2 reads only a part: {_REMEDY}')
 
 

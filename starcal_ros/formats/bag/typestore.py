@@ -7,7 +7,6 @@ Equal messages give equal bytes.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import io
 import os
@@ -16,6 +15,7 @@ import sys
 from typing import Any, IO
 
 from mcap.writer import CompressionType, Writer
+import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -26,6 +26,7 @@ from starcal_ros.formats.messages import message_codec, record_messages
 from starcal_ros.records import StarObservations
 
 _MOST_CHARACTERS = 1 << 16  # the largest definition of starcal has 4,718
+_LONGEST_REASON = 100  # characters
 _COMPRESSION = CompressionType.ZSTD
 _CHUNK_BYTES = 4 << 20  # an image or two: lost in a crash, and held in memory by a reader
 # Of telemetry and observations.
@@ -96,25 +97,65 @@ def _definitions_folder() -> Path:
     raise BagError(f'the starcal .msg files are not installed in {candidates[-1]}')
 
 
-@functools.lru_cache(maxsize=64)
 def typestore_of(type_name: str, definition: str) -> Typestore:
     """
     Types by the definition in a bag, if another version of starcal wrote it; else `store_with`.
 
-    A definition that `check_definition` refuses is not taken: the message is then decoded as one
-    of this version, which mostly fails.
+    An empty definition is taken for that of this version.  Raises BagError for one that
+    `check_definition` refuses.
     """
-    own = store_with(type_name)
+    store, why = _typestore_of(type_name, definition)
+    if store is None:
+        raise BagError(f'defined in the bag as no version of starcal does: {why}')
+    return store
+
+
+@functools.lru_cache(maxsize=64)
+def _typestore_of(type_name: str, definition: str) -> tuple[Typestore | None, str]:
+    """Return the types, or None and what is wrong with the definition, once for all messages."""
+    own, store = store_with(type_name), get_typestore(Stores.EMPTY)
     is_own = type_name.startswith('starcal/') and type_name in own.types
-    if not is_own or definition == described(type_name)[0]:
-        return own
+    if not (is_own and definition) or definition == described(type_name)[0]:
+        return own, ''
     # The exceptions of an invalid definition have no common base class.
-    with contextlib.suppress(Exception):
-        definitions = check_definition(type_name, definition)
-        store = get_typestore(Stores.EMPTY)
-        store.register(definitions)
-        return store
-    return own
+    try:
+        store.register(check_definition(type_name, definition))
+        # Comments may differ, as recorders keep those of the .msg file.
+        return (own if store.hash_rihs01(type_name) == described(type_name)[1] else store), ''
+    except Exception as error:
+        return None, ' '.join(str(error).split())[:_LONGEST_REASON]
+
+
+def of_this_version(type_name: str, definition: str, data: memoryview) -> memoryview:
+    """
+    CDR of a message of another version of starcal by the definition of this one.
+
+    The fields that it lacks are zeros, as of a sender that does not know them.  Raises BagError as
+    `typestore_of`, and errors of any class for wrong bytes.
+    """
+    store, own = typestore_of(type_name, definition), store_with(type_name)
+    if store is own:
+        return data
+    message = store.deserialize_cdr(data, type_name)
+    return own.serialize_cdr(_filled(own, (Nodetype.NAME, type_name), message), type_name)
+
+
+def _filled(store: Typestore, kind: Any, value: Any = None) -> Any:
+    """Return a value as one of a field of a store; what it lacks, or all for None, is zero."""
+    node, content = kind
+    if node == Nodetype.NAME:
+        fields = store.fielddefs[content][1]
+        return store.types[content](
+            *(_filled(store, of_field, getattr(value, name, None)) for name, of_field in fields)
+        )
+    if node == Nodetype.BASE:
+        return ('' if content[0] == 'string' else 0) if value is None else value
+    item, size = content
+    is_number = item[0] == Nodetype.BASE and item[1][0] != 'string'
+    if value is None:
+        length = size if node == Nodetype.ARRAY else 0
+        value = np.zeros(length, item[1][0]) if is_number else [None] * length
+    return value if is_number else [_filled(store, item, one) for one in value]
 
 
 def check_definition(type_name: str, definition: str) -> dict[str, Any]:

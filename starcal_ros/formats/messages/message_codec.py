@@ -42,6 +42,7 @@ from starcal_ros.record_fields import fields_of, FieldType, plain_record, read_r
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE)
 ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
 VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'

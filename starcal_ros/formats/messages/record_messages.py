@@ -60,11 +60,12 @@ def observations_from_message(message: codec.Message) -> StarObservations:
     star can have.
     """
     values = codec.plain_message(StarObservations, message)
-    reasons, counts = message.refused_star_reasons, message.refused_star_counts
+    names = ('refused_star_reasons', 'refused_star_counts')
+    reasons, counts = (getattr(message, name, ()) for name in names)
     if len(reasons) != len(counts):
         raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
     values['refused_stars'] = dict(zip(reasons, counts, strict=True))
-    values['detail'] = values['detail'][:_LONGEST_DETAIL]
+    values['detail'] = values.get('detail', '')[:_LONGEST_DETAIL]
     _forget_zeros(values)
     record = read_record(StarObservations, values)
     _check_stars(record)
@@ -74,8 +75,8 @@ def observations_from_message(message: codec.Message) -> StarObservations:
 def _forget_zeros(values: dict[str, Any]) -> None:
     """Replace zeros that no sender means, as ROS fills them in, by numbers that are not known."""
     nowhere = np.full(3, math.nan)
-    if not np.any(values['first_from_star_tracker']):
-        del values['first_from_star_tracker']
+    if not np.any(values.get('first_from_star_tracker', 0)):
+        values.pop('first_from_star_tracker', None)
     sigma = values.get('star_tracker_rate_sigma_rad_s', nowhere)
     values['star_tracker_rate_sigma_rad_s'] = np.where(sigma == 0, math.nan, sigma)
     is_stated = bool((sigma > 0).any())
@@ -93,8 +94,6 @@ def checked_observations(message: codec.Message) -> StarObservations:
     Observations of a starcal/StarObservations, refused where they hold impossible values.
 
     The refusal is ``bad_observations``, with the field and its value.
-
-    Raises AttributeError when the message lacks fields.
     """
     try:
         return observations_from_message(message)

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
 import json
 from pathlib import Path
 import shutil
@@ -160,7 +161,14 @@ def test_images_without_a_match_are_measured_with_the_calibration() -> None:
         for k, reason in ((2, 'no_match'), (5, 'no_stars'))
     )
     before = [*seen[:2], lost, *seen[3:5], smeared, *seen[6:]]
-    made = campaign.calibrate(campaign.Observed(source, before, tuple(before), ()))
+    done: list[int] = []
+
+    @contextlib.contextmanager
+    def progress(total: int) -> Iterator[Callable[[], None]]:
+        yield lambda: done.append(total)
+
+    made = campaign.calibrate(campaign.Observed(source, before, tuple(before), ()), None, progress)
+    assert done == [1]
     again = made.observations
     assert made.notes[0].startswith('1 image') and made.calibration.images_used == 9
     assert all(a is b for k, (a, b) in enumerate(zip(again, before, strict=True)) if k != 2)

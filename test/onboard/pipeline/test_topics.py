@@ -12,6 +12,7 @@ import pytest
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ros.errors import BagError
+from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
@@ -25,6 +26,7 @@ from starcal_ros.formats.messages.message_codec import (
 )
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import topics
+from starcal_ros.pipeline.campaign import Source
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup
 from starcal_ros.pipeline.topics import Topics
 
@@ -143,3 +145,40 @@ def test_without_a_channel_the_refusal_names_the_option(bag: Path) -> None:
     records = list(topics.read([bag], topics.choose_topics([bag], Topics(), setup), setup))
     assert {record.refusal for record in records} == {'bad_encoding'}
     assert 'image_channel' in records[0].detail
+
+
+def test_images_that_cannot_be_decoded_are_chosen_by_their_stamps_too(bag: Path) -> None:
+    setup, wanted = setup_with(), images()[1].time_ns
+    chosen = topics.choose_topics([bag], Topics(), setup)
+    records = list(topics.read([bag], chosen, setup, wanted=wanted.__eq__))
+    assert [(record.time_ns, record.refusal) for record in records] == [(wanted, 'bad_encoding')]
+
+
+@pytest.mark.parametrize('stray', ['', '/attitude', '/image', '/velocity'])
+@pytest.mark.parametrize('is_first', [True, False])
+def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, stray: str, is_first: bool
+) -> None:
+    """They hid the attitudes, ended in a traceback or were counted as images."""
+    reader.log_damage.cache_clear()
+    text = make_message('std_msgs/msg/String', data='stray')
+    velocity_m_s = np.array([0.0, 3e4, 0.0])
+    with BagWriter(tmp_path / 'bag') as writer:
+        for step in range(3):
+            if stray and step == (0 if is_first else 2):
+                writer._channels.pop(stray, None)
+                writer.write(stray, 'std_msgs/msg/String', 1, text)
+                del writer._channels[stray]
+            elif step == 1:
+                for time_ns, xyzw in attitudes()[:4]:
+                    writer.write_attitude('/attitude', time_ns, xyzw, 'icrf')
+                writer.write_velocity('/velocity', images()[0].time_ns, velocity_m_s, 'icrf')
+                writer.write_image('/image', images()[0], 'camera')
+    bags, setup = [tmp_path / 'bag'], setup_with()
+    chosen = topics.choose_topics(bags, Topics(), setup)
+    assert chosen == Topics('/image', '/attitude', '/velocity')
+    assert Source(tuple(bags), chosen, setup).image_count == 1
+    (record,) = topics.read(bags, chosen, setup)
+    assert not record.refusal and len(record) > 100
+    said = [f'{stray}: 1 messages of std_msgs/msg/String are not read'] if stray else []
+    assert caplog.messages == said

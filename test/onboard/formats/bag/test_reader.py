@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import io
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -216,13 +217,32 @@ def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) 
     assert '\n' not in said
 
 
-def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
-    """Files of a split bag are read in recording order: 10 after 9."""
+@pytest.mark.parametrize(('content', 'kind'), [(b'', 'truncated'), (bytes(4096), 'damaged')])
+def test_split_bag_is_read_in_order(tmp_path: Path, content: bytes, kind: str) -> None:
+    """Files of a split bag are read in recording order: 10 after 9; a crash lost the last."""
     (tmp_path / 'split').mkdir()
     for k in (0, 9, 10):
         with BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
             writer.write_image('/image', Image(k, np.zeros((2, 2), np.uint8)), '')
-    assert [image.time_ns for image in images_of(tmp_path / 'split')] == [0, 9, 10]
+    (tmp_path / 'split' / 'split_11.mcap').write_bytes(content)
+    for paths in ([tmp_path / 'split'], sorted((tmp_path / 'split').iterdir())):
+        told: list[str] = []
+        images = bag_reader.read_raw(paths, ['/image'], told.append)
+        assert [image.log_time_ns for image in images] == [0, 9, 10]
+        (sentence,) = told
+        assert f'split_11.mcap: {kind} after byte 0 of {len(content)}' in sentence
+
+
+def test_a_file_that_the_metadata_do_not_list_is_named(
+    tmp_path: Path, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its images were missing without a word."""
+    bag = Path(shutil.copytree(folder, tmp_path / 'bag'))
+    shutil.copy(bag / 'six_0.mcap', bag / 'six_1.mcap')
+    assert len(images_of(bag)) == 6
+    assert caplog.messages == [
+        f'{bag / "six_1.mcap"}: not read, as metadata.yaml does not list it'
+    ]
 
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
@@ -240,6 +260,19 @@ def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     assert (second.refusal, second.time_ns, second.width) == ('bad_encoding', 8, 3)
     assert isinstance(third, StarObservations) and third.refusal == 'bad_layout'
     assert isinstance(last, Image)
+
+
+def test_a_bad_message_of_observations_does_not_end_the_run(tmp_path: Path) -> None:
+    record = refused_image(5, 3, 2, 'no_stars', 'sound')
+    with BagWriter(tmp_path / 'b') as writer:
+        writer.write_observations('/observations', record, 'camera')
+        number, _ = writer._channels['/observations']
+        writer._writer.add_message(number, 6, b'\x00\x01\x00\x00rubbish', 6)
+        writer.write_observations('/observations', record, 'camera')
+    first, bad, last = bag_reader.read_observations([tmp_path / 'b'], '/observations')
+    assert first.detail == last.detail == 'sound'
+    assert (bad.refusal, bad.time_ns) == ('bad_observations', 6)
+    assert bad.detail == '/observations: cannot decode 11 bytes as starcal/msg/StarObservations'
 
 
 def test_invalid_attitude_sample(tmp_path: Path) -> None:
@@ -456,16 +489,46 @@ def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     assert isinstance(read, Image) and read.time_ns == 5
 
 
-def test_messages_compressed_one_by_one_are_refused_with_the_remedy(tmp_path: Path) -> None:
-    """Of such a bag the file alone, without the metadata of its folder, is given."""
-    with (tmp_path / 'bag_0.mcap').open('wb') as stream:
-        writer = typestore_module.started(stream)
-        image = typestore_module.opened(writer, '/image', IMAGE_TYPE)
-        writer.add_message(image, 5, zstandard.compress(bytes(100)), 5)
+def test_a_bag_without_messages_of_ros_2_is_named(tmp_path: Path) -> None:
+    """As those that other tools make of ROS 1 bags."""
+    with (tmp_path / 'b.mcap').open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros1')
+        schema = writer.register_schema('sensor_msgs/Image', 'ros1msg', b'uint32 height')
+        writer.add_message(writer.register_channel('/image', 'ros1', schema), 1, b'', 1)
         writer.finish()
-    remedy = f'{tmp_path}: its messages are compressed one by one: ros2 bag convert -i {tmp_path} '
-    with pytest.raises(BagError, match=re.escape(remedy)):
-        images_of(tmp_path / 'bag_0.mcap')
+    with pytest.raises(BagError, match=r'\(topics: none in cdr, the encoding of ROS 2\)'):
+        bag_reader.choose_topic([tmp_path / 'b.mcap'], IMAGE_TYPE)
+
+
+def test_messages_compressed_one_by_one_are_read(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by ``ros2 bag record --compression-mode message``; damaged ones are counted as ever."""
+    sound = list(bag_reader.read_raw([folder], ['/image', '/attitude']))
+    (tmp_path / 'bag').mkdir()
+    with (tmp_path / 'bag/bag_0.mcap').open('wb') as stream:
+        writer = typestore_module.started(stream)
+        numbers: dict[str, int] = {}
+        for raw in sound:
+            if raw.topic not in numbers:
+                numbers[raw.topic] = typestore_module.opened(writer, raw.topic, raw.type_name)
+            writer.add_message(numbers[raw.topic], 5, zstandard.compress(raw.data), 5)
+        writer.add_message(numbers['/image'], 5, zstandard.compress(bytes(100))[:-9], 5)
+        writer.finish()
+    files = {'relative_file_paths': ['bag_0.mcap'], 'compression_mode': 'MESSAGE'}
+    (tmp_path / 'bag/metadata.yaml').write_text(
+        yaml.safe_dump({'rosbag2_bagfile_information': files})
+    )
+    for path in (tmp_path / 'bag', tmp_path / 'bag/bag_0.mcap'):
+        read = list(bag_reader.read_raw([path]))
+        assert [one.data for one in read[:-1]] == [one.data for one in sound]
+        *images, last = images_of(path)
+        assert all(isinstance(image, Image) for image in images)
+        assert isinstance(last, StarObservations) and last.refusal == 'bad_layout'
+    # One that claims to be larger is not inflated.
+    monkeypatch.setattr(bag_reader, 'ARCHIVE_BYTES', 600 * 602 * 2)
+    assert not any(isinstance(image, Image) for image in images_of(tmp_path / 'bag'))
 
 
 MEMORY = """

@@ -3,17 +3,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
+from sample_records import observations  # type: ignore[import-not-found]
 
+from starcal_ros.errors import BagError
+from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import (
     check_definition,
     described,
+    make_message,
+    serialised,
     store_with,
     typestore,
     typestore_of,
 )
-from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE, OBSERVATIONS_TYPE
+from starcal_ros.formats.messages.message_codec import (
+    CALIBRATION_TYPE,
+    OBSERVATIONS_TYPE,
+    RawMessage,
+)
+from starcal_ros.formats.messages.record_messages import (
+    checked_observations,
+    observations_to_message,
+)
 
 END = '=' * 80
 HEAD = 'std_msgs/Header header\n'
@@ -49,7 +66,49 @@ def test_the_definitions_of_versions_are_taken(type_name: str, more: str) -> Non
 def test_others_are_refused(definition: str, why: str) -> None:
     with pytest.raises(Exception, match=why):
         check_definition(OBSERVATIONS_TYPE, definition)
-    assert typestore_of(OBSERVATIONS_TYPE, definition) is store_with(OBSERVATIONS_TYPE)
+    raw = RawMessage('/o', OBSERVATIONS_TYPE, definition, 0, memoryview(b''))
+    for read in (reader.decode, reader.cdr_of_this_version):
+        with pytest.raises(BagError, match=f'^/o: .* as no version of starcal does: .*{why}'):
+            read(raw)
+
+
+@pytest.mark.parametrize('text', ['', '# of the file\n\n{}'])
+def test_a_definition_that_differs_in_words_is_that_of_this_version(text: str) -> None:
+    """Recorders write the file with its comments, or none for types that they do not find."""
+    definition = text.format(described(CALIBRATION_TYPE)[0])
+    assert typestore_of(CALIBRATION_TYPE, definition) is store_with(CALIBRATION_TYPE)
+
+
+FIELDS = [name for name, _ in store_with(OBSERVATIONS_TYPE).fielddefs[OBSERVATIONS_TYPE][1]]
+
+
+def zeroed(value: Any, is_sequence: bool) -> Any:
+    """Return what ROS has in a field that a sender leaves out."""
+    if isinstance(value, np.ndarray):
+        return value[:0] if is_sequence else np.zeros_like(value)
+    if hasattr(value, 'w'):
+        return replace(value, x=0.0, y=0.0, z=0.0, w=0.0)
+    return type(value)()
+
+
+@pytest.mark.parametrize('lacking', FIELDS[1:])
+def test_a_message_of_another_version_is_read_and_has_zeros_for_ros(lacking: str) -> None:
+    """To the nodes its bytes were those of other fields."""
+    now = described(OBSERVATIONS_TYPE)[0]
+    message = observations_to_message(observations(), 'camera', make_message)
+    lines = [line for line in now.splitlines() if line.partition(' ')[2] != lacking]
+    assert len(lines) == len(now.splitlines()) - 1
+    definition = '\n'.join(lines).replace(END, f'float64 later\n{END}', 1)
+    store = typestore_of(OBSERVATIONS_TYPE, definition)
+    others = {name: getattr(message, name) for name in FIELDS if name != lacking}
+    older = store.types[OBSERVATIONS_TYPE](**others, later=0.5)
+    data = memoryview(store.serialize_cdr(older, OBSERVATIONS_TYPE))
+    raw = RawMessage('/observations', OBSERVATIONS_TYPE, definition, 0, data)
+    zero = zeroed(getattr(message, lacking), f'[] {lacking}\n' in now)
+    with_zero = serialised('', OBSERVATIONS_TYPE, replace(message, **{lacking: zero}))
+    assert reader.cdr_of_this_version(raw) == with_zero
+    record = checked_observations(reader.decode(raw))
+    assert not record.refusal or record.detail.startswith(('key ', 'refused_star_'))
 
 
 def test_a_type_of_others_is_that_of_ros_whatever_its_bag_says() -> None:
