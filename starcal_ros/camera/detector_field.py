@@ -129,7 +129,7 @@ class DetectorField(Record):
     >>> shift[0, 0] = 0.1  # px, half a wave along u
     >>> field = DetectorField(1024, 768, octaves, shift)
     >>> field.displacement_px([[0, 0], [1023, 0]]).round(2).tolist()
-    [[0.14, 0.0], [-0.14, 0.0]]
+    [[0.13, 0.0], [-0.13, 0.0]]
     """
 
     width: int
