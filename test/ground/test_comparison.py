@@ -78,8 +78,8 @@ def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
         a.geometry.camera.parameters[0]
     )
     found = compare(a, b)
-    # The field that both have moves the places at which they differ, by less than 1e-4 px here.
-    np.testing.assert_allclose(found.before.length_px.ravel(), expected_px, atol=1e-6)
+    # The field that both have moves the places at which they differ, by some 1e-4 px here.
+    np.testing.assert_allclose(found.before.length_px.ravel(), expected_px, atol=3e-6)
     names = [*PARAMETER_NAMES]
     assert found.difference[names.index('fx')] == pytest.approx(1.0)
     np.testing.assert_allclose(found.difference[10:], [2e-5, -1e-5, 4e-5], atol=1e-15)
