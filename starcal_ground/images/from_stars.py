@@ -199,11 +199,8 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], 
         sums |= {digest} - {0}
         noises.append(noise)
         sources = bright_sources(image.pixels)
-        # The structure of a corona is wide along both axes, as few stars are.
-        middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
-        compact = sources.xy_px[sources.wide_px <= middle_px]
         stars = count_of_stars(image.pixels, sources)
-        seen.append(_Sources(image.time_ns, (sources.xy_px, compact), stars))
+        seen.append(_Sources(image.time_ns, sources.rankings, stars))
     return seen, size, copies
 
 

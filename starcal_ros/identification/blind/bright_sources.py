@@ -40,6 +40,13 @@ class BrightSources:
     along_rad: Floats
     background: Background
 
+    @property
+    def rankings(self) -> tuple[Floats, Floats]:
+        """Centroids by their light: of all sources, and of the compact ones, without glare."""
+        # The structure of a corona is wide along both axes, as few stars are.
+        middle_px = np.median(self.wide_px) if len(self.wide_px) else 0.0
+        return self.xy_px, self.xy_px[self.wide_px <= middle_px]
+
 
 def bright_sources(pixels: Pixels) -> BrightSources:
     """

@@ -178,7 +178,7 @@ def identify_images(
         is_measured = streak is None or streak[0] < LONGEST_PX + _BLURRED_ENDS_PX
         if len(bright.sources.xy_px) >= FEWEST_SOURCES and is_measured:
             searched += 1
-            rankings = [bright.sources.xy_px]
+            rankings = bright.sources.rankings
             sky = finder.guess(rankings, guesses(bright.time_ns))
             if sky := sky or finder.look_up(rankings, search.ROUNDS[:1]):
                 solved.append(Solved(**vars(bright), sky=sky))
@@ -206,7 +206,7 @@ def _look_up(
     for bright in pending:
         sky = None
         if len(solved) < _FEW and not finder.is_over():
-            sky = finder.look_up([bright.sources.xy_px], [searched], scales)
+            sky = finder.look_up(bright.sources.rankings, [searched], scales)
         if sky:
             solved.append(Solved(**vars(bright), sky=sky))
         else:

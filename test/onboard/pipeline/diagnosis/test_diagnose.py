@@ -229,6 +229,24 @@ def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
     assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.0)
 
 
+def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog) -> None:
+    """Eighty wide spots, most of them brighter than the stars: the compact sources are known."""
+    rng = np.random.default_rng(5)
+
+    def with_corona(pixels: Any) -> Any:
+        v, u = np.indices(pixels.shape)
+        light = np.zeros(pixels.shape)
+        for _ in range(80):
+            u0, v0 = rng.uniform((0.0, 0.0), pixels.shape[::-1])
+            spread = np.exp(-((u - u0) ** 2 + (v - v0) ** 2) / (2 * 3.0**2))
+            light += 10 ** rng.uniform(1.5, 2.3) * spread
+        return np.minimum(pixels + light, 4095.0).astype(pixels.dtype)
+
+    night = with_pixels(slewing_night(), with_corona)
+    found = found_in(with_alignment(night, Rotation.from_rotvec([0.4, 0.3, 1.0])), catalog)
+    assert (found.cause, found.images) == ('prior_alignment', 3)
+
+
 @pytest.mark.parametrize('degrees', [90.0, 180.0])
 def test_rolled_alignment(night: Night, catalog: StarCatalog, degrees: float) -> None:
     wrong = with_alignment(night, Rotation.from_euler('z', -degrees, degrees=True))
