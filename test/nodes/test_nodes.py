@@ -120,20 +120,22 @@ def test_nodes_and_tool_give_the_same_calibration(
     client.until(lambda: found)
     live = calibration_from_message(found[0])
     offline = read_calibration(tiny_products / CALIBRATION_FILE)
-    for a, b in (
-        (live.geometry.camera.parameters, offline.geometry.camera.parameters),
-        (
-            live.geometry.star_tracker_from_camera_xyzw,
-            offline.geometry.star_tracker_from_camera_xyzw,
-        ),
-        (live.covariance, offline.covariance),
-        (live.residual_rms_px, offline.residual_rms_px),
-    ):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=0)
+    # On a busy machine the velocity after an image may come too late: the one before it, of half a
+    # second earlier, moves the stars by 1e-8 px.
+    sigma = np.sqrt(np.diag(offline.covariance))
+    off = live.geometry.camera.parameters - offline.geometry.camera.parameters
+    assert np.abs(off / sigma[:10]).max() < 1e-5
+    turn = live.geometry.star_tracker_from_camera.inv() * offline.geometry.star_tracker_from_camera
+    assert (np.abs(turn.as_rotvec()) < 1e-5 * sigma[10:]).all()
+    off = (live.covariance - offline.covariance) / np.outer(sigma, sigma)
+    assert np.abs(off).max() < 1e-5
+    assert live.residual_rms_px == pytest.approx(offline.residual_rms_px, rel=1e-6)
     assert (live.stars_used, live.stars_rejected) == (offline.stars_used, offline.stars_rejected)
     assert live.images_refused == offline.images_refused
+    # The digest of the observations has that velocity in it.
     ours = {k: v for k, v in offline.provenance.items() if not k.startswith('input ')}
-    assert dict(live.provenance) == ours
+    digest = 'observations_sha256'
+    assert dict(live.provenance) == ours | {digest: live.provenance[digest]}
 
 
 def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool(
