@@ -761,8 +761,8 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
     Return the record of a field with the covariance of lines of sight as factor and remainder.
 
     The factor has the parameters exactly, and the field as it follows them.  The remainder, that
-    of the field with the parameters known, displaces pixels with little cancellation: a part of
-    the sigma of each coefficient is enough.
+    of the field with the parameters known, displaces pixels with little cancellation: steps of
+    a `_STEPS`-th of the sigma of each coefficient are enough.
     """
     count, matrix = of.coefficients.size, covariance.matrix
     p = len(matrix) - count
