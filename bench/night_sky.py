@@ -22,6 +22,8 @@ from bench.frames import earth_velocity_m_s
 from bench.table import Table
 from bench.trials import shape_errors_arcsec
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags.topics import Topics
+from starcal_ground.campaign import calibrate, Campaign, chosen, observe
 from starcal_ground.images import night_sky
 from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
@@ -29,8 +31,6 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import StarcalError
-from starcal_ros.pipeline.campaign import calibrate, Campaign, chosen, observe
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, CameraGeometry
 from studies.trials import rms
 

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 
 from docs.make_images import FOLDER, part_of
+from starcal_ground.bags.reader import read_observations
 from starcal_ground.cli import main as cli
 from starcal_ground.images.photographs import image_paths
 from starcal_ground.products import OBSERVATIONS_FILE, OBSERVATIONS_TOPIC
-from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Image
 

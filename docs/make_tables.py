@@ -15,13 +15,13 @@ import re
 import sys
 from typing import Any
 
+from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ros.pipeline.setup import (
     CalibratorOptions,
     NODE_OPTION_CLASSES,
     NodeOptions,
     ObserverOptions,
     OPTION_CLASSES,
-    PlayerOptions,
 )
 from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
 from tools.write_parameters import allowed, as_yaml, fields_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-import starcal_ros
+import starcal_ground
 
 
 def main() -> int:
@@ -15,13 +15,13 @@ def main() -> int:
         return 2
     bag, params, output = sys.argv[1:]
     try:
-        calibration = starcal_ros.calibrate_bag(bag, params)
-    except starcal_ros.StarcalError as error:
+        calibration = starcal_ground.calibrate_bag(bag, params)
+    except starcal_ground.StarcalError as error:
         print(error, file=sys.stderr)
         return 2
-    starcal_ros.write_calibration(calibration, output)
+    starcal_ground.write_calibration(calibration, output)
 
-    camera = starcal_ros.read_calibration(output).geometry.camera
+    camera = starcal_ground.read_calibration(output).geometry.camera
     for name, value, sigma in zip(
         camera.parameter_names, camera.parameters, calibration.sigma, strict=False
     ):

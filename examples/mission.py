@@ -17,9 +17,9 @@ import numpy as np
 import spiceypy
 import yaml
 
+import starcal_ground
+from starcal_ground.bags import reader
 from starcal_ground.cli.main import main as starcal
-import starcal_ros
-from starcal_ros.formats.bag import reader
 from starcal_ros.records import Image
 
 
@@ -95,10 +95,10 @@ def main() -> int:
     _, frame, boresight, _, _ = spiceypy.getfov(-999001, 100)
     in_tracker = spiceypy.pxform(frame, 'STAR_TRACKER', 0.0) @ boresight
 
-    calibration = starcal_ros.read_calibration(folder / 'out')
+    calibration = starcal_ground.read_calibration(folder / 'out')
     camera = calibration.geometry.camera
     middle = ((camera.width - 1) / 2, (camera.height - 1) / 2)
-    expected = starcal_ros.lines_of_sight(calibration, middle, frame='star_tracker')
+    expected = starcal_ground.lines_of_sight(calibration, middle, frame='star_tracker')
     print('boresight in the star tracker frame, by SPICE:', *np.round(in_tracker, 9))
     print(f'difference from the calibration: {np.linalg.norm(in_tracker - expected):.1e} rad')
     return 0

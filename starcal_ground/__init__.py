@@ -2,8 +2,8 @@
 """
 Ground side of starcal: the tool, reports, images without attitudes, mission formats, trends.
 
-``starcal_ros`` flies and imports nothing of this package.  The public functions are those of
-``__all__``, each imported at its first use.
+``starcal_ros`` flies and imports nothing of this package.  The library is the names of
+``__all__``, those of ``starcal_ros`` included, each imported at its first use.
 """
 
 import sys
@@ -17,19 +17,70 @@ if _is_found and any(word.startswith('starcal_ground.') for word in sys.orig_arg
 from typing import TYPE_CHECKING  # noqa: E402
 
 if TYPE_CHECKING:
+    from starcal_ground.api import (
+        calibrate,
+        calibrate_bag,
+        calibrate_with_residuals,
+        observations_of,
+        write_calibration,
+    )
     from starcal_ground.comparison import compare
     from starcal_ground.images.night_sky import calibrate_images
     from starcal_ground.products import read_residuals
     from starcal_ground.report.page import plot
+    from starcal_ros import (
+        Calibration,
+        CameraGeometry,
+        CameraModel,
+        line_of_sight_covariance,
+        line_of_sight_sigma_arcsec,
+        lines_of_sight,
+        OptionError,
+        project,
+        read_calibration,
+        StarcalError,
+        StarObservations,
+        TooFewObservations,
+    )
 
-__all__ = ['calibrate_images', 'compare', 'plot', 'read_residuals']
+    __version__: str
+
+__all__ = [
+    'Calibration',
+    'CameraGeometry',
+    'CameraModel',
+    'OptionError',
+    'StarObservations',
+    'StarcalError',
+    'TooFewObservations',
+    '__version__',
+    'calibrate',
+    'calibrate_bag',
+    'calibrate_images',
+    'calibrate_with_residuals',
+    'compare',
+    'line_of_sight_covariance',
+    'line_of_sight_sigma_arcsec',
+    'lines_of_sight',
+    'observations_of',
+    'plot',
+    'project',
+    'read_calibration',
+    'read_residuals',
+    'write_calibration',
+]
 
 if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
     _MODULES = {
+        'calibrate': 'api',
+        'calibrate_bag': 'api',
         'calibrate_images': 'images.night_sky',
+        'calibrate_with_residuals': 'api',
         'compare': 'comparison',
+        'observations_of': 'api',
         'plot': 'report.page',
         'read_residuals': 'products',
+        'write_calibration': 'api',
     }
 
     def __getattr__(name: str) -> object:
@@ -38,7 +89,9 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         import importlib
 
-        value: object = getattr(importlib.import_module(f'{__name__}.{_MODULES[name]}'), name)
+        # The other names are those of `starcal_ros`, which a vehicle has too.
+        module = f'{__name__}.{_MODULES[name]}' if name in _MODULES else 'starcal_ros'
+        value: object = getattr(importlib.import_module(module), name)
         globals()[name] = value
         return value
 

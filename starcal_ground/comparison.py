@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table, lines_of_sight
+from starcal_ros.assessment.lookup import GRID, grid_lines_of_sight, line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
@@ -211,7 +211,7 @@ def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
 
 def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
     """Lines of sight of the grid, (GRID^2, 3), star tracker frame."""
-    directions = lines_of_sight(geometry, GRID, GRID)
+    directions = grid_lines_of_sight(geometry, GRID, GRID)
     if not np.isfinite(directions).all():
         raise ProductError(
             'a calibration has pixels without a line of sight: its distortion folds'

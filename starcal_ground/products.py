@@ -20,13 +20,13 @@ import zipfile
 import numpy as np
 import yaml
 
+from starcal_ground.bags import rosbag2
 from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import is_marked
-from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
@@ -107,7 +107,7 @@ def write_observations(
     path = folder / OBSERVATIONS_FILE
     if rosbag2.READS_BAGS:
         path.unlink(missing_ok=True)  # one that is there is of the products that are replaced
-        from starcal_ros.formats.bag.reader import log_damage
+        from starcal_ground.bags.reader import log_damage
 
         log_damage(f'{path} is not written: mcap or rosbags is not installed: {rosbag2.INSTALL}')
         return

@@ -17,8 +17,9 @@ Conventions of the whole package:
 - Angles are radians inside and arcseconds for people; times are integer nanoseconds since the
   Unix epoch (UTC, as ROS stamps); directions are unit vectors; xyz is the last axis.
 
-The public functions and records are those of ``__all__``; `api` describes them.  Each is imported
-at its first use, so that ``import starcal_ros`` loads neither NumPy nor OpenCV.
+The public functions and records are those of ``__all__``: what a consumer of calibrations needs on
+the vehicle.  Each is imported at its first use, so that ``import starcal_ros`` loads neither NumPy
+nor OpenCV.  Calibrations are made by the nodes, or on the ground by ``starcal_ground``.
 """
 
 import sys
@@ -32,7 +33,16 @@ if _is_found and any(word.startswith('starcal_ros.') for word in sys.orig_argv):
 from typing import TYPE_CHECKING  # noqa: E402
 
 if TYPE_CHECKING:
-    from starcal_ros.api import *
+    from starcal_ros.assessment.lookup import (
+        line_of_sight_covariance,
+        line_of_sight_sigma_arcsec,
+        lines_of_sight,
+        project,
+    )
+    from starcal_ros.camera import CameraModel
+    from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
+    from starcal_ros.formats.products.product_files import read_calibration
+    from starcal_ros.records import Calibration, CameraGeometry, StarObservations
 
     __version__: str
 
@@ -45,22 +55,42 @@ __all__ = [
     'StarcalError',
     'TooFewObservations',
     '__version__',
-    'calibrate',
-    'calibrate_bag',
-    'calibrate_with_residuals',
     'line_of_sight_covariance',
     'line_of_sight_sigma_arcsec',
     'lines_of_sight',
-    'observations_of',
     'project',
     'read_calibration',
-    'write_calibration',
 ]
 
 if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
+    _MODULES = {
+        'assessment.lookup': (
+            'line_of_sight_covariance',
+            'line_of_sight_sigma_arcsec',
+            'lines_of_sight',
+            'project',
+        ),
+        'camera': ('CameraModel',),
+        'errors': ('OptionError', 'StarcalError', 'TooFewObservations'),
+        'formats.products.product_files': ('read_calibration',),
+        'records': ('Calibration', 'CameraGeometry', 'StarObservations'),
+    }
+    _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+    # They were here in 1.0.0.  An AttributeError's text would not reach a `from ... import`.
+    _ON_GROUND = frozenset(
+        [
+            'calibrate',
+            'calibrate_bag',
+            'calibrate_with_residuals',
+            'observations_of',
+            'write_calibration',
+        ]
+    )
 
     def __getattr__(name: str) -> object:
         """Import a public name at its first use (PEP 562)."""
+        if name in _ON_GROUND:
+            raise ImportError(f'starcal_ros.{name} is starcal_ground.{name} now')
         if name not in __all__:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         if name == '__version__':
@@ -68,9 +98,9 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
 
             value: object = software_version()
         else:
-            from starcal_ros import api
+            import importlib
 
-            value = getattr(api, name)
+            value = getattr(importlib.import_module(f'{__name__}.{_MODULE_OF[name]}'), name)
         globals()[name] = value
         return value
 

@@ -23,8 +23,11 @@ _REMEDY = (
 )
 
 
+_ON_GROUND = ('bag_player',)  # nodes that a vehicle may not have
+
+
 def _run(name: str) -> int:
-    """Run the function ``main`` of a module of `starcal_ros.ros`, or of one by its whole name."""
+    """Run the function ``main`` of the module of a node, or of another by its whole name."""
     use_one_arena()
     # Read when NumPy is imported: see `starcal_ros.processes`, which a vehicle may not have.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -34,11 +37,14 @@ def _run(name: str) -> int:
     # `starcal play` and `starcal monitor` block it until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
-        module = importlib.import_module(name if '.' in name else f'starcal_ros.ros.{name}')
+        package = 'starcal_ground' if name in _ON_GROUND else 'starcal_ros'
+        module = importlib.import_module(name if '.' in name else f'{package}.ros.{name}')
     except ImportError as error:
-        if (error.name or '').startswith(('starcal_ros', 'starcal_ground')):
+        if error.name == 'starcal_ground':
+            why = 'starcal_ground is not installed: build the workspace with -DSTARCAL_GROUND=ON'
+        elif (error.name or '').startswith(('starcal_ros', 'starcal_ground')):
             raise
-        if error.name in ('mcap', 'rosbags'):  # rosdep has no key for them
+        elif error.name in ('mcap', 'rosbags'):  # rosdep has no key for them
             install = f'{sys.executable} -m pip install mcap rosbags'
             why = f'{error.name} is not installed: {install}'
         else:

@@ -35,10 +35,10 @@ class StarcalError(Exception):
     """
     Base class of the exceptions that starcal raises for bad input.
 
-    >>> import starcal_ros
+    >>> import starcal_ground
     >>> try:
-    ...     starcal_ros.calibrate_bag('no.mcap', 'bags/tiny/params.yaml')
-    ... except starcal_ros.StarcalError as error:
+    ...     starcal_ground.calibrate_bag('no.mcap', 'bags/tiny/params.yaml')
+    ... except starcal_ground.StarcalError as error:
     ...     print(error)
     no.mcap: no such bag
     """
@@ -48,9 +48,9 @@ class OptionError(StarcalError):
     """
     An option is unknown, of the wrong type or out of its range; the text names it.
 
-    >>> import starcal_ros
-    >>> prior = starcal_ros.read_calibration('out').geometry
-    >>> starcal_ros.calibrate([], prior, methd='single')
+    >>> import starcal_ground
+    >>> prior = starcal_ground.read_calibration('out').geometry
+    >>> starcal_ground.calibrate([], prior, methd='single')
     Traceback (most recent call last):
     starcal_ros.errors.OptionError: methd: no such parameter (did you mean method?)
     """
@@ -106,9 +106,9 @@ class TooFewObservations(StarcalError):
     """
     The ensemble does not suffice for the requested calibration; the text names the shortage.
 
-    >>> import starcal_ros
-    >>> prior = starcal_ros.read_calibration('out').geometry
-    >>> starcal_ros.calibrate([], prior)  # doctest: +ELLIPSIS
+    >>> import starcal_ground
+    >>> prior = starcal_ground.read_calibration('out').geometry
+    >>> starcal_ground.calibrate([], prior)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     starcal_ros.errors.TooFewObservations: too few observations: 3 more images are needed...
     """

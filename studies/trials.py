@@ -20,7 +20,7 @@ from starcal_ground.comparison import chi_squared, parameter_difference
 from starcal_ground.simulation.centroids import scaled_inverse
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table, lines_of_sight
+from starcal_ros.assessment.lookup import GRID, grid_lines_of_sight, line_of_sight_table
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -192,7 +192,7 @@ def pointing_bound_arcsec(camera: CameraModel, covariance: MapCovariance) -> flo
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:
     """RMS difference of the lines of sight in the star tracker frame over the detector, arcsec."""
-    of_found, of_true = (lines_of_sight(geometry, GRID, GRID) for geometry in (found, true))
+    of_found, of_true = (grid_lines_of_sight(geometry, GRID, GRID) for geometry in (found, true))
     return rms(np.linalg.norm(of_found - of_true, axis=1)) / ARCSECOND_RAD
 
 

@@ -19,10 +19,10 @@ from typing import Any
 from hypothesis import Phase, settings
 from hypothesis import strategies as st
 
+from starcal_ground.bags import reader, topics
+from starcal_ground.bags.reader import Topics
 from starcal_ground.products import write_observations, write_products
-from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.reader import Topics
-from starcal_ros.pipeline import solve, topics
+from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 

@@ -18,7 +18,7 @@ import spiceypy
 import yaml
 
 from starcal_ground.bag_writer import BagWriter
-from starcal_ros.formats.bag import reader
+from starcal_ground.bags import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import (

@@ -11,7 +11,7 @@ from bench.frames import observed, write_bag, write_set_up
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
 from starcal_ground.images.from_stars import from_stars, ideal_camera
-from starcal_ros.api import read_calibration
+from starcal_ros import read_calibration
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import Calibration

@@ -22,8 +22,8 @@ from starcal_ros.text import printable
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from starcal_ground.bags.topics import Topics
     from starcal_ground.images.first_setup import Given
-    from starcal_ros.pipeline.topics import Topics
 
 Record = TypeVar('Record', bound='DataclassInstance')
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
@@ -152,7 +152,7 @@ def add_topics(command: argparse.ArgumentParser) -> None:
 
 def topics(args: argparse.Namespace) -> Topics:
     """Topics that `add_topics` asked for."""
-    from starcal_ros.pipeline.topics import Topics
+    from starcal_ground.bags.topics import Topics
 
     return Topics(**{kind: vars(args)[f'{kind}_topic'] for kind in _TOPICS})
 

@@ -11,7 +11,8 @@ import functools
 from pathlib import Path
 import threading
 
-from starcal_ground import products
+from starcal_ground import campaign, products
+from starcal_ground.bags import reader
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
 from starcal_ground.planning.plan import with_images_to_reach
@@ -19,9 +20,8 @@ from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import campaign, solve
+from starcal_ros.pipeline import solve
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 
@@ -162,8 +162,8 @@ def _drawn(
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
+    from starcal_ground.diagnosis.bags import refusals
     from starcal_ground.planning.inspect import cause_of
-    from starcal_ros.pipeline.diagnosis.bags import refusals
 
     source, count = observed.source, len(observed.observations)
     groups = refusals(observed.observations)

@@ -21,14 +21,21 @@ import textwrap
 import numpy as np
 import yaml
 
+from starcal_ground.bags import reader
+from starcal_ground.bags.topics import (
+    choose_image_topic,
+    choose_topics,
+    stated_tracker,
+    Topics,
+    without_attitudes,
+)
+from starcal_ground.campaign import Source, ThroughAir
 from starcal_ground.images.photographs import image_paths
 from starcal_ground.products import make_folder, write_camera_info
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.campaign import Source, ThroughAir
 from starcal_ros.pipeline.setup import (
     aligned,
     files_of,
@@ -36,13 +43,6 @@ from starcal_ros.pipeline.setup import (
     option_groups,
     paths_from,
     Setup,
-)
-from starcal_ros.pipeline.topics import (
-    choose_image_topic,
-    choose_topics,
-    stated_tracker,
-    Topics,
-    without_attitudes,
 )
 from starcal_ros.records import Ensemble
 from starcal_ros.text import printable
@@ -238,8 +238,8 @@ def air_of(setup: Setup) -> ThroughAir | None:
 
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     """Setup of bags with attitudes whose camera is not stated, and sentences on it."""
+    from starcal_ground.diagnosis.bags import diagnose_bags
     from starcal_ground.images import from_stars, night_sky  # as in `first_setup`
-    from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
     from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 
     if choose_topics(given.paths, given.topics).observations:

@@ -11,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ground import campaign
+from starcal_ground.bags import frames, reader
+from starcal_ground.bags import topics as bag_topics
+from starcal_ground.diagnosis import bags
+from starcal_ground.diagnosis.bags import Refused
 from starcal_ground.file_kinds import explained
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.formats.bag import frames, reader
 from starcal_ros.formats.messages import message_codec, sensor_messages
-from starcal_ros.pipeline import campaign, solve
-from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.diagnosis import bags
-from starcal_ros.pipeline.diagnosis.bags import Refused
+from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import EnsembleStatus, StarObservations

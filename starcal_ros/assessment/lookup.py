@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_jacobians
+from starcal_ros.camera import project as project_pixels
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.record_fields import Record
-from starcal_ros.records import CameraGeometry, MapCovariance
+from starcal_ros.records import Calibration, CameraGeometry, MapCovariance
 
 CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
 GRID = 25  # pixels a side over which calibrations are compared and common rotations taken
@@ -163,7 +166,7 @@ def _rotations(directions: Floats) -> Floats:
     return np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
 
 
-def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
+def grid_lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
     """
     Unit directions of a grid of pixels in the star tracker frame, (columns * rows, 3), by rows.
 
@@ -187,9 +190,169 @@ def movement(
         The remaining movement at a grid of pixels, in pixels at the centre.  Both results are
         infinite if a pixel no longer has a line of sight.
     """
-    old, new = (lines_of_sight(geometry, columns, rows) for geometry in (before, after))
+    old, new = (grid_lines_of_sight(geometry, columns, rows) for geometry in (before, after))
     if not (np.isfinite(old).all() and np.isfinite(new).all()):
         return np.inf, np.full(len(old), np.inf)
     rotation, _ = Rotation.align_vectors(new, old)
     left_rad = np.linalg.norm(new - rotation.apply(old), axis=1)
     return float(rotation.magnitude()), left_rad * after.camera.parameters[0]
+
+
+Frame = Literal['camera', 'star_tracker']
+
+
+def lines_of_sight(
+    calibration: Calibration | CameraGeometry | CameraModel,
+    pixels_px: ArrayLike,
+    frame: Frame = 'camera',
+) -> Floats:
+    """
+    Unit vectors (..., 3) of the lines of sight of pixels (..., 2); the inverse of `project`.
+
+    Parameters
+    ----------
+    calibration : Calibration, CameraGeometry or CameraModel
+    pixels_px : (..., 2)
+        (u, v); the centre of the first pixel is (0, 0).
+    frame : {'camera', 'star_tracker'}
+        Axes of the vectors; the star tracker's are those of the alignment.
+
+    Returns
+    -------
+    (..., 3)
+        NaN where the distortion model has no inverse.
+
+    Raises
+    ------
+    ValueError
+        For another frame, or the star tracker's without an alignment.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> geometry = starcal_ros.CameraGeometry(camera, [0, 0, 0.6, 0.8])  # 73.7 degrees about z
+    >>> starcal_ros.lines_of_sight(geometry, [711.5, 383.5]).round(4).tolist()
+    [0.0995, 0.0, 0.995]
+    >>> starcal_ros.lines_of_sight(geometry, [711.5, 383.5], 'star_tracker').round(4).tolist()
+    [0.0279, 0.0955, 0.995]
+    """
+    camera, frame_from_camera = _in_frame(calibration, frame)
+    in_camera = line_of_sight(camera, np.asarray(pixels_px, np.float64))
+    return np.asarray(in_camera @ frame_from_camera.T)
+
+
+def project(
+    calibration: Calibration | CameraGeometry | CameraModel,
+    directions: ArrayLike,
+    frame: Frame = 'camera',
+) -> Floats:
+    """
+    Pixels (..., 2) of directions (..., 3); the inverse of `lines_of_sight`.
+
+    Parameters
+    ----------
+    calibration : Calibration, CameraGeometry or CameraModel
+    directions : (..., 3)
+        Vectors of any length.
+    frame : {'camera', 'star_tracker'}
+        Their axes.
+
+    Returns
+    -------
+    (..., 2)
+        (u, v), outside the image too; NaN behind the camera and where the distortion folds.
+
+    Raises
+    ------
+    ValueError
+        For another frame, or the star tracker's without an alignment.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> sight = starcal_ros.lines_of_sight(calibration, [100.0, 200.0], 'star_tracker')
+    >>> starcal_ros.project(calibration, sight, 'star_tracker').round(6).tolist()
+    [100.0, 200.0]
+    """
+    camera, frame_from_camera = _in_frame(calibration, frame)
+    in_camera = np.asarray(directions, np.float64) @ frame_from_camera
+    return project_pixels(camera, in_camera)
+
+
+def line_of_sight_covariance(
+    calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
+) -> Floats:
+    """
+    Covariance (..., 3, 3) of the unit vectors of `lines_of_sight`, rad^2.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    pixels_px : (..., 2)
+        (u, v).
+    frame : {'camera', 'star_tracker'}
+        ``camera``: of the camera alone, the rotation common to the detector removed;
+        ``star_tracker``: of camera and alignment together.
+
+    Raises
+    ------
+    ValueError
+        For another frame, or the star tracker's without an alignment.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> covariance = starcal_ros.line_of_sight_covariance(calibration, [[0, 0], [320, 256]])
+    >>> covariance.shape, bool(covariance[0].trace() > covariance[1].trace())  # corner, middle
+    ((2, 3, 3), True)
+    """
+    camera, frame_from_camera = _in_frame(calibration, frame)
+    pixels = np.asarray(pixels_px, np.float64)
+    flat = pixels.reshape(-1, 2)
+    parts: list[Floats] = [np.empty((0, 3, 3))]
+    for k in range(0, len(flat), CHUNK):
+        derivatives = Derivatives.at(camera, flat[k : k + CHUNK])
+        J = derivatives.J if frame == 'star_tracker' else derivatives.of_shape(camera)
+        parts.append(derivatives.covariance_rad2(calibration.map_covariance, J))
+    turned = frame_from_camera @ np.concatenate(parts) @ frame_from_camera.T
+    return turned.reshape(*pixels.shape[:-1], 3, 3)
+
+
+def line_of_sight_sigma_arcsec(
+    calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
+) -> Floats:
+    """
+    1-sigma (...) of the lines of sight of pixels (..., 2), arcsec, as in `starcal lookup`.
+
+    The root of the trace of `line_of_sight_covariance`, which has the parameters.
+
+    Examples
+    --------
+    >>> import starcal_ros
+    >>> calibration = starcal_ros.read_calibration('out')
+    >>> alone, pointing = (
+    ...     starcal_ros.line_of_sight_sigma_arcsec(calibration, [320, 256], frame)
+    ...     for frame in ('camera', 'star_tracker'))
+    >>> bool(alone < 1.0 < pointing)
+    True
+    """
+    return sigma_arcsec(line_of_sight_covariance(calibration, pixels_px, frame))
+
+
+def _in_frame(
+    calibration: Calibration | CameraGeometry | CameraModel, frame: str
+) -> tuple[CameraModel, Floats]:
+    """Camera of a calibration, and the rotation (3, 3) from the camera frame to a frame."""
+    geometry = calibration.geometry if isinstance(calibration, Calibration) else calibration
+    camera = geometry if isinstance(geometry, CameraModel) else geometry.camera
+    if frame == 'camera':
+        return camera, np.eye(3)
+    if frame != 'star_tracker':
+        raise ValueError(f"frame: {frame!r} is not 'camera' or 'star_tracker'")
+    alone = isinstance(calibration, Calibration) and not calibration.has_alignment
+    if alone or isinstance(geometry, CameraModel):
+        raise ValueError(f'frame: {frame!r}: the camera alone has no alignment')
+    return camera, geometry.star_tracker_from_camera.as_matrix()

@@ -35,8 +35,7 @@ from typing import Any
 
 from starcal_ros.errors import ArchiveError, BagError, errors_as, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
-from starcal_ros.formats.bag.reader import read_observations
-from starcal_ros.formats.bag.typestore import observations_bag
+from starcal_ros.formats.bag.typestore import observations_bag, observations_in_bag
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE
@@ -408,21 +407,17 @@ class Archive:
                 self.damage.append(f'{path}: not a regular file, skipped')
 
     def _read_image(self, path: Path, name: re.Match[str]) -> StarObservations | None:
-        damage: list[str] = []
         try:
             data = _content(path)
             self._seal.check_mark(name[2] or '', int(name[1]), data)
-            records = list(read_observations([path], TOPIC, damage.append))
+            image = observations_in_bag(data)
         except (BagError, ValueError) as error:
             self._set_aside(path, str(error))
             return None
-        if damage or len(records) != 1:
-            self._set_aside(path, damage[0] if damage else f'{len(records)} images, not one')
+        if image.refusal:
+            self._set_aside(path, f'{image.refusal}: {image.detail}')
             return None
-        if records[0].refusal:
-            self._set_aside(path, f'{records[0].refusal}: {records[0].detail}')
-            return None
-        return records[0]
+        return image
 
     def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
         content = self._unsealed(path, product_files.SCHEMA)

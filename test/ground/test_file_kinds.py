@@ -19,9 +19,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE
 from starcal_ros.records import Image
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from sample_records import assert_same  # type: ignore[import-not-found]
 
+from starcal_ground.bags import reader as bag_reader
 from starcal_ros.errors import ArchiveError
-from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive, Seal, TOPIC
 

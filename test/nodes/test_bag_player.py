@@ -27,6 +27,7 @@ from std_msgs.msg import String
 
 from starcal.msg import StarObservations
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.ros import bag_player
 from starcal_ros.formats.bag import typestore
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
@@ -41,7 +42,6 @@ from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
-from starcal_ros.ros import bag_player
 
 pytestmark = pytest.mark.nodes
 

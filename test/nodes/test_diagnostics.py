@@ -27,7 +27,7 @@ from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, StarObservations
-from starcal_ros.formats.bag import reader
+from starcal_ground.bags import reader
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Activation, Ensemble, IMAGE_REFUSALS
 from starcal_ros.ros.archive import Archive

@@ -23,7 +23,7 @@ from node_inputs import BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-
 
 from starcal.msg import EnsembleStatus
 from starcal_ground.bag_writer import BagWriter
-from starcal_ros.formats.bag import reader
+from starcal_ground.bags import reader
 from starcal_ros.formats.messages.message_codec import stamp_ns
 from starcal_ros.records import Image
 

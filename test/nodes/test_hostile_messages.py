@@ -38,7 +38,7 @@ from std_srvs.srv import Trigger
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
-from starcal_ros.formats.bag import reader
+from starcal_ground.bags import reader
 from starcal_ros.formats.messages.record_messages import (
     calibration_to_message,
     observations_to_message,

@@ -238,7 +238,8 @@ def test_a_node_that_the_middleware_never_lets_go_ends() -> None:
 EXECUTOR_OF_A_NODE = """
 import os, signal, sys
 import rclpy
-from starcal_ros.ros import bag_player, calibrator
+from starcal_ground.ros import bag_player
+from starcal_ros.ros import calibrator
 from starcal_ros.ros import node as node_module
 
 def told_of(module, name):

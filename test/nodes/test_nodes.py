@@ -45,9 +45,9 @@ from starcal_ground.bag_writer import (
     image_to_message,
     temperature_to_message,
 )
+from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
 from starcal_ros.assessment.lookup import COLUMNS
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages import message_codec
 from starcal_ros.formats.messages.message_codec import make_header
 from starcal_ros.formats.messages.record_messages import (

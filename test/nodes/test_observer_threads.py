@@ -18,7 +18,7 @@ pytest.importorskip('starcal.msg')
 from geometry_msgs.msg import TwistStamped
 from node_inputs import in_this_process  # type: ignore[import-not-found]
 
-from starcal_ros.formats.bag import reader
+from starcal_ground.bags import reader
 from starcal_ros.formats.bag.typestore import typestore
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration

@@ -29,6 +29,7 @@ from packaging.requirements import Requirement
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration
+import starcal_ros
 from starcal_ros.formats.messages.record_messages import calibration_from_message
 
 pytestmark = [pytest.mark.nodes, pytest.mark.usefixtures('onboard')]
@@ -61,11 +62,12 @@ for name in sys.argv[1:]:
     except ModuleNotFoundError as error:
         print(error.name)
 """
-CALIBRATED = """
+READ = """
 import json, sys
 import starcal_ros
-found = starcal_ros.calibrate_bag(sys.argv[1], sys.argv[2])
-print(json.dumps([found.accepted, found.images_used, found.geometry.camera.parameters.tolist()]))
+found = starcal_ros.read_calibration(sys.argv[1])
+sight = starcal_ros.lines_of_sight(found, [0.0, 0.0], 'star_tracker')
+print(json.dumps([found.accepted, found.images_used, sight.tolist()]))
 """
 
 
@@ -107,26 +109,34 @@ def test_what_stays_on_the_ground_cannot_be_imported() -> None:
     assert (done.returncode, done.stdout.split()) == (0, [*ON_THE_GROUND])
 
 
-def test_nodes_and_interface_calibrate_a_bag(
-    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The same calibration from the messages of a player and from the bag; with a state folder."""
+    """Of the messages of a player on the ground, with a state folder."""
     for name in BOTH:
         ros = (*parameters(tiny_bag, f'state_dir:={tmp_path}/kept'), *REMAPS)
         start_node(name, ros=ros, forked=False)
     client.until_listened()
     ros = ('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0')
-    player = start_node('bag_player', ros=ros, forked=False)
+    with monkeypatch.context() as on_ground:
+        on_ground.delenv('PYTHONPATH')
+        player = start_node('bag_player', ros=ros, forked=False)
     assert player.wait() == 0, player.said()
     client.until_images(10, 'images_saved')
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert answer.success, answer.message
     published = client.latched(Calibration, 'calibration')
     client.until(lambda: published)
-    done = run('-c', CALIBRATED, tiny_bag, tiny_bag / 'params.yaml')
+    done = run('-c', READ, tmp_path / 'kept')
     assert (done.returncode, done.stderr) == (0, '')
-    is_accepted, images, by_interface = json.loads(done.stdout)
+    is_accepted, images, sight = json.loads(done.stdout)
     assert is_accepted and published[0].accepted
     assert images == published[0].images_used == 10
-    camera = calibration_from_message(published[0]).geometry.camera
-    assert by_interface == camera.parameters.tolist()
+    expected = starcal_ros.lines_of_sight(
+        calibration_from_message(published[0]), [0.0, 0.0], 'star_tracker'
+    )
+    assert sight == expected.tolist()

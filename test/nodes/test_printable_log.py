@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-from starcal_ros.ros.bag_player import BagPlayer
+from starcal_ground.ros.bag_player import BagPlayer
 from starcal_ros.ros.node import StarcalNode
 from starcal_ros.ros.printable_log import PrintableLog, PrintableLogger
 

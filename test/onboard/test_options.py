@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.options import (
@@ -23,12 +24,7 @@ from starcal_ros.options import (
     read_parameter_file,
     section_applies,
 )
-from starcal_ros.pipeline.setup import (
-    NODE_OPTION_CLASSES,
-    OPTION_CLASSES,
-    PlayerOptions,
-    read_values,
-)
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, read_values
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import attacks  # type: ignore[import-not-found]
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits, ThreadpoolController
 
-import starcal_ros
+import starcal_ground
 from starcal_ros.processes import one_blas_thread
 from studies.workers import run_each
 
@@ -107,7 +107,7 @@ def test_the_estimate_of_a_calibration_from_python_is_on_one_thread() -> None:
     records, prior = attacks.observations(), attacks.setup().prior
     sys.setprofile(look)
     try:
-        calibration = starcal_ros.calibrate(records, prior)
+        calibration = starcal_ground.calibrate(records, prior)
     finally:
         sys.setprofile(None)
     assert (calibration.images_used, numbers) == (10, {1})

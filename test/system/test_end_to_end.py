@@ -20,14 +20,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
+from starcal_ground.bags.frames import read_telemetry
+from starcal_ground.bags.reader import read_images, Topics
 from starcal_ground.cli import main
 from starcal_ground.comparison import alignment_difference_rad, compare, truth_like
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.formats.bag.frames import read_telemetry
-from starcal_ros.formats.bag.reader import read_images, Topics
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, CameraGeometry, Image

@@ -20,6 +20,7 @@ import pytest
 
 from bench.frames import write_set_up
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
 from starcal_ground.products import prior_of
@@ -29,7 +30,6 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import observations_bag
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import (

@@ -154,8 +154,8 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
     assert 'look at out/report.html' in done.stdout
     assert '<svg' in (tmp_path / 'out/report.html').read_text()
     write = (
-        'import sys, starcal_ros; found = starcal_ros.calibrate_bag(*sys.argv[1:]);'
-        "starcal_ros.write_calibration(found, 'again.json')"
+        'import sys, starcal_ground; found = starcal_ground.calibrate_bag(*sys.argv[1:]);'
+        "starcal_ground.write_calibration(found, 'again.json')"
     )
     done = run(python, '-W', 'error', '-c', write, tiny, params, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')

@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 
+from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ros.options import names_of
-from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, PlayerOptions
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))

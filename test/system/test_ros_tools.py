@@ -31,8 +31,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ros_tools import find_tools, HIDDEN, RosTools  # type: ignore[import-not-found]
 from rosbags.convert import convert
 
-from starcal_ros import calibrate_bag
-from starcal_ros.formats.bag import reader
+from starcal_ground import calibrate_bag
+from starcal_ground.bags import reader
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive

@@ -37,8 +37,8 @@ from starcal_ros.errors import NotFromStars, OptionError
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:
+    from starcal_ground.campaign import Campaign, Source
     from starcal_ground.images.first_setup import FirstSetup
-    from starcal_ros.pipeline.campaign import Campaign, Source
     from starcal_ros.records import Calibration, CameraGeometry
 
 _DIR = 'folder for the products, created if absent'
@@ -100,11 +100,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Source]:
     """The set-up that the arguments give, and its source; a failure is recorded in the folder."""
+    from starcal_ground.campaign import chosen
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
     from starcal_ground.products import check_outputs, make_folder, same_as_one_of
     from starcal_ros.assessment.gate import requirements_of
-    from starcal_ros.pipeline.campaign import chosen
 
     requirements_of(args.require or ())
     given = arguments.given(args, **({'requirements': args.require} if args.require else {}))

@@ -41,12 +41,12 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from starcal_ground import comparison, products
+    from starcal_ground.bags.topics import Topics
+    from starcal_ground.campaign import chosen, Source
     from starcal_ground.cli.commands.compare import print_comparison
     from starcal_ground.cli.into_folder import calibrate_into, check_folder, Drawings
     from starcal_ground.report import page
-    from starcal_ros.pipeline.campaign import chosen, Source
     from starcal_ros.pipeline.setup import load_setup
-    from starcal_ros.pipeline.topics import Topics
 
     products.make_folder(args.output)
     bag = tiny_bag(args.output)

@@ -27,8 +27,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.diagnosis.bags import diagnose_bags
     from starcal_ground.images.first_setup import first_setup
-    from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
 
     given = arguments.given(args)
     setup, _ = given.checked()

@@ -62,9 +62,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import products
+    from starcal_ground.bags.reader import read_observations
     from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
-    from starcal_ros.formats.bag.reader import read_observations
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     file = calibration_file(args.calibration)

@@ -39,10 +39,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.bags import reader
     from starcal_ground.file_kinds import explained
     from starcal_ground.images.first_setup import first_setup
     from starcal_ground.planning import inspect
-    from starcal_ros.formats.bag import reader
     from starcal_ros.formats.messages import message_codec
 
     kinds = (*message_codec.IMAGE_TYPES, message_codec.OBSERVATIONS_TYPE)

@@ -55,11 +55,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from starcal_ground.bags import reader
+    from starcal_ground.campaign import calibrate, chosen, observe
     from starcal_ground.images.first_setup import first_setup
     from starcal_ground.planning.plan import Cone, plan_pointings, Request
-    from starcal_ros.formats.bag import reader
     from starcal_ros.formats.products.product_files import write_atomically
-    from starcal_ros.pipeline.campaign import calibrate, chosen, observe
 
     given = arguments.given(args)
     setup, files = given.checked()

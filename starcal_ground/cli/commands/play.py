@@ -26,7 +26,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ros.formats.bag import reader
+    from starcal_ground.bags import reader
 
     reader.mcap_files([args.bag])
     parameters = node_processes.player_arguments(args.bag, args.rate)

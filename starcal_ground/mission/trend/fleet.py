@@ -27,17 +27,17 @@ from typing import Any
 import numpy as np
 
 from starcal_ground import file_kinds, products
+from starcal_ground.bags import reader
+from starcal_ground.bags.topics import Topics
+from starcal_ground.campaign import calibrate, chosen, observe, Source
 from starcal_ground.images.first_setup import air_of
 from starcal_ground.mission.trend import places, trend_table
 from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE
-from starcal_ros.pipeline.campaign import calibrate, chosen, observe, Source
 from starcal_ros.pipeline.setup import files_of, read_setup
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import StarObservations
 from starcal_ros.text import printable
 

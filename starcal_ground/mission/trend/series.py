@@ -24,7 +24,7 @@ from scipy.special import fdtrc
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ground.mission.trend.trend_table import COMPUTED, Row
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import lines_of_sight, movement
+from starcal_ros.assessment.lookup import grid_lines_of_sight, movement
 from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import CameraGeometry
@@ -350,7 +350,7 @@ def _change(rows: Sequence[Row], row: int, against: int) -> Change:
     before, after = rows[against].geometry, rows[row].geometry
     if (before.camera.width, before.camera.height) != (after.camera.width, after.camera.height):
         return Change(row, against, math.inf, math.inf)
-    old, new = (lines_of_sight(geometry, *_GRID) for geometry in (before, after))
+    old, new = (grid_lines_of_sight(geometry, *_GRID) for geometry in (before, after))
     moved_rad = np.linalg.norm(new - old, axis=1).max()
     _, left_px = movement(before, after, *_GRID)
     total_px = float(moved_rad * after.camera.parameters[0])

@@ -14,6 +14,8 @@ from pathlib import Path
 import sys
 from typing import Any, IO
 
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -193,6 +195,34 @@ def observations_bag(topic: str, record: StarObservations, frame_id: str) -> byt
     writer.add_message(number, record.time_ns, data, publish_time=record.time_ns)
     writer.finish()  # type: ignore[no-untyped-call]
     return stream.getvalue()
+
+
+def observations_in_bag(data: bytes) -> StarObservations:
+    """Observations of the single message in the bytes of a bag; raises BagError for any other."""
+    try:
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        messages: list[Message] = []
+        for record in StreamReader(io.BytesIO(data), validate_crcs=True).records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                messages.append(record)
+        if len(messages) != 1:
+            raise BagError(f'{len(messages)} images, not one')
+        schema = schemas[channels[messages[0].channel_id].schema_id]
+        if schema.name != message_codec.OBSERVATIONS_TYPE:
+            raise BagError(f'{schema.name} is not {message_codec.OBSERVATIONS_TYPE}')
+        store = typestore_of(schema.name, schema.data.decode())
+        message = store.deserialize_cdr(messages[0].data, schema.name)
+    except BagError:
+        raise
+    # Damaged bytes are parsed as an arbitrary record: the exceptions have no common base class.
+    except Exception as error:
+        raise BagError(f'damaged: {type(error).__name__}: {error}') from error
+    return record_messages.checked_observations(message)
 
 
 def started(stream: IO[bytes]) -> Writer:

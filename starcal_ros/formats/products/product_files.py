@@ -128,12 +128,30 @@ def _text(value: object, margin: str = '\n') -> str:
     return json.dumps(value, allow_nan=False)
 
 
-def read_calibration(path: Path) -> Calibration:
-    """The calibration in a file, equal to the one written; raises ProductError with the key."""
-    content = read_json(path)
+def read_calibration(path: Path | str) -> Calibration:
+    """
+    The calibration of a ``calibration.json``, or of the folder that holds one.
+
+    Equal to the one written, to the last bit.
+
+    Raises
+    ------
+    ProductError
+        Naming the file and the key that is missing or wrong.
+
+    Examples
+    --------
+    After ``starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out``:
+
+    >>> import starcal_ros
+    >>> starcal_ros.read_calibration('out').method
+    'hierarchical'
+    """
+    file = calibration_file(Path(path))
+    content = read_json(file)
     if not isinstance(content, dict):
-        raise ProductError(f'{path}: not a calibration (no JSON object)')
-    return calibration_from_content(path, content)
+        raise ProductError(f'{file}: not a calibration (no JSON object)')
+    return calibration_from_content(file, content)
 
 
 def calibration_file(path: Path) -> Path:

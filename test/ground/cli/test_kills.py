@@ -32,12 +32,12 @@ from mission_files import write_frames  # type: ignore[import-not-found]
 import pytest
 
 from bench import graph
+from starcal_ground.bags import reader
 from starcal_ground.cli import entry_point, main
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products.product_files import read_calibration, write_atomically
 
 SLOWEST_S = 300.0

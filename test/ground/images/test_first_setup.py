@@ -14,8 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup

@@ -16,6 +16,8 @@ from random_pointings import honesty  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags.topics import Topics
+from starcal_ground.campaign import calibrate, chosen, observe, Source
 from starcal_ground.images.first_setup import air_of
 from starcal_ground.images.from_stars import ideal_camera, options_of
 from starcal_ground.images.unknown_air import refracted, with_air, zenith_of
@@ -29,9 +31,7 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.unknowns import Refraction
-from starcal_ros.pipeline.campaign import calibrate, chosen, observe, Source
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import CameraGeometry, Ensemble, HeldTerm, StarObservations
 from starcal_ros.sky.astrometry import (
     air_above,

@@ -15,18 +15,17 @@ import numpy as np
 import pytest
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader, topics
+from starcal_ground.bags.topics import Topics
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_REFUSED
+from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.planning import inspect
 from starcal_ground.simulation import simulated_bag
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
-from starcal_ros.pipeline import topics
-from starcal_ros.pipeline.diagnosis.bags import refusals
 from starcal_ros.pipeline.setup import read_setup, Setup
-from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image, refused_image
 
 PARAMS = TINY / 'params.yaml'

@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 
 from starcal_ground import products
+from starcal_ground.bags.reader import read_observations
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
 from starcal_ground.products import prior_of, REPORT_FILE
 from starcal_ground.report import page as report
-from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
     read_calibration,

@@ -13,14 +13,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_campaign import attitudes, image, SCENARIO, TRUTH, values, write_png  # type: ignore[import-not-found]
 
+from starcal_ground.bags import topics
+from starcal_ground.bags.frames import read_telemetry
+from starcal_ground.bags.reader import read_images, Topics
 from starcal_ground.simulation.rendering import render, star_electrons
 from starcal_ground.simulation.scenario import attitude_samples, Inertial, scene
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.formats.bag.frames import read_telemetry
-from starcal_ros.formats.bag.reader import read_images, Topics
-from starcal_ros.pipeline import observe, topics
+from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.astrometry import air_above, apparent_directions, through_the_air

@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import topics
+from starcal_ground.bags.reader import Topics
 from starcal_ground.simulation.scenario import attitude_samples, Detector
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.formats.bag.reader import Topics
-from starcal_ros.pipeline import observe, solve, topics
+from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup, with_method
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image
 from starcal_ros.sky.attitude import AttitudeHistory

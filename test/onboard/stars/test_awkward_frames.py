@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starcal_ground.bags import reader
 from starcal_ground.simulation.rendering import expose, star_electrons
 from starcal_ground.simulation.scenario import Detector
-from starcal_ros.formats.bag import reader
 from starcal_ros.records import Image, StarRefusal
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import (

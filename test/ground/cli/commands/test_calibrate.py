@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground.bags.reader import read_observations
 from starcal_ground.cli import main
 from starcal_ground.products import (
     NOT_CALIBRATED_FILE,
@@ -20,7 +21,6 @@ from starcal_ground.products import (
     OBSERVATIONS_TOPIC,
     write_observations,
 )
-from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import refused_image
 

@@ -17,12 +17,12 @@ import pytest
 import yaml
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.cli import main
 from starcal_ground.mission.ingest.deep_catalog import write_deep_catalog
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message

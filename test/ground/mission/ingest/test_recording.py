@@ -22,12 +22,12 @@ import numpy as np
 import pytest
 import yaml
 
+import starcal_ground
+from starcal_ground.bags import reader
+from starcal_ground.bags.frames import read_telemetry
+from starcal_ground.bags.reader import Topics
 from starcal_ground.cli.main import main
-import starcal_ros
 from starcal_ros.constants import utc_text
-from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.frames import read_telemetry
-from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.records import Image
 
 pytestmark = pytest.mark.usefixtures('forked_readers')
@@ -67,12 +67,12 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
     for a, b in zip(found, images(), strict=True):
         assert isinstance(a, Image) and a.time_ns == b.time_ns and (a.pixels == b.pixels).all()
     # The file of the original: it has the sigma of the star tracker too.
-    imported = starcal_ros.calibrate_bag(bag, TINY / 'params.yaml')
-    original = starcal_ros.calibrate_bag(TINY, TINY / 'params.yaml')
+    imported = starcal_ground.calibrate_bag(bag, TINY / 'params.yaml')
+    original = starcal_ground.calibrate_bag(TINY, TINY / 'params.yaml')
     # Quaternions are scaled to unit length on the way: a rounding of 1e-16.
     change = np.abs(imported.geometry.camera.parameters - original.geometry.camera.parameters)
     assert (change <= 1e-6 * original.sigma[:-3]).all()
-    assert starcal_ros.calibrate_bag(bag, bag / 'params.yaml').accepted
+    assert starcal_ground.calibrate_bag(bag, bag / 'params.yaml').accepted
     record = json.loads((bag / 'import.json').read_text())
     assert record['scale'] == {'offset': 0.0, 'step': 1.0, 'dtype': images()[0].pixels.dtype.name}
 
@@ -107,7 +107,7 @@ def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -
         for topic in ('/star_tracker/attitude', '/ST_2/attitude')
     )
     assert first == other and len(first) == len(attitudes())
-    found = starcal_ros.calibrate_bag(bag, bag / 'params.yaml')
+    found = starcal_ground.calibrate_bag(bag, bag / 'params.yaml')
     assert found.accepted
     values = yaml.safe_load((bag / 'params.yaml').read_text())['/**']['ros__parameters']
     assert values['more_star_trackers'] == ['ST_2']

@@ -11,8 +11,8 @@ import pytest
 from rosbags.typesys import get_typestore, Stores
 from sample_records import observations  # type: ignore[import-not-found]
 
+from starcal_ground.bags import reader
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import (
     check_definition,
     described,

@@ -256,7 +256,7 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, content: bytes
 def test_missing_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
         read_calibration(tmp_path / 'none')
-    with pytest.raises(ProductError, match='cannot be read: Is a directory'):
+    with pytest.raises(ProductError, match='the folder holds no calibration.json'):
         read_calibration(tmp_path)
     with pytest.raises(ProductError, match='cannot be written'):
         write_calibration(calibration(), tmp_path / 'none' / 'c.json')

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from starcal_ground.bags import reader
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.camera import CameraModel
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis, WireAttitudes
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup

@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import frames as frames_module
+from starcal_ground.bags import reader
+from starcal_ground.bags.frames import Frame, read_frames, read_telemetry, Telemetry
+from starcal_ground.bags.reader import read_images, Topics
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag import frames as frames_module
-from starcal_ros.formats.bag import reader, typestore
-from starcal_ros.formats.bag.frames import Frame, read_frames, read_telemetry, Telemetry
-from starcal_ros.formats.bag.reader import read_images, Topics
+from starcal_ros.formats.bag import typestore
 from starcal_ros.records import Image
 from starcal_ros.sky.attitude import AttitudeOptions
 
@@ -232,8 +233,8 @@ def test_an_error_of_reading_reaches_the_caller(tmp_path: Path) -> None:
 # on the threads.
 MEMORY = """
 import resource, sys
-from starcal_ros.formats.bag import frames
-from starcal_ros.formats.bag.reader import Topics
+from starcal_ground.bags import frames
+from starcal_ground.bags.reader import Topics
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for k, frame in enumerate(frames.read_frames([sys.argv[1]], Topics('/image', '/attitude'))):
     if k == 15:

@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ground.bags import reader
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.formats.messages.message_codec import RawMessage
 from starcal_ros.records import Image, StarObservations

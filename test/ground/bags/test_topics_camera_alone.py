@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     make_header,

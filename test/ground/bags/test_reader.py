@@ -26,12 +26,12 @@ import yaml
 import zstandard
 
 from starcal_ground.bag_writer import BagWriter, image_to_message
+from starcal_ground.bags import reader as bag_reader
+from starcal_ground.bags.frames import read_telemetry
+from starcal_ground.bags.reader import Damage, Topics
 from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.formats.bag import typestore as typestore_module
-from starcal_ros.formats.bag.frames import read_telemetry
-from starcal_ros.formats.bag.reader import Damage, Topics
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages.message_codec import (
     ATTITUDE_TYPE,
@@ -43,7 +43,7 @@ from starcal_ros.formats.messages.sensor_messages import image_to_message as pic
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
-SHARED = Path(__file__).parents[5] / 'shared'  # inputs from elsewhere, not part of the tree
+SHARED = Path(__file__).parents[4] / 'shared'  # inputs from elsewhere, not part of the tree
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 10**9
 
@@ -533,7 +533,7 @@ def test_messages_compressed_one_by_one_are_read(
 
 MEMORY = """
 import resource, sys
-from starcal_ros.formats.bag import reader as bag_reader
+from starcal_ground.bags import reader as bag_reader
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for k, image in enumerate(bag_reader.read_images([sys.argv[1]], '/image')):
     if k == 10:

@@ -34,8 +34,8 @@ import struct
 from typing import Any, IO
 import zlib
 
+from starcal_ground.bags import rosbag2
 from starcal_ros.errors import BagError, errors_as, NotABag
-from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import re
 
+from starcal_ground.bags import reader
+from starcal_ground.bags.frames import Frame, read_frames
+from starcal_ground.bags.reader import Topics as Topics
 from starcal_ros.constants import utc_text
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag import reader
-from starcal_ros.formats.bag.frames import Frame, read_frames
-from starcal_ros.formats.bag.reader import Topics as Topics
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup

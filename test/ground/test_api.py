@@ -14,9 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
 
+import starcal_ground
 import starcal_ros
-from starcal_ros import api
-from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment import lookup
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, StarObservations
@@ -41,29 +41,48 @@ def arrays(image: StarObservations) -> dict[str, Any]:
     }
 
 
-def test_public_names_are_those_of_the_api() -> None:
-    assert sorted(starcal_ros.__all__) == sorted([*api.__all__, '__version__'])
-    for name in api.__all__:
-        assert getattr(starcal_ros, name) is getattr(api, name)
+def test_public_names_are_those_that_can_be_imported() -> None:
+    assert set(starcal_ros.__all__) < set(starcal_ground.__all__)
+    for package in (starcal_ros, starcal_ground):
+        assert set(dir(package)) >= set(package.__all__)
+        for name in package.__all__:
+            assert getattr(package, name) is getattr(starcal_ground, name)
+        with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+            _ = package.calibrat
     assert starcal_ros.__version__.count('.') == 2
-    assert set(dir(starcal_ros)) >= set(starcal_ros.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
-        _ = starcal_ros.calibrat  # type: ignore[attr-defined]
 
 
-def test_the_import_alone_loads_nothing() -> None:
-    show = 'import sys; import starcal_ros; print(*sys.modules)'
+@pytest.mark.parametrize(
+    'name',
+    [
+        'calibrate',
+        'calibrate_bag',
+        'calibrate_with_residuals',
+        'observations_of',
+        'write_calibration',
+    ],
+)
+def test_an_old_name_leads_to_the_new_one(name: str) -> None:
+    with pytest.raises(ImportError, match=f'^starcal_ros.{name} is starcal_ground.{name} now$'):
+        exec(f'from starcal_ros import {name}')
+
+
+@pytest.mark.parametrize('package', ['starcal_ros', 'starcal_ground'])
+def test_the_import_alone_loads_nothing(package: str) -> None:
+    show = f'import sys; import {package}; print(*sys.modules)'
     done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
-    assert not {'numpy', 'cv2', 'starcal_ros.api'} & set(done.stdout.split())
+    assert not {'numpy', 'cv2', 'starcal_ground.api'} & set(done.stdout.split())
 
 
 @pytest.mark.slow
 def test_arrays_give_the_estimate_of_the_records() -> None:
     images = [
-        starcal_ros.observations_of(SCENARIO.prior.camera, **arrays(image))
+        starcal_ground.observations_of(SCENARIO.prior.camera, **arrays(image))
         for image in ensemble().images
     ]
-    found = starcal_ros.calibrate(images, SCENARIO.prior, star_tracker_sigma_arcsec=SIGMA_ARCSEC)
+    found = starcal_ground.calibrate(
+        images, SCENARIO.prior, star_tracker_sigma_arcsec=SIGMA_ARCSEC
+    )
     options = CalibrationOptions(star_tracker_sigma_arcsec=SIGMA_ARCSEC)
     # Arrays have no magnitudes, by which the variances would be told apart.
     dark = Ensemble(
@@ -86,7 +105,7 @@ def test_stars_of_equal_directions_are_one_star() -> None:
     image = dict(arrays(ensemble().images[0]), catalog_id=None)
     later = dict(image, time_ns=image['time_ns'] + 1)
     first, second = (
-        starcal_ros.observations_of(SCENARIO.prior.camera, **one) for one in (image, later)
+        starcal_ground.observations_of(SCENARIO.prior.camera, **one) for one in (image, later)
     )
     assert np.array_equal(first.catalog_id, second.catalog_id)
     assert len(np.unique(first.catalog_id)) == len(first)
@@ -94,7 +113,7 @@ def test_stars_of_equal_directions_are_one_star() -> None:
 
 def test_one_covariance_serves_all_stars() -> None:
     image = dict(arrays(ensemble().images[0]), covariance_px2=[[0.04, 0.01], [0.01, 0.09]])
-    stars = starcal_ros.observations_of(SCENARIO.prior.camera, **image)
+    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **image)
     assert np.array_equal(stars.covariance_px2, np.tile([0.04, 0.01, 0.09], (len(stars), 1)))
 
 
@@ -114,40 +133,40 @@ def test_one_covariance_serves_all_stars() -> None:
 def test_a_bad_array_is_named(argument: str, value: Any, complaint: str) -> None:
     image = dict(arrays(ensemble().images[0]), **{argument: value})
     with pytest.raises(ValueError, match=complaint):
-        starcal_ros.observations_of(SCENARIO.prior.camera, **image)
+        starcal_ground.observations_of(SCENARIO.prior.camera, **image)
 
 
 def test_options_are_checked_by_name() -> None:
-    with pytest.raises(starcal_ros.OptionError, match='did you mean method'):
-        starcal_ros.calibrate(ensemble().images, SCENARIO.prior, methd='single')
-    with pytest.raises(starcal_ros.OptionError, match='method: .* is not one of'):
-        starcal_ros.calibrate(ensemble().images, SCENARIO.prior, method='best')
-    with pytest.raises(starcal_ros.OptionError, match='prior_alignment: no such parameter'):
-        starcal_ros.calibrate(ensemble().images, SCENARIO.prior, prior_alignment=(0, 0, 0, 1))
+    with pytest.raises(starcal_ground.OptionError, match='did you mean method'):
+        starcal_ground.calibrate(ensemble().images, SCENARIO.prior, methd='single')
+    with pytest.raises(starcal_ground.OptionError, match='method: .* is not one of'):
+        starcal_ground.calibrate(ensemble().images, SCENARIO.prior, method='best')
+    with pytest.raises(starcal_ground.OptionError, match='prior_alignment: no such parameter'):
+        starcal_ground.calibrate(ensemble().images, SCENARIO.prior, prior_alignment=(0, 0, 0, 1))
 
 
 def test_too_few_images_are_refused() -> None:
-    with pytest.raises(starcal_ros.TooFewObservations, match='1 more images are needed'):
-        starcal_ros.calibrate(ensemble().images[:2], SCENARIO.prior)
+    with pytest.raises(starcal_ground.TooFewObservations, match='1 more images are needed'):
+        starcal_ground.calibrate(ensemble().images[:2], SCENARIO.prior)
 
 
 @pytest.mark.slow
 def test_a_bag_gives_what_the_tool_gives(tiny_bag: Path, tiny_products: Path) -> None:
-    found = starcal_ros.calibrate_bag(tiny_bag, tiny_bag / 'params.yaml')
-    written = starcal_ros.read_calibration(tiny_products)
+    found = starcal_ground.calibrate_bag(tiny_bag, tiny_bag / 'params.yaml')
+    written = starcal_ground.read_calibration(tiny_products)
     assert found.provenance == written.provenance
     assert np.array_equal(found.geometry.camera.parameters, written.geometry.camera.parameters)
     assert np.array_equal(found.covariance, written.covariance)
-    again = starcal_ros.calibrate_bag(
+    again = starcal_ground.calibrate_bag(
         [tiny_products / 'observations.mcap'], str(tiny_bag / 'params.yaml')
     )
     assert again.stars_used == found.stars_used
 
 
 def test_a_calibration_is_written_and_read(tiny_products: Path, tmp_path: Path) -> None:
-    calibration = starcal_ros.read_calibration(tiny_products)
-    starcal_ros.write_calibration(calibration, tmp_path)
-    starcal_ros.write_calibration(calibration, tmp_path / 'other.json')
+    calibration = starcal_ground.read_calibration(tiny_products)
+    starcal_ground.write_calibration(calibration, tmp_path)
+    starcal_ground.write_calibration(calibration, tmp_path / 'other.json')
     text = (tiny_products / 'calibration.json').read_text()
     assert (tmp_path / 'calibration.json').read_text() == text
     assert (tmp_path / 'other.json').read_text() == text
@@ -156,57 +175,57 @@ def test_a_calibration_is_written_and_read(tiny_products: Path, tmp_path: Path) 
 def test_lines_of_sight_are_of_either_frame() -> None:
     geometry = SCENARIO.truth
     pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
-    in_camera = starcal_ros.lines_of_sight(geometry, pixels)
+    in_camera = starcal_ground.lines_of_sight(geometry, pixels)
     assert in_camera.shape == (2, 2, 3)
     # 1e-8 px: Newton's iteration stops at 4e-11 px, and arithmetic adds some more.
     np.testing.assert_allclose(
-        starcal_ros.project(geometry.camera, in_camera), pixels, rtol=0, atol=1e-8
+        starcal_ground.project(geometry.camera, in_camera), pixels, rtol=0, atol=1e-8
     )
     star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
     expected = star_tracker_from_camera.apply(in_camera.reshape(-1, 3)).reshape(2, 2, 3)
-    found = starcal_ros.lines_of_sight(geometry, pixels, frame='star_tracker')
+    found = starcal_ground.lines_of_sight(geometry, pixels, frame='star_tracker')
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
     with pytest.raises(ValueError, match="frame: 'icrf' is not"):
-        starcal_ros.lines_of_sight(geometry, pixels, frame='icrf')  # type: ignore[arg-type]
+        starcal_ground.lines_of_sight(geometry, pixels, frame='icrf')  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize('frame', ['camera', 'star_tracker'])
-def test_a_direction_is_projected_from_either_frame(frame: api.Frame) -> None:
+def test_a_direction_is_projected_from_either_frame(frame: lookup.Frame) -> None:
     pixels = np.array([[0.0, 0.0], [100.0, 50.0], [639.0, 511.0]])
-    sights = starcal_ros.lines_of_sight(SCENARIO.truth, pixels, frame)
-    back = starcal_ros.project(SCENARIO.truth, 3.0 * sights, frame)
+    sights = starcal_ground.lines_of_sight(SCENARIO.truth, pixels, frame)
+    back = starcal_ground.project(SCENARIO.truth, 3.0 * sights, frame)
     np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-8)  # as above
 
 
 @pytest.mark.parametrize(('frame', 'column'), [('camera', 1), ('star_tracker', 2)])
 def test_sigmas_of_lines_of_sight_are_those_of_the_table(
-    tiny_products: Path, frame: api.Frame, column: int
+    tiny_products: Path, frame: lookup.Frame, column: int
 ) -> None:
-    calibration = starcal_ros.read_calibration(tiny_products)
+    calibration = starcal_ground.read_calibration(tiny_products)
     pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
-    table = line_of_sight_table(
+    table = lookup.line_of_sight_table(
         calibration.geometry.camera, calibration.map_covariance, pixels.reshape(-1, 2)
     )
-    found = starcal_ros.line_of_sight_sigma_arcsec(calibration, pixels, frame)
+    found = starcal_ground.line_of_sight_sigma_arcsec(calibration, pixels, frame)
     expected = (table.shape_sigma_arcsec, table.sigma_arcsec)[column - 1].reshape(2, 2)
     np.testing.assert_allclose(found, expected, rtol=1e-9)  # rounding
     # No uncertainty is along the line of sight itself.
-    covariance = starcal_ros.line_of_sight_covariance(calibration, pixels, frame)
-    sights = starcal_ros.lines_of_sight(calibration, pixels, frame)
+    covariance = starcal_ground.line_of_sight_covariance(calibration, pixels, frame)
+    sights = starcal_ground.lines_of_sight(calibration, pixels, frame)
     along = np.einsum('...i,...ij,...j->...', sights, covariance, sights)
     assert (np.abs(along) < 1e-9 * np.trace(covariance, axis1=-2, axis2=-1)).all()
 
 
 def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny_products: Path) -> None:
-    alone = dataclasses.replace(starcal_ros.read_calibration(tiny_products), parent_frame='')
+    alone = dataclasses.replace(starcal_ground.read_calibration(tiny_products), parent_frame='')
     for camera in (alone, alone.geometry.camera):
-        assert starcal_ros.lines_of_sight(camera, [1.0, 2.0]).shape == (3,)
+        assert starcal_ground.lines_of_sight(camera, [1.0, 2.0]).shape == (3,)
         with pytest.raises(ValueError, match='the camera alone has no alignment'):
-            starcal_ros.lines_of_sight(camera, [1.0, 2.0], 'star_tracker')
+            starcal_ground.lines_of_sight(camera, [1.0, 2.0], 'star_tracker')
 
 
 def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products: Path) -> None:
-    one, same = (starcal_ros.read_calibration(tiny_products) for _ in range(2))
+    one, same = (starcal_ground.read_calibration(tiny_products) for _ in range(2))
     assert one == same and one != 'calibration'
     assert one != dataclasses.replace(one, covariance=2 * one.covariance)
     assert repr(one).count('\n') == 2 and len(repr(one)) < 300
@@ -218,10 +237,10 @@ def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products: Path)
 
 def test_records_are_not_changed_by_the_caller() -> None:
     image = arrays(ensemble().images[0])
-    stars = starcal_ros.observations_of(SCENARIO.prior.camera, **image)
+    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **image)
     held = stars.measured_px.copy()
     mine = image['measured_px'].copy()
-    stars = starcal_ros.observations_of(SCENARIO.prior.camera, **dict(image, measured_px=mine))
+    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **dict(image, measured_px=mine))
     mine += 1.0
     assert np.array_equal(stars.measured_px, held)
     assert dataclasses.is_dataclass(stars)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from starcal_ros.formats.bag import rosbag2
+from starcal_ground.bags import rosbag2
 
 
 def test_a_bag_cannot_name_any_module_to_be_imported() -> None:

@@ -16,12 +16,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ground.bags import reader
+from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages import message_codec
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.setup import PlayerOptions
 from starcal_ros.ros import inputs, node, parameters, printable_log
 
 NAME = 'bag_player'

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 import yaml
 
+import starcal_ground
+from starcal_ground import campaign
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags.reader import read_observations, Topics
 from starcal_ground.cli.main import main
 from starcal_ground.images.night_sky import calibrate_images
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.trend_table import Row
-import starcal_ros
-from starcal_ros.formats.bag.reader import read_observations, Topics
-from starcal_ros.pipeline import campaign
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Calibration, refused_image
 
@@ -73,7 +73,7 @@ def expected(bag: Path) -> Calibration:
     out = bag.parent / 'out'
     params = str(bag / 'params.yaml')
     assert main(['calibrate', str(bag), '--params', params, '-o', str(out)]) == 0
-    written = starcal_ros.read_calibration(out)
+    written = starcal_ground.read_calibration(out)
     assert written.accepted and written.images_used == 10
     return written
 
@@ -85,7 +85,7 @@ def is_unsited(bag: Path) -> bool:
 
 def by_python(bag: Path) -> Mapping[str, Any]:
     """Numbers of `calibrate_bag`."""
-    return numbers_of(starcal_ros.calibrate_bag(bag, bag / 'params.yaml'))
+    return numbers_of(starcal_ground.calibrate_bag(bag, bag / 'params.yaml'))
 
 
 def by_trend(bag: Path) -> Mapping[str, Any]:
@@ -126,7 +126,7 @@ def test_all_entrances_give_one_calibration(
 ) -> None:
     given = (bag, capsys) if entrance is by_plan else (bag,)
     if entrance is by_python and is_unsited(bag):  # what flies does not find the air
-        with pytest.raises(starcal_ros.OptionError, match='observer: ground needs the site'):
+        with pytest.raises(starcal_ground.OptionError, match='observer: ground needs the site'):
             entrance(*given)
         return
     for name, number in entrance(*given).items():
@@ -225,11 +225,11 @@ def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
     params.write_text('/**:\n  ros__parameters:\n    observer: space\n')
     by_tool = ['calibrate', str(bag), '--params', str(params), '-o', str(tmp_path / 'out')]
     assert main([*by_tool, '--no-report']) in (0, 3)
-    written = starcal_ros.read_calibration(tmp_path / 'out')
+    written = starcal_ground.read_calibration(tmp_path / 'out')
     calibration = calibrate_images(bag, observer='space')
     assert not calibration.has_alignment
-    with pytest.raises(starcal_ros.OptionError, match='starcal_ground.calibrate_images'):
-        starcal_ros.calibrate_bag(bag, params)
+    with pytest.raises(starcal_ground.OptionError, match='starcal_ground.calibrate_images'):
+        starcal_ground.calibrate_bag(bag, params)
     for name, number in numbers_of(calibration).items():
         np.testing.assert_allclose(number, numbers_of(written)[name], rtol=1e-9, err_msg=name)
 

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader, topics
+from starcal_ground.bags.topics import Topics
+from starcal_ground.campaign import Source
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
@@ -25,10 +27,7 @@ from starcal_ros.formats.messages.message_codec import (
     vector_to_message,
 )
 from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline import topics
-from starcal_ros.pipeline.campaign import Source
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup
-from starcal_ros.pipeline.topics import Topics
 
 
 def setup_with(**others: object) -> Setup:

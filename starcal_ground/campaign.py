@@ -16,13 +16,13 @@ import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from starcal_ground.bags import reader
+from starcal_ground.bags import topics as bag_topics
+from starcal_ground.bags.topics import OnImage, Topics, Wanted
 from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.assessment.predictions import Residuals
-from starcal_ros.formats.bag import reader
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.setup import check_site, Setup
-from starcal_ros.pipeline.topics import OnImage, Topics, Wanted
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
 _FOR_WANT_OF_STARS = {REQUIREMENTS, 'min_coverage'}  # checks that fail, of a sound calibration
@@ -101,7 +101,7 @@ def chosen(source: Source) -> Source:
         check_site(setup.site)
     topics = bag_topics.choose_topics(bags, requested, setup)
     if not (setup.is_aligned or topics.observations):
-        from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags  # seldom needed, slow
+        from starcal_ground.diagnosis.bags import aligned_by_bags  # seldom needed, slow
 
         setup, sentence = aligned_by_bags(bags, requested, setup)
         notes = (*notes, sentence)
@@ -215,7 +215,7 @@ def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
 def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:
     """Sentences on the reasons of refused images."""
     if any(image.refusal for image in observations):
-        from starcal_ros.pipeline.diagnosis.bags import refusals  # slow
+        from starcal_ground.diagnosis.bags import refusals  # slow
 
         for group in refusals(observations):
             detail = f' ({group.detail})' if group.detail else ''

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The public functions of the package, for use without ROS; imported as attributes of `starcal_ros`.
+Calibration from Python, without ROS: from arrays and from bags.
 
 A calibration from arrays or from a bag is the one that ``starcal calibrate`` and the nodes give
 from the same observations, with the same options.  BLAS runs on one thread meanwhile.
@@ -12,50 +12,26 @@ from collections.abc import Iterable, Sequence
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcal_ground.bags import reader
+from starcal_ground.bags.topics import Topics, without_attitudes
+from starcal_ground.campaign import calibrate_bags
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment import lookup
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.predictions import Residuals
-from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera import project as project_in_camera
-from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.product_files import calibration_file
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, read_values
 from starcal_ros.pipeline.solve import inputs_of
-from starcal_ros.pipeline.topics import Topics, without_attitudes
 from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
 from starcal_ros.records import Calibration, CameraGeometry, StarObservations
-
-__all__ = [
-    'Calibration',
-    'CameraGeometry',
-    'CameraModel',
-    'OptionError',
-    'StarObservations',
-    'StarcalError',
-    'TooFewObservations',
-    'calibrate',
-    'calibrate_bag',
-    'calibrate_with_residuals',
-    'line_of_sight_covariance',
-    'line_of_sight_sigma_arcsec',
-    'lines_of_sight',
-    'observations_of',
-    'project',
-    'read_calibration',
-    'write_calibration',
-]
 
 
 def observations_of(
@@ -115,10 +91,11 @@ def observations_of(
 
     Examples
     --------
-    >>> import numpy as np, starcal_ros
-    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
+    >>> import numpy as np, starcal_ground
+    >>> pinhole = [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0]
+    >>> camera = starcal_ground.CameraModel(1024, 768, pinhole)
     >>> towards = np.array([[0.0, 0.0, 1.0], [0.0, 0.1, np.sqrt(0.99)]])  # (n, 3), ICRF
-    >>> stars = starcal_ros.observations_of(
+    >>> stars = starcal_ground.observations_of(
     ...     camera, 1_700_000_000_000_000_000, [[511.4, 383.6], [511.6, 584.4]],
     ...     0.01 * np.eye(2), towards, [0, 0, 0, 1])
     >>> len(stars), stars.covariance_px2[0].tolist()  # uu, uv, vv
@@ -198,20 +175,21 @@ def calibrate(
     --------
     Five images of 100 stars, whose camera has a focal length 0.5 % shorter than the prior:
 
-    >>> import numpy as np, starcal_ros
+    >>> import numpy as np, starcal_ground
     >>> from scipy.spatial.transform import Rotation
-    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
-    >>> truth = starcal_ros.CameraGeometry(camera, [0, 0, 0, 1])
-    >>> prior = starcal_ros.CameraGeometry(camera.replace(fx=2010, fy=2010), [0, 0, 0, 1])
+    >>> pinhole = [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0]
+    >>> camera = starcal_ground.CameraModel(1024, 768, pinhole)
+    >>> truth = starcal_ground.CameraGeometry(camera, [0, 0, 0, 1])
+    >>> prior = starcal_ground.CameraGeometry(camera.replace(fx=2010, fy=2010), [0, 0, 0, 1])
     >>> noise, images = np.random.default_rng(1), []
     >>> for k in range(5):
     ...     pixels = noise.uniform((0, 0), (1023, 767), (100, 2))
     ...     icrf_from_camera = Rotation.from_rotvec([0, 0.2 * k, 0])
-    ...     images.append(starcal_ros.observations_of(
+    ...     images.append(starcal_ground.observations_of(
     ...         camera, k, pixels + noise.normal(0, 0.1, pixels.shape), 0.01 * np.eye(2),
-    ...         icrf_from_camera.apply(starcal_ros.lines_of_sight(truth, pixels)),
+    ...         icrf_from_camera.apply(starcal_ground.lines_of_sight(truth, pixels)),
     ...         icrf_from_camera.as_quat()))
-    >>> calibration = starcal_ros.calibrate(images, prior)
+    >>> calibration = starcal_ground.calibrate(images, prior)
     >>> print(calibration.accepted, calibration.geometry.camera.parameters[0].round())
     True 2000.0
     """
@@ -226,11 +204,11 @@ def calibrate_with_residuals(
 
     Examples
     --------
-    >>> import starcal_ros
-    >>> from starcal_ros.formats.bag.reader import read_observations
+    >>> import starcal_ground
+    >>> from starcal_ground.bags.reader import read_observations
     >>> images = list(read_observations(['out/observations.mcap'], '/observations'))
-    >>> prior = starcal_ros.read_calibration('out').geometry
-    >>> calibration, residuals = starcal_ros.calibrate_with_residuals(images, prior)
+    >>> prior = starcal_ground.read_calibration('out').geometry
+    >>> calibration, residuals = starcal_ground.calibrate_with_residuals(images, prior)
     >>> bool(residuals.residual_px[residuals.used].std() < 0.2)  # measured minus predicted
     True
     """
@@ -276,8 +254,8 @@ def calibrate_bag(
 
     Examples
     --------
-    >>> import starcal_ros
-    >>> calibration = starcal_ros.calibrate_bag('bags/tiny', 'bags/tiny/params.yaml')
+    >>> import starcal_ground
+    >>> calibration = starcal_ground.calibrate_bag('bags/tiny', 'bags/tiny/params.yaml')
     >>> calibration.images_used, calibration.residual_rms_px < 0.2
     (10, True)
     """
@@ -297,26 +275,6 @@ def calibrate_bag(
     return calibrate_bags(paths, setup, requested, inputs).calibration
 
 
-def read_calibration(path: Path | str) -> Calibration:
-    """
-    The calibration of a ``calibration.json``, or of the folder that holds one.
-
-    Raises
-    ------
-    ProductError
-        Naming the file and the key that is missing or wrong.
-
-    Examples
-    --------
-    After ``starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out``:
-
-    >>> import starcal_ros
-    >>> starcal_ros.read_calibration('out').method
-    'hierarchical'
-    """
-    return product_files.read_calibration(calibration_file(Path(path)))
-
-
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """
     Write a ``calibration.json``, into a folder if the path is one.
@@ -328,174 +286,14 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
 
     Examples
     --------
-    >>> import starcal_ros
-    >>> starcal_ros.write_calibration(starcal_ros.read_calibration('out'), 'copy.json')
-    >>> starcal_ros.read_calibration('copy.json').images_used
+    >>> import starcal_ground
+    >>> starcal_ground.write_calibration(starcal_ground.read_calibration('out'), 'copy.json')
+    >>> starcal_ground.read_calibration('copy.json').images_used
     10
     """
     path = Path(path)
     file = path / product_files.CALIBRATION_FILE if path.is_dir() else path
     product_files.write_calibration(calibration, file)
-
-
-Frame = Literal['camera', 'star_tracker']
-
-
-def lines_of_sight(
-    calibration: Calibration | CameraGeometry | CameraModel,
-    pixels_px: ArrayLike,
-    frame: Frame = 'camera',
-) -> Floats:
-    """
-    Unit vectors (..., 3) of the lines of sight of pixels (..., 2); the inverse of `project`.
-
-    Parameters
-    ----------
-    calibration : Calibration, CameraGeometry or CameraModel
-    pixels_px : (..., 2)
-        (u, v); the centre of the first pixel is (0, 0).
-    frame : {'camera', 'star_tracker'}
-        Axes of the vectors; the star tracker's are those of the alignment.
-
-    Returns
-    -------
-    (..., 3)
-        NaN where the distortion model has no inverse.
-
-    Raises
-    ------
-    ValueError
-        For another frame, or the star tracker's without an alignment.
-
-    Examples
-    --------
-    >>> import starcal_ros
-    >>> camera = starcal_ros.CameraModel(1024, 768, [2000, 0, 2000, 511.5, 383.5, 0, 0, 0, 0, 0])
-    >>> geometry = starcal_ros.CameraGeometry(camera, [0, 0, 0.6, 0.8])  # 73.7 degrees about z
-    >>> starcal_ros.lines_of_sight(geometry, [711.5, 383.5]).round(4).tolist()
-    [0.0995, 0.0, 0.995]
-    >>> starcal_ros.lines_of_sight(geometry, [711.5, 383.5], 'star_tracker').round(4).tolist()
-    [0.0279, 0.0955, 0.995]
-    """
-    camera, frame_from_camera = _in_frame(calibration, frame)
-    in_camera = line_of_sight(camera, np.asarray(pixels_px, np.float64))
-    return np.asarray(in_camera @ frame_from_camera.T)
-
-
-def project(
-    calibration: Calibration | CameraGeometry | CameraModel,
-    directions: ArrayLike,
-    frame: Frame = 'camera',
-) -> Floats:
-    """
-    Pixels (..., 2) of directions (..., 3); the inverse of `lines_of_sight`.
-
-    Parameters
-    ----------
-    calibration : Calibration, CameraGeometry or CameraModel
-    directions : (..., 3)
-        Vectors of any length.
-    frame : {'camera', 'star_tracker'}
-        Their axes.
-
-    Returns
-    -------
-    (..., 2)
-        (u, v), outside the image too; NaN behind the camera and where the distortion folds.
-
-    Raises
-    ------
-    ValueError
-        For another frame, or the star tracker's without an alignment.
-
-    Examples
-    --------
-    >>> import starcal_ros
-    >>> calibration = starcal_ros.read_calibration('out')
-    >>> sight = starcal_ros.lines_of_sight(calibration, [100.0, 200.0], 'star_tracker')
-    >>> starcal_ros.project(calibration, sight, 'star_tracker').round(6).tolist()
-    [100.0, 200.0]
-    """
-    camera, frame_from_camera = _in_frame(calibration, frame)
-    in_camera = np.asarray(directions, np.float64) @ frame_from_camera
-    return project_in_camera(camera, in_camera)
-
-
-def line_of_sight_covariance(
-    calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
-) -> Floats:
-    """
-    Covariance (..., 3, 3) of the unit vectors of `lines_of_sight`, rad^2.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    pixels_px : (..., 2)
-        (u, v).
-    frame : {'camera', 'star_tracker'}
-        ``camera``: of the camera alone, the rotation common to the detector removed;
-        ``star_tracker``: of camera and alignment together.
-
-    Raises
-    ------
-    ValueError
-        For another frame, or the star tracker's without an alignment.
-
-    Examples
-    --------
-    >>> import starcal_ros
-    >>> calibration = starcal_ros.read_calibration('out')
-    >>> covariance = starcal_ros.line_of_sight_covariance(calibration, [[0, 0], [320, 256]])
-    >>> covariance.shape, bool(covariance[0].trace() > covariance[1].trace())  # corner, middle
-    ((2, 3, 3), True)
-    """
-    camera, frame_from_camera = _in_frame(calibration, frame)
-    pixels = np.asarray(pixels_px, np.float64)
-    flat = pixels.reshape(-1, 2)
-    parts: list[Floats] = [np.empty((0, 3, 3))]
-    for k in range(0, len(flat), lookup.CHUNK):
-        derivatives = lookup.Derivatives.at(camera, flat[k : k + lookup.CHUNK])
-        J = derivatives.J if frame == 'star_tracker' else derivatives.of_shape(camera)
-        parts.append(derivatives.covariance_rad2(calibration.map_covariance, J))
-    turned = frame_from_camera @ np.concatenate(parts) @ frame_from_camera.T
-    return turned.reshape(*pixels.shape[:-1], 3, 3)
-
-
-def line_of_sight_sigma_arcsec(
-    calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
-) -> Floats:
-    """
-    1-sigma (...) of the lines of sight of pixels (..., 2), arcsec, as in `starcal lookup`.
-
-    The root of the trace of `line_of_sight_covariance`, which has the parameters.
-
-    Examples
-    --------
-    >>> import starcal_ros
-    >>> calibration = starcal_ros.read_calibration('out')
-    >>> alone, pointing = (
-    ...     starcal_ros.line_of_sight_sigma_arcsec(calibration, [320, 256], frame)
-    ...     for frame in ('camera', 'star_tracker'))
-    >>> bool(alone < 1.0 < pointing)
-    True
-    """
-    return lookup.sigma_arcsec(line_of_sight_covariance(calibration, pixels_px, frame))
-
-
-def _in_frame(
-    calibration: Calibration | CameraGeometry | CameraModel, frame: str
-) -> tuple[CameraModel, Floats]:
-    """Camera of a calibration, and the rotation (3, 3) from the camera frame to a frame."""
-    geometry = calibration.geometry if isinstance(calibration, Calibration) else calibration
-    camera = geometry if isinstance(geometry, CameraModel) else geometry.camera
-    if frame == 'camera':
-        return camera, np.eye(3)
-    if frame != 'star_tracker':
-        raise ValueError(f"frame: {frame!r} is not 'camera' or 'star_tracker'")
-    alone = isinstance(calibration, Calibration) and not calibration.has_alignment
-    if alone or isinstance(geometry, CameraModel):
-        raise ValueError(f'frame: {frame!r}: the camera alone has no alignment')
-    return camera, geometry.star_tracker_from_camera.as_matrix()
 
 
 def _unit(vectors: Floats) -> Floats:
