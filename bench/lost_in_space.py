@@ -24,10 +24,10 @@ from scipy.stats import binomtest
 
 from bench.table import Table, timed
 from bench.trials import in_processes
+from starcal_ground.blind.search import find_in_any, SkyMatch
+from starcal_ground.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
-from starcal_ros.identification.blind.search import find_in_any, SkyMatch
-from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
 SEED = 416

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Launch the star observer and the calibrator, and play a recorded bag to them."""
+"""Launch the nodes of integration.launch.py, and play a recorded bag to them."""
 
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
@@ -11,7 +11,7 @@ from launch import LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the nodes, the player and the arguments; those of starcal.launch.py apply too."""
+    """Return the nodes, the player and the arguments; those of integration.launch.py apply too."""
     arguments = [
         DeclareLaunchArgument('bag', description='an .mcap file or a bag folder'),
         DeclareLaunchArgument(
@@ -38,7 +38,7 @@ def generate_launch_description() -> LaunchDescription:
     ]
     nodes = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(
-            PathJoinSubstitution([ThisLaunchFileDir(), 'starcal.launch.py'])
+            PathJoinSubstitution([ThisLaunchFileDir(), 'integration.launch.py'])
         ),
         launch_arguments=[
             (name, LaunchConfiguration(name))

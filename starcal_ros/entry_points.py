@@ -23,7 +23,7 @@ _REMEDY = (
 )
 
 
-_ON_GROUND = ('bag_player',)  # nodes that a vehicle may not have
+_ON_GROUND = ('bag_player', 'setup_finder')  # nodes that a vehicle may not have
 
 
 def _run(name: str) -> int:
@@ -58,6 +58,7 @@ def _run(name: str) -> int:
 star_observer = functools.partial(_run, 'star_observer')
 calibrator = functools.partial(_run, 'calibrator')
 bag_player = functools.partial(_run, 'bag_player')
+setup_finder = functools.partial(_run, 'setup_finder')
 
 if __name__ == '__main__':
     sys.exit(_run(sys.argv.pop(1)))

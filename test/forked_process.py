@@ -20,8 +20,8 @@ FORKSERVER = multiprocessing.get_context('forkserver')
 FORKSERVER.set_forkserver_preload(
     [
         *('starcal_ros.ros.calibrator', 'starcal_ros.ros.star_observer'),
-        *('starcal_ground.ros.bag_player', 'starcal_ground.mission.ingest.recording'),
-        'astropy.io.fits',
+        *('starcal_ground.ros.bag_player', 'starcal_ground.ros.setup_finder'),
+        *('starcal_ground.mission.ingest.recording', 'astropy.io.fits'),
         # What rclpy imports with a first message, of which it takes the C library.
         *('rosidl_generator_py', 'std_msgs.msg', 'type_description_interfaces.msg'),
     ]

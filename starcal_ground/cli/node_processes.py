@@ -28,7 +28,7 @@ Process = subprocess.Popen[bytes]
 RATE = 5.0  # ten images in eight seconds
 _START_S = 30.0  # longest start of the nodes
 _QUIET_S = 10.0  # after the bag was played: no more images come
-_NODES = ('star_observer', 'calibrator')
+_NODES = ('star_observer', 'calibrator', 'setup_finder')
 
 
 class NodeError(StarcalError):

@@ -17,17 +17,17 @@ from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.frames import read_frames, read_telemetry
 from starcal_ground.bags.topics import Topics
-from starcal_ros.assessment.gate import REMEDIES
-from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import BagError, ImageRefused, OptionError
-from starcal_ros.identification.blind.images import LOOKED_AT
-from starcal_ros.pipeline.diagnosis.diagnose import (
+from starcal_ground.blind.images import LOOKED_AT
+from starcal_ground.diagnosis.diagnose import (
     diagnose,
     Diagnosis,
     found_alignment,
     wire_attitudes,
     WireAttitudes,
 )
+from starcal_ros.assessment.gate import REMEDIES
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations

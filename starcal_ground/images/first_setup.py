@@ -239,8 +239,8 @@ def air_of(setup: Setup) -> ThroughAir | None:
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     """Setup of bags with attitudes whose camera is not stated, and sentences on it."""
     from starcal_ground.diagnosis.bags import diagnose_bags
+    from starcal_ground.diagnosis.diagnose import found_alignment
     from starcal_ground.images import from_stars, night_sky  # as in `first_setup`
-    from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 
     if choose_topics(given.paths, given.topics).observations:
         raise OptionError(

@@ -20,6 +20,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.blind import search
+from starcal_ground.blind.bright_sources import bright_sources, BrightSources
+from starcal_ground.blind.images import FEWEST_SOURCES, ImageSearch
+from starcal_ground.blind.search import SkyMatch
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.lens import COEFFICIENTS, ideal_points
@@ -29,10 +33,6 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import State
 from starcal_ros.estimation.search import minimise, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
-from starcal_ros.identification.blind import search
-from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
-from starcal_ros.identification.blind.images import FEWEST_SOURCES, ImageSearch
-from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.catalog import StarCatalog

@@ -20,6 +20,8 @@ import numpy as np
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
+from starcal_ground.blind.bright_sources import bright_sources
+from starcal_ground.blind.images import FEWEST_SOURCES
 from starcal_ground.campaign import calibrate, chosen, observe, Source
 from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.images import from_stars as by_stars
@@ -29,8 +31,6 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.identification.blind.bright_sources import bright_sources
-from starcal_ros.identification.blind.images import FEWEST_SOURCES
 from starcal_ros.pipeline.setup import load_setup, option_groups
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations

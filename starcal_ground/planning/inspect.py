@@ -16,12 +16,12 @@ from starcal_ground.bags import frames, reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.diagnosis import bags
 from starcal_ground.diagnosis.bags import Refused
+from starcal_ground.diagnosis.diagnose import Diagnosis
 from starcal_ground.file_kinds import explained
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import EnsembleStatus, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions

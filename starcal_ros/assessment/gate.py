@@ -604,7 +604,7 @@ REMEDIES: Mapping[str, str] = {
     'not_in_catalog': (
         'raise magnitude_limit, or give starcal catalog a table of this sky (docs/mission.md)'
     ),
-    'no_match': 'ask the diagnostics of the star observer, or starcal diagnose, for the cause',
+    'no_match': 'ask starcal diagnose, or setup_finder beside the nodes, for the cause',
     'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
     # Checks of the gate, with the section of the report.
     'stars left out as outliers': 'look for smeared or misidentified stars (Residuals)',

@@ -160,7 +160,7 @@ class SetupOptions:
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 0.0),
         'prior orientation of the camera in the star tracker frame, a quaternion (x, y, z, w);'
-        ' zeros: found from the first images',
+        ' zeros: not given; star_observer needs it, the tool and setup_finder find it',
         length=4,
         basic=True,
     )

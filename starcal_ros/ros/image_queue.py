@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Images that wait for their attitude or match no star; star trackers, rates and latencies.
+Images that wait for their attitude; star trackers, rates and latencies.
 
 Without messages: rclpy is not imported.
 """
@@ -8,10 +8,9 @@ Without messages: rclpy is not imported.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 import math
-import os
 import threading
 import time
 from typing import Any
@@ -20,18 +19,8 @@ import numpy as np
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.pipeline.diagnosis.diagnose import (
-    diagnose,
-    Diagnosis,
-    IMAGES_OF_AN_ALIGNMENT,
-    wire_attitudes,
-    WireAttitudes,
-)
-from starcal_ros.pipeline.setup import Setup
-from starcal_ros.processes import ChildProcess
-from starcal_ros.records import AttitudeSample, Image
+from starcal_ros.records import AttitudeSample
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 
 # A stamp this far ahead of the next image is wrong: its attitude will never arrive.
 _WRONG_NS = 10 * NANOSECONDS_PER_SECOND
@@ -40,9 +29,6 @@ _MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messa
 _SILENT_S = 2.0  # without a sample: no image waits for more of them for its rate
 _LAGS = 100  # samples from which the delay of a star tracker is learned
 _MORE = 2  # times the longest of them: it has fallen silent
-KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
-DIAGNOSED = 5  # images in a row without a match
-_LOWEST_PRIORITY = 19  # of a diagnosis that no image waits for
 
 
 @dataclass(frozen=True)
@@ -273,109 +259,3 @@ class StarTrackers:
     def _newest_ns(self) -> int | None:
         stamps = [history.latest_ns for history in self.histories]
         return max((stamp for stamp in stamps if stamp is not None), default=None)
-
-
-class Unmatched:
-    """
-    The last images that matched no star, and why they did not.
-
-    After five in a row, then ten, twenty and so on, they are diagnosed in another process; without
-    a prior alignment after each image from the third on.  Safe to use from several threads.
-    """
-
-    def __init__(
-        self, setup: Setup, attitudes: AttitudeHistory, on_answer: Callable[[Diagnosis], None]
-    ) -> None:
-        self._setup, self._attitudes = setup, attitudes
-        self._on_answer = on_answer
-        self._lock = threading.Lock()
-        self._images: deque[Image] = deque(maxlen=KEPT)
-        self._in_a_row = 0
-        self._next = DIAGNOSED if setup.is_aligned else IMAGES_OF_AN_ALIGNMENT
-        self._process: ChildProcess | None = None
-        self._is_closed = False
-        self._thread: threading.Thread | None = None
-        self._diagnosis: Diagnosis | None = None
-
-    @property
-    def diagnosis(self) -> Diagnosis | None:
-        """Why the last images matched nothing; None: not asked yet, or they match again."""
-        with self._lock:
-            return self._diagnosis
-
-    def matched(self) -> None:
-        """Forget the diagnosis: an image matched."""
-        with self._lock:
-            self._in_a_row, self._diagnosis = 0, None
-            self._next = DIAGNOSED
-
-    def add(self, image: Image) -> None:
-        """Keep an image that matched nothing, and have it diagnosed if it is time."""
-        with self._lock:
-            self._images.append(image)
-            self._in_a_row += 1
-            busy = self._thread is not None and self._thread.is_alive()
-            if busy or self._in_a_row < self._next:
-                return
-            self._next = 2 * self._in_a_row if self._setup.is_aligned else self._in_a_row + 1
-            question = (
-                tuple(self._images),
-                wire_attitudes(self._attitudes, self._setup.attitude.attitude_direction),
-                replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
-            )
-            self._thread = threading.Thread(
-                target=self._ask, args=question, name='diagnose', daemon=True
-            )
-            self._thread.start()
-
-    def images(self) -> list[Image]:
-        """Return the images kept, which may be measured again."""
-        with self._lock:
-            return list(self._images)
-
-    def drop(self, images: Sequence[Image]) -> None:
-        """Keep these images no longer."""
-        stamps_ns = {image.time_ns for image in images}
-        with self._lock:
-            kept = [image for image in self._images if image.time_ns not in stamps_ns]
-            self._images.clear()
-            self._images.extend(kept)
-
-    def aligned(self, setup: Setup) -> None:
-        """Go on with the alignment found."""
-        with self._lock:
-            self._setup = setup
-            self._in_a_row, self._diagnosis, self._next = 0, None, DIAGNOSED
-
-    def close(self) -> None:
-        """End a diagnosis under way; there is none after it."""
-        with self._lock:
-            self._is_closed = True
-            if self._process is not None:
-                self._process.kill()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
-
-    def _ask(self, *question: object) -> None:
-        with self._lock:
-            if self._is_closed:
-                return
-            process = self._process = ChildProcess()
-        try:
-            diagnosis = process.call(_answer, *question)
-        except Exception:  # whatever it is, the node goes on
-            return
-        finally:
-            process.end()
-        with self._lock:
-            if not self._in_a_row:
-                return  # images match again
-            self._diagnosis = diagnosis
-        self._on_answer(diagnosis)
-
-
-def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -> Diagnosis:
-    """Diagnose in a process of its own."""
-    if setup.is_aligned:  # else all images wait for the answer
-        os.nice(_LOWEST_PRIORITY)
-    return diagnose(images, attitudes, setup)

@@ -238,11 +238,10 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         frames, camera = self._setup.frames, self._setup.prior.camera
         width_deg = math.degrees(2 * math.atan(camera.width / 2 / float(camera.parameters[0])))
         alignment = [round(number, 6) for number in frames.prior_alignment]
-        unknown = 'not given: found from the images'
         return (
             f'prior camera {frames.camera_info_url}: {camera.width} x {camera.height},'
             f' {width_deg:.1f} degrees wide; prior_alignment'
-            f' {alignment if self._setup.is_aligned else unknown}'
+            f' {alignment if self._setup.is_aligned else "not given"}'
         )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:

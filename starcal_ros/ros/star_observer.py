@@ -15,7 +15,6 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, QuaternionStamped, TransformStamped, TwistStamped
-import numpy as np
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, Temperature
 from sensor_msgs.msg import Image as ImageMessage
@@ -24,11 +23,10 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import ImageRefused
+from starcal_ros.errors import ImageRefused, OptionError
 from starcal_ros.formats.messages import message_codec, record_messages, sensor_messages
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import annotation, observe, setup
-from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -36,7 +34,7 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
-from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Unmatched, Waiting
+from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
 from starcal_ros.sky.attitude import attitude_sample
@@ -50,6 +48,7 @@ _SAMPLES = QoSProfile(depth=2000)
 _STAMP_NS = operator.itemgetter(0)
 _DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
 _HISTORY_S = 3600.0  # of attitudes: 2 MB at 10 Hz; images come later only from a recorder
+_KEPT = 5  # images that matched nothing: 50 MB of 5 megapixels and 16 bit
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
 
 
@@ -62,7 +61,6 @@ class StarObserver(StarcalNode):
 
     # By `activate`, before the callbacks that use them.
     _queue: ImageQueue
-    _unmatched: Unmatched
 
     def __init__(self) -> None:
         super().__init__(NAME)
@@ -74,6 +72,11 @@ class StarObserver(StarcalNode):
         self._own = from_mapping(setup.ObserverOptions, values)
         self._setup = setup.load_setup(values)
         setup.check_site(self._setup.site)
+        if not self._setup.is_aligned:
+            raise OptionError(
+                'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'
+                ' setup_finder beside the camera'
+            )
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
         self._observations = self.publisher(
@@ -95,7 +98,9 @@ class StarObserver(StarcalNode):
             self._setup.attitude.max_attitude_gap_s,
             self._own.attitude_timeout_s,
         )
-        # By the stamps of images that matched nothing: the star trackers awaited then.
+        # The last images that matched nothing, which a calibration or an attitude may mend.
+        self._unmatched: deque[Image] = deque(maxlen=_KEPT)
+        # By the stamps of these: the star trackers awaited then.
         self._awaiting: dict[int, frozenset[int]] = {}
         self._track = observe.Track(self._geometry)
         self._predicted_from = self._geometry
@@ -105,9 +110,6 @@ class StarObserver(StarcalNode):
         self._restarts = self._retried = self._retried_used = 0
         self._last_refusal = self._bad_velocity = ''
         self._velocities_left_out = 0
-        first = self._star_trackers.histories[0]
-        on_diagnosis = functools.partial(self._in_worker, self._on_diagnosis)
-        self._unmatched = Unmatched(self._setup, first, on_diagnosis)
         self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
             _IMAGES, self._own.attitude_timeout_s, self._star_trackers.has_come
@@ -138,11 +140,9 @@ class StarObserver(StarcalNode):
         self._queue.close()
         self._worker.join()
         self._worker = None
-        self._unmatched.close()
 
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
-        why = self._unmatched.diagnosis
         counts = dict(self._counts)  # the worker thread continues counting
         unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
         not_used = [f'{name or first}: {tracker.images}' for name, tracker in unfit.items()]
@@ -162,13 +162,10 @@ class StarObserver(StarcalNode):
             'restarts': self._restarts,
             'retried': self._retried,
             'retried_used': self._retried_used,
-            'diagnosis': 'none' if why is None else why.cause,
             'calibration': self._calibration_number or 'prior',
             'listeners': self._observations.get_subscription_count(),
             **{f'refused_{reason}': counts.get(reason, 0) for reason in sorted(IMAGE_REFUSALS)},
         }
-        if why is not None:
-            return WARN, f'no image matches: {why.in_a_sentence()}', numbers
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
         if why_not := [tracker.why for tracker in unfit.values() if tracker.why]:
@@ -314,29 +311,19 @@ class StarObserver(StarcalNode):
         if self._geometry is not self._predicted_from:
             self._predicted_from = self._geometry
             self._track = dataclasses.replace(self._track, geometry=self._geometry)
-        if not self._setup.is_aligned and self._geometry is self._setup.prior:
-            self._unmatched.add(image)
-            detail = 'prior_alignment is not given: it is being found from the images'
-            self._publish(self._refused(waiting, 'no_match', detail))
-            return
         before = self._track
         # Asked first: an attitude that comes during the measurement was awaited.
         awaited = self._star_trackers.awaited(image.time_ns)
         observations, self._track = self._observe_next(image, before)
-        why = self._unmatched.diagnosis
-        if why is not None and why.cause != 'unknown' and observations.refusal == 'no_match':
-            observations = dataclasses.replace(observations, detail=why.in_a_sentence())
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
             self.get_logger().warning('image stamps went back: restarted the sequence')
         self._publish(observations)
         if observations.refusal == 'no_match':
-            self._unmatched.add(image)
+            self._unmatched.append(image)
             if awaited:
                 self._awaiting[image.time_ns] = awaited
                 self._measure_awaiting()
-        elif not observations.refusal:
-            self._unmatched.matched()
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations, before.geometry)
 
@@ -358,42 +345,31 @@ class StarObserver(StarcalNode):
             more,
         )
 
-    def _on_diagnosis(self, diagnosis: Diagnosis) -> None:
-        """Log why images match nothing; without a prior alignment, take the one found."""
-        if self._setup.is_aligned:
-            self.get_logger().warning(f'no image matches: {diagnosis.in_a_sentence()}')
-            self.publish_health()
-            return
-        values, sentence = found_alignment(diagnosis)
-        if values is None:
-            self.get_logger().warning(f'prior_alignment is not given, and not found: {sentence}')
-            return
-        is_prior = self._geometry is self._setup.prior
-        self._setup = setup.aligned(self._setup, np.array(values))
-        self._unmatched.aligned(self._setup)
-        self.get_logger().info(sentence)
-        if is_prior:
-            self._geometry = self._setup.prior
-            self._measure_again()
-
     def _measure_again(self) -> None:
-        """Measure the images that matched nothing, with the calibration or alignment found."""
-        images = self._unmatched.images()
-        self._retry(images)
-        self._unmatched.drop(images)
+        """Measure the images that matched nothing with the calibration that became active."""
+        self._retry(list(self._unmatched))
+        self._unmatched.clear()
 
     def _measure_awaiting(self) -> None:
         """Measure the images that matched nothing and whose awaited attitude has come."""
-        images = self._unmatched.images()
-        kept = {image.time_ns for image in images}
-        before = {stamp: which for stamp, which in self._awaiting.items() if stamp in kept}
+        before = {
+            image.time_ns: self._awaiting[image.time_ns]
+            for image in self._unmatched
+            if image.time_ns in self._awaiting
+        }
         now = {stamp: self._star_trackers.awaited(stamp) for stamp in before}
-        images = [image for image in images if now.get(image.time_ns) != before.get(image.time_ns)]
         self._awaiting = {stamp: which for stamp, which in now.items() if which}
-        # The others are kept for a diagnosis, a calibration or an alignment.
-        if used := self._retry(images):
-            self._unmatched.drop(used)
-            self._unmatched.matched()
+        # The others are kept for a calibration.
+        used = self._retry(
+            [
+                image
+                for image in self._unmatched
+                if now.get(image.time_ns) != before.get(image.time_ns)
+            ]
+        )
+        stamps_ns = {image.time_ns for image in used}
+        kept = [image for image in self._unmatched if image.time_ns not in stamps_ns]
+        self._unmatched = deque(kept, _KEPT)
 
     def _retry(self, images: Sequence[Image]) -> list[Image]:
         """Measure images again that matched nothing; return those that are used."""

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-import dataclasses
 from pathlib import Path
 import threading
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -18,12 +16,8 @@ pytest.importorskip('starcal.msg')
 from geometry_msgs.msg import TwistStamped
 from node_inputs import in_this_process  # type: ignore[import-not-found]
 
-from starcal_ground.bags import reader
-from starcal_ros.formats.bag.typestore import typestore
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
-from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
-from starcal_ros.ros.image_queue import Waiting
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
 
@@ -72,27 +66,3 @@ def test_the_first_image_awaits_a_velocity_that_has_a_publisher(
     message.header.frame_id = 'icrf'
     observer.taking(observer._on_velocity)(message)
     assert observer._is_told()
-
-
-def test_a_refusal_has_the_cause_once_it_is_known(observer: StarObserver, tiny_bag: Path) -> None:
-    """The calibrator answers with the detail of the last refusal."""
-    topics = {topic.type_name: topic.name for topic in reader.topics([tiny_bag])}
-    of_images = topics.pop('sensor_msgs/msg/Image')
-    images = []
-    for raw in reader.read_raw([tiny_bag], [of_images, *topics.values()]):
-        message = reader.decode(raw)
-        if raw.topic == of_images:
-            images.append((raw, message))
-        elif hasattr(message, 'quaternion'):
-            observer._on_attitude(message)
-    raw, first = images[0]
-    pixels = np.asarray(first.data).reshape(first.height, -1, 2)[:, ::-1]
-    mirrored = dataclasses.replace(first, data=pixels.ravel())
-    view = typestore().serialize_cdr(mirrored, raw.type_name)
-    waiting = Waiting(0, 0, 0, dataclasses.replace(raw, view=memoryview(view)), 0.0)
-    observer._measure(waiting)
-    assert observer._last_refusal.startswith('no_match: ') and 'chance' in observer._last_refusal
-    observer._unmatched._diagnosis = Diagnosis('mirrored', 1, 'The image is mirrored.')
-    observer._track = dataclasses.replace(observer._track, latest_ns=None)
-    observer._measure(waiting)
-    assert observer._last_refusal.startswith('no_match: The image is mirrored.')

@@ -200,7 +200,7 @@ REFUSED = {
     'none': ([], '', False),
     'cause': (
         [('no_match', '23 star-like sources'), ('no_match', 'The images are mirrored.')],
-        '; 2 images refused as no_match: The images are mirrored; ask the diagnostics of the star',
+        '; 2 images refused as no_match: The images are mirrored; ask starcal diagnose, or',
         True,
     ),
     'most': (

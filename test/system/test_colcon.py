@@ -122,7 +122,9 @@ def test_imports_come_from_the_install_space(workspace: Path) -> None:
 def test_everything_is_installed_that_the_package_reads(workspace: Path) -> None:
     prefix = workspace / 'install' / 'starcal'
     executables = {path.name for path in (prefix / 'lib' / 'starcal').iterdir()}
-    assert executables == {'starcal', 'star_observer', 'calibrator', 'bag_player'}
+    assert executables == {
+        *('starcal', 'star_observer', 'calibrator', 'bag_player', 'setup_finder')
+    }
     for folder in INSTALLED:
         there = {path.name for path in (prefix / 'share/starcal' / folder).iterdir()}
         assert there == {path.name for path in (ROOT / folder).iterdir()} - {'__pycache__'}

@@ -33,7 +33,7 @@ def test_a_calibration_does_not_wait_for_what_it_seldom_needs() -> None:
     done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert 'scipy.special' in loaded and 'starcal_ros.pipeline.solve' in loaded
-    seldom = {'scipy.stats', 'starcal_ros.identification.blind.search'}
+    seldom = {'scipy.stats', 'starcal_ground.blind.search'}
     assert not loaded & seldom
 
 

@@ -210,7 +210,7 @@ def test_types_and_definitions_are_installed(flight_install: Path) -> None:
 @pytest.mark.nodes
 def test_the_nodes_import_nothing_of_the_extras() -> None:
     pytest.importorskip('rclpy')
-    nodes = ('star_observer', 'calibrator', 'bag_player')
+    nodes = ('star_observer', 'calibrator', 'bag_player', 'setup_finder')
     source = '; '.join(f'import starcal_ros.ros.{node}' for node in nodes)
     source += '; import sys; print(*sys.modules)'
     done = run(sys.executable, '-c', source, cwd=ROOT)

@@ -44,12 +44,19 @@ def constants(node: ast.AST) -> list[Any]:
 
 
 def declared(path: Path) -> set[str]:
-    """Declared arguments of a launch file."""
-    return {
+    """Declared arguments of a launch file, those of the files that it includes among them."""
+    own = {
         str(call.args[0].value)
         for call in calls(path, 'DeclareLaunchArgument')
         if isinstance(call.args[0], ast.Constant)
     }
+    return own.union(*map(declared, included(path)))
+
+
+def included(path: Path) -> list[Path]:
+    """Launch files that one includes."""
+    words = [word for call in calls(path, 'IncludeLaunchDescription') for word in constants(call)]
+    return [path.with_name(word) for word in words if str(word).endswith('.launch.py')]
 
 
 def used(path: Path) -> set[str]:
@@ -117,7 +124,8 @@ def test_topics_are_inputs_of_the_star_observer() -> None:
 def test_replay_hands_on_what_starcal_takes() -> None:
     path = ROOT / 'launch' / 'replay.launch.py'
     (include,) = calls(path, 'IncludeLaunchDescription')
-    assert 'starcal.launch.py' in constants(include)
+    (integration,) = included(path)
+    assert [file.name for file in included(integration)] == ['starcal.launch.py']
     (handed,) = (node for node in ast.walk(include) if isinstance(node, ast.ListComp))
     names = set(constants(handed.generators[0].iter))
     assert 'params_file' in names

@@ -279,7 +279,7 @@ def test_policies_are_enforced(make: Make, tiny_bag: Path, tmp_path: Path) -> No
     keys = tmp_path / 'keys'
     outsider = make(CYCLONE)
     policies = {path.name.partition('.')[0]: path for path in SECURITY.glob('*.policy.xml')}
-    assert set(policies) == {'star_observer', 'calibrator', 'bag_player'}
+    assert set(policies) == {*('star_observer', 'calibrator', 'bag_player', 'setup_finder')}
     policies['operator'] = tmp_path / 'operator.policy.xml'
     policies['operator'].write_text(OPERATOR)
     done(outsider.run('security', 'create_keystore', keys))

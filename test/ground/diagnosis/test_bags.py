@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import Topics
 from starcal_ground.diagnosis.bags import aligned_by_bags
+from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment, wire_attitudes
+from starcal_ground.ros.setup_finder import Unmatched
 from starcal_ros.errors import OptionError
-from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment, wire_attitudes
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image
-from starcal_ros.ros.image_queue import Unmatched
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.blind.search import SkyMatch
 from starcal_ground.cli.main import main
 from starcal_ground.images.from_stars import _of_one_lens, from_stars, FromStars, ideal_camera
 from starcal_ground.images.night_sky import (
@@ -35,7 +36,6 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Image, refused_image
 from starcal_ros.sky.astrometry import SiteOptions

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import find_sky
 from bench.narrow import scenario_of
+from starcal_ground.blind.bright_sources import bright_sources
+from starcal_ground.blind.pattern_index import pattern_index
+from starcal_ground.blind.search import SkyMatch
 from starcal_ground.simulation.rendering import render
 from starcal_ground.simulation.scenario import Scenario, scenario, Scene, scene
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.blind.bright_sources import bright_sources
-from starcal_ros.identification.blind.pattern_index import pattern_index
-from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.identification.star_finder import (
     Exposure,
     IdentificationOptions,

@@ -10,7 +10,7 @@ from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ground.cli import main
-from starcal_ros.pipeline.diagnosis.diagnose import CAUSES
+from starcal_ground.diagnosis.diagnose import CAUSES
 
 
 @pytest.fixture

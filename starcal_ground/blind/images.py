@@ -19,12 +19,12 @@ import time
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.blind import search
+from starcal_ground.blind.bright_sources import bright_sources, BrightSources, smear
+from starcal_ground.blind.search import SkyMatch
+from starcal_ground.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.identification.blind import search
-from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources, smear
-from starcal_ros.identification.blind.search import SkyMatch
-from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 from starcal_ros.stars.streak import LONGEST_PX

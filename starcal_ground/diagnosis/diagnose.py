@@ -19,11 +19,11 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.blind.bright_sources import LONGEST_STREAK_PX, smear
+from starcal_ground.blind.images import Identified, identify_images, Solved
 from starcal_ros.arrays import Floats, Integers, Mask
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
-from starcal_ros.identification.blind.images import Identified, identify_images, Solved
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Image

@@ -18,11 +18,11 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from starcal_ground.bags import reader
+from starcal_ground.diagnosis.diagnose import CAUSES, diagnose, Diagnosis, WireAttitudes
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.camera import CameraModel
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
-from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis, WireAttitudes
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.sky.attitude import AttitudeOptions
@@ -30,7 +30,7 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 pytestmark = pytest.mark.slow
 
-GRANASAT = Path(__file__).parents[5] / 'shared' / 'realsky' / 'granasat'
+GRANASAT = Path(__file__).parents[4] / 'shared' / 'realsky' / 'granasat'
 START_NS = 1778829600_000000000
 NO_ATTITUDES = WireAttitudes(np.empty(0, np.int64), np.empty((0, 4)))
 
@@ -444,7 +444,7 @@ def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
 def test_images_of_another_size_are_named_with_their_remedy(
     shape: tuple[int, int], words: str, remedy: str
 ) -> None:
-    setup = read_setup(Path(__file__).parents[4] / 'bags' / 'tiny' / 'params.yaml')
+    setup = read_setup(Path(__file__).parents[3] / 'bags' / 'tiny' / 'params.yaml')
     pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)
     found = diagnose([Image(k, pixels) for k in range(3)], NO_ATTITUDES, setup)
     assert words in found.sentence and remedy in found.mend[0]

@@ -13,9 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import camera, find_sky, Frame, frames
-from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.identification.blind.pattern_index import (
+from starcal_ground.blind.pattern_index import (
     _SPACING,
     _STARS,
     equal_patterns,
@@ -26,7 +24,7 @@ from starcal_ros.identification.blind.pattern_index import (
     patterns_of,
     sphere_points,
 )
-from starcal_ros.identification.blind.search import (
+from starcal_ground.blind.search import (
     confirm_sky,
     find_in_any,
     matched_again,
@@ -34,7 +32,7 @@ from starcal_ros.identification.blind.search import (
     mirrored_camera,
     SkyMatch,
 )
-from starcal_ros.identification.blind.sky_fit import (
+from starcal_ground.blind.sky_fit import (
     _chance_of_order,
     FOUND,
     mutual,
@@ -42,6 +40,8 @@ from starcal_ros.identification.blind.sky_fit import (
     SourceImage,
     STATED,
 )
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 

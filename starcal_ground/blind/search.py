@@ -23,11 +23,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.blind import pattern_index, sky_fit
+from starcal_ground.blind.pattern_index import PATTERN, Patterns, patterns_of
+from starcal_ground.blind.sky_fit import FOUND, Ranges, SkyFit, SourceImage, STATED
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.identification.blind import pattern_index, sky_fit
-from starcal_ros.identification.blind.pattern_index import PATTERN, Patterns, patterns_of
-from starcal_ros.identification.blind.sky_fit import FOUND, Ranges, SkyFit, SourceImage, STATED
 from starcal_ros.sky.catalog import direction_tree, StarCatalog
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches

@@ -1,0 +1,102 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The setup finder beside a star observer: a wrong set-up, and an alignment that is not given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import yaml
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from geometry_msgs.msg import QuaternionStamped
+from node_inputs import ATTITUDES, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+from sensor_msgs.msg import Image
+
+from starcal.msg import SetupDiagnosis
+from starcal_ground.bags import reader
+
+pytestmark = pytest.mark.nodes
+
+ZEROS = 'prior_alignment:=[0.0, 0.0, 0.0, 0.0]'
+
+
+def play(client: Client, bag: Path, nodes: int = 2) -> None:
+    """Publish the attitudes of a bag, then its images, to a number of nodes."""
+    images = client.publisher(Image, IMAGES, 20)
+    attitudes = client.publisher(QuaternionStamped, ATTITUDES)
+    for publisher in (images, attitudes):
+        client.until(lambda publisher=publisher: publisher.get_subscription_count() == nodes)
+    for sample in reader.read_raw([bag], [ATTITUDES]):
+        attitudes.publish(sample.data)
+    for image in reader.read_raw([bag], [IMAGES]):
+        images.publish(image.data)
+
+
+def test_five_images_without_a_match_are_diagnosed(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    wrong = parameters(tiny_bag, 'attitude_direction:=inertial_to_st')
+    for name in ('star_observer', 'setup_finder'):
+        start_node(name, ros=(*wrong, *REMAPS))
+        client.until(lambda name=name: client.health(name)[1] == 'waiting for images')
+    said = client.latched(SetupDiagnosis, 'setup_diagnosis')
+    play(client, tiny_bag)
+    client.until(lambda: said)
+    assert said[0].cause == 'attitude_direction'
+    assert said[0].parameters == ['attitude_direction: st_to_inertial']
+    client.until_value('diagnosis', 'attitude_direction', 'setup_finder')
+    level, text, values = client.health('setup_finder')
+    assert level == b'\x01' and 'Set attitude_direction: st_to_inertial.' in text
+    assert (values['diagnosis'], values['callback_errors']) == ('attitude_direction', '0')
+    client.until_value('refused_no_match', '10')
+
+
+def test_an_alignment_not_given_is_found(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """The star observer does not start without one, and names the two ways to find it."""
+    observer = start_node('star_observer', ros=(*parameters(tiny_bag, ZEROS), *REMAPS))
+    assert observer.wait() == 2
+    refusal = 'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'
+    assert f'{refusal} setup_finder beside the camera' in observer.said()
+    assert 'Traceback' not in observer.said()
+    finder = start_node('setup_finder', ros=(*parameters(tiny_bag, ZEROS), *REMAPS))
+    client.until(lambda: client.health('setup_finder')[1].endswith('waiting for images'))
+    said = client.latched(SetupDiagnosis, 'setup_diagnosis')
+    play(client, tiny_bag, nodes=1)
+    client.until(lambda: any(one.cause == 'prior_alignment' for one in said))
+    (line,) = said[-1].parameters
+    found = yaml.safe_load(line)['prior_alignment']
+    given = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    # The stars of one image show its rotation to some arcseconds, the star tracker errs by 10.
+    turn = abs(np.dot(found, given['prior_alignment']))
+    assert 2.0 * np.arccos(min(turn, 1.0)) < np.radians(1.0)
+    client.until(lambda: f'Set prior_alignment: {found}' in finder.said())
+
+
+def test_images_that_match_again_withdraw_the_diagnosis(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    wrong = parameters(tiny_bag, 'attitude_direction:=inertial_to_st')
+    observer = start_node('star_observer', ros=(*wrong, *REMAPS))
+    start_node('setup_finder', ros=(*parameters(tiny_bag), *REMAPS))
+    for name in ('star_observer', 'setup_finder'):
+        client.until(lambda name=name: client.health(name)[1] == 'waiting for images')
+    said = client.latched(SetupDiagnosis, 'setup_diagnosis')
+    play(client, tiny_bag)
+    client.until(lambda: said)
+    observer.stop()
+    again = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    client.until(lambda: client.health()[1] == 'waiting for images')
+    play(client, tiny_bag)
+    client.until(lambda: said[-1].cause == 'none')
+    client.until(lambda: client.health('setup_finder')[1] == 'images match')
+    assert 'Traceback' not in again.said()
