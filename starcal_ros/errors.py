@@ -18,7 +18,6 @@ import sys
 # Modules of the extras in setup.cfg.
 _OF_EXTRAS = (
     'astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'rawpy', 'spiceypy',
-    'weasyprint',
 )  # fmt: skip
 _OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
 # Of the plain install, by their names in PyPI: rosdep brings none of them.

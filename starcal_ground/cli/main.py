@@ -151,8 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        extra = 'pdf' if error.name == 'weasyprint' else 'mission'
-        return arguments.complain(missing_package(error, extra))
+        return arguments.complain(missing_package(error, 'mission'))
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:

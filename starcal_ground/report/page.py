@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import functools
 import json
-import logging
 from pathlib import Path
 
 import cv2
@@ -161,9 +160,6 @@ def used_images(
         for t in thumbnails
         if not t.is_expected and t.time_ns in stars
     ]
-
-
-PDF_FILE = 'report.pdf'
 
 
 @dataclass(frozen=True)
@@ -403,25 +399,3 @@ def page_template(name: str) -> jinja2.Template:
     )
     environment.filters['significant'] = significant
     return environment.get_template(name)
-
-
-def write_pdf(page: Path) -> Path:
-    """
-    Write the pages of a report beside it and return their path.
-
-    Raises ProductError when the libraries that draw the letters are missing, or the file cannot be
-    written.
-    """
-    try:
-        import weasyprint
-    except OSError as error:
-        raise ProductError(
-            f'{PDF_FILE}: the library Pango is missing ({str(error).splitlines()[0]}): '
-            'apt install libpango-1.0-0 libpangoft2-1.0-0'
-        ) from error
-    logging.getLogger('weasyprint').setLevel(logging.ERROR)  # styles of the screen alone
-    within_page = weasyprint.URLFetcher(allowed_protocols=('data',))
-    document = weasyprint.HTML(string=svg.light(page.read_text()), url_fetcher=within_page)
-    path = page.with_name(PDF_FILE)
-    product_files.write_atomically(path, document.write_pdf())
-    return path

@@ -3,11 +3,11 @@
 Rewrite report.html of a calibration.
 
 Makes one page from the files of a folder: gate verdict, parameters, residuals, uncertainties,
-refused images and stars. The page needs no network. --pdf writes it as numbered pages with a block
-for signatures (extra pdf).
+refused images and stars. The page needs no network. A browser prints it as numbered pages with a
+block for signatures.
 
-  # from the files of an earlier calibration, with pages to sign
-  starcal report out --pdf
+  # from the files of an earlier calibration
+  starcal report out
   # of the last calibration of a calibrator, from its state_dir
   starcal report state
 """
@@ -20,18 +20,12 @@ from starcal_ground.cli import arguments, terminal
 def add_arguments(command: argparse.ArgumentParser) -> None:
     what = 'folder with the products of starcal calibrate, or the state_dir of a calibrator'
     command.add_argument('folder', type=arguments.path, metavar='DIR', help=what)
-    what = 'write report.pdf too, to print and sign'
-    command.add_argument('--pdf', action='store_true', help=what)
 
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.products import check_outputs, REPORT_FILE
     from starcal_ground.report import page
 
-    names = (REPORT_FILE, page.PDF_FILE) if args.pdf else (REPORT_FILE,)
-    check_outputs(args.folder / name for name in names)
-    written = page.write_report(args.folder)
-    terminal.print_text(f'report written to {written}')
-    if args.pdf:
-        terminal.print_text(f'report written to {page.write_pdf(written)}')
+    check_outputs([args.folder / REPORT_FILE])
+    terminal.print_text(f'report written to {page.write_report(args.folder)}')
     return arguments.EXIT_ACCEPTED

@@ -1,9 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-CCSDS attitude and orbit ephemerides (AEM, OEM), KVN or XML.
+CCSDS attitude and orbit ephemerides (AEM, OEM) in KVN.
 
-Sources: CCSDS 504.0-B-1 and B-2 (AEM 1.0 and 2.0), 502.0-B-1 to B-3 (OEM 1.0 to 3.0), 505.0-B
-(XML).  A quaternion A to B of an AEM is a frame transformation: it converts coordinates in A to
+Sources: CCSDS 504.0-B-1 and B-2 (AEM 1.0 and 2.0), 502.0-B-1 to B-3 (OEM 1.0 to 3.0).
+A quaternion A to B of an AEM is a frame transformation: it converts coordinates in A to
 coordinates in B.  Read as a rotation operator, as in ROS and in starcal, the same numbers convert
 coordinates in B to coordinates in A.  AEM 1.0 has keywords for direction and order of its
 quaternions; in AEM 2.0 they are A to B, scalar last.  A keyword that the version does not define
@@ -12,13 +12,11 @@ is refused: it may change the meaning of the numbers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-import io
 from pathlib import Path
 import re
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import erfa
 import numpy as np
@@ -42,7 +40,7 @@ _STATE_NUMBERS = (6, 9)  # position and velocity, without and with acceleration
 
 
 def is_ccsds(path: Path) -> bool:
-    """True if a file begins as a CCSDS message in KVN, or as XML."""
+    """True if a file begins as a CCSDS message in KVN, or as XML, to be refused as such."""
     start = mission_records.start_of(path).removeprefix(b'\xef\xbb\xbf')
     return start.lstrip().startswith(b'<') or _KVN.search(start) is not None
 
@@ -149,8 +147,6 @@ def _quaternions(segment: Segment) -> tuple[Floats, bool]:
     count = _TYPES[segment.version].get(kind)
     if count is None:
         raise ValueError(f'attitudes of type {kind}, not QUATERNION: convert them')
-    if segment.is_xml:
-        return _numbers(segment, (4,)), is_a_to_b
     values = _numbers(segment, (count,))[:, :4]
     if is_old and _keyword(segment, 'QUATERNION_TYPE', 'FIRST', 'LAST') == 'FIRST':
         values = np.roll(values, -1, axis=1)
@@ -227,12 +223,10 @@ _KEYWORDS = {
 
 
 class _Layout(NamedTuple):
-    """Sections of a message in KVN, and the element and units of a state in XML."""
+    """Sections of a message, and the one that it ends in."""
 
     steps: Mapping[tuple[str, str], str]
     end: str
-    state: str
-    units: Mapping[str, str]
 
 
 _LAYOUTS = {
@@ -244,8 +238,6 @@ _LAYOUTS = {
             ('data', 'DATA_STOP'): 'header',
         },
         'header',
-        'attitudeState',
-        dict.fromkeys(('Q1', 'Q2', 'Q3', 'QC'), ''),
     ),
     'OEM': _Layout(
         {
@@ -256,8 +248,6 @@ _LAYOUTS = {
             ('data', 'META_START'): 'metadata',
         },
         'data',
-        'stateVector',
-        {'X': 'km', 'Y': 'km', 'Z': 'km', 'X_DOT': 'km/s', 'Y_DOT': 'km/s', 'Z_DOT': 'km/s'},
     ),
 }
 
@@ -267,12 +257,10 @@ class Segment:
     """
     Segment of a message.
 
-    ``values`` has one row for each of ``epochs``.  In XML numbers are named: they are Q1, Q2, Q3,
-    QC or X, Y, Z, X_DOT, Y_DOT, Z_DOT.  In KVN they are those of the line.
+    ``values`` has one row for each of ``epochs``: the numbers of its line.
     """
 
     version: str
-    is_xml: bool
     metadata: dict[str, str] = field(default_factory=dict)
     epochs: list[str] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
@@ -294,15 +282,14 @@ def read_segments(path: Path, kind: str) -> list[Segment]:
     text = mission_records.text_of(path)
     try:
         if text.lstrip().startswith('<'):
-            segments = list(_xml_segments(text, kind))
-        else:
-            segments = _kvn_segments(text, kind)
+            raise ValueError(
+                'it is XML: convert it to KVN (the package ccsds-ndm does)'
+            )
+        segments = _kvn_segments(text, kind)
         if not segments:
             raise ValueError('no segment')
         for segment in segments:
             _check(segment, kind)
-    except ElementTree.ParseError as error:
-        raise IngestError(f'{path}: not XML: {error}') from error
     except ValueError as error:
         raise IngestError(f'{path}: not readable as CCSDS {kind}: {error}') from error
     return segments
@@ -333,7 +320,7 @@ def _kvn_segments(text: str, kind: str) -> list[Segment]:
         if after:
             section = after
             if line == 'META_START':
-                segments.append(Segment(version[2], is_xml=False))
+                segments.append(Segment(version[2]))
             continue
         try:
             _kvn_line(section, line, segments)
@@ -355,47 +342,3 @@ def _kvn_line(section: str, line: str, segments: list[Segment]) -> None:
             raise ValueError(f'{line[:60]!r} is out of place')
         if section == 'metadata':
             segments[-1].add_keyword(key.strip(), value.strip())
-
-
-def _xml_segments(text: str, kind: str) -> Iterator[Segment]:
-    # A few lines of nested entities expand to gigabytes, and an entity can name another file.
-    if '<!DOCTYPE' in text or '<!ENTITY' in text:
-        raise ValueError('a document type definition is not read; remove it')
-    layout = _LAYOUTS[kind]
-    version = ''
-    messages: list[str] = []  # of a combined instantiation, in their order
-    segment = Segment('', is_xml=True)
-    for event, element in ElementTree.iterparse(io.StringIO(text), ('start', 'end')):
-        tag = element.tag.rpartition('}')[2]
-        if event == 'start':
-            if element.get('id', '').startswith('CCSDS_'):
-                messages.append(tag.upper())
-                version = element.get('version', '')
-            elif tag == 'segment':
-                segment = Segment(version, is_xml=True)
-        elif messages[-1:] != [kind]:
-            continue
-        elif tag == 'metadata':
-            for child in element:
-                if child.tag != 'COMMENT':
-                    segment.add_keyword(child.tag, (child.text or '').strip())
-        elif tag == layout.state:
-            _add_state(segment, element, layout.units)
-            element.clear()
-        elif tag == 'segment':
-            yield segment
-            element.clear()
-    if kind not in messages:
-        raise ValueError(f'the message is {" and ".join(messages) or "not a CCSDS message"}')
-
-
-def _add_state(segment: Segment, state: ElementTree.Element, units: Mapping[str, str]) -> None:
-    children = {child.tag: child for child in state.iter()}
-    missing = [name for name in ('EPOCH', *units) if name not in children]
-    if missing:
-        raise ValueError(f'a {state.tag} of {list(children)[1]} has no {missing[0]}')
-    for name, unit in units.items():
-        if children[name].get('units', unit) != unit:
-            raise ValueError(f'{name} in {children[name].get("units")}, not in {unit}')
-    segment.values.append(tuple(float(children[name].text or '') for name in units))
-    segment.epochs.append((children['EPOCH'].text or '').strip())

@@ -61,29 +61,6 @@ def aem(
     )
 
 
-def aem_xml(version: str, keywords: str, element: str, numbers: str, start: str = '') -> str:
-    names = zip(('Q1', 'Q2', 'Q3', 'QC'), numbers.split(), strict=True)
-    quaternion = ''.join(f'<{name}>{value}</{name}>' for name, value in names)
-    states = ''.join(
-        f'<attitudeState><{element}><EPOCH>{time}</EPOCH><quaternion>{quaternion}</quaternion>'
-        f'<angVel><ANGVEL_X>0.1</ANGVEL_X></angVel></{element}></attitudeState>'
-        for time in T
-    )
-    return (
-        f'<?xml version="1.0" encoding="UTF-8"?>\n{start}<aem id="CCSDS_AEM_VERS" '
-        f'version="{version}"><header><ORIGINATOR>TEST</ORIGINATOR></header><body><segment>'
-        '<metadata><COMMENT>one</COMMENT><COMMENT>two</COMMENT><REF_FRAME_A>ICRF</REF_FRAME_A>'
-        '<REF_FRAME_B>ST_1</REF_FRAME_B><TIME_SYSTEM>UTC</TIME_SYSTEM>'
-        f'{keywords}</metadata><data>{states}</data></segment></body></aem>\n'
-    )
-
-
-XML_2 = '<ATTITUDE_TYPE>QUATERNION/ANGVEL</ATTITUDE_TYPE><ANGVEL_FRAME>ST_1</ANGVEL_FRAME>'
-XML_1 = (
-    '<ATTITUDE_DIR>B2A</ATTITUDE_DIR><ATTITUDE_TYPE>QUATERNION/DERIVATIVE</ATTITUDE_TYPE>'
-    '<QUATERNION_TYPE>FIRST</QUATERNION_TYPE>'
-)
-APM = '<apm id="CCSDS_APM_VERS" version="2.0"><body><segment/></body></apm>'
 GMAT = {'CENTER_NAME': 'Earth', 'INTERPOLATION_METHOD': 'Linear', 'INTERPOLATION_DEGREE': '7'}
 TO_ICRF = {'REF_FRAME_A': 'SC_BODY_1', 'REF_FRAME_B': 'J2000', 'ANGVEL_FRAME': 'REF_FRAME_B'}
 
@@ -104,12 +81,6 @@ ATTITUDES = {
     'orekit times': aem('1.0', {}, times=('2026-135T07:20:00.0Z', '2026-135T07:20:10Z'),
                         head='COMMENT one\nCREATION_DATE = 2026-135T00:00:00\n')
     .replace('DATA_START\n', 'DATA_START\nCOMMENT from a filter\n   '),
-    # 505.0-B: numbers are named, so QUATERNION_TYPE does not order them.
-    'orekit xml': aem_xml('1.0', XML_1, 'quaternionDerivative', BACKWARD),
-    'blue book xml': aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD),
-    'long comment': aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD, f'<!-- {"x" * 5000} -->'),
-    # A combined instantiation holds several messages.
-    'ndm': aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD, f'<ndm>{APM}') + f'{APM}</ndm>',
     # Tests of gmat-run have both: a byte-order mark and CR LF are no part of the text.
     'byte-order mark': '\ufeff' + aem('1.0', {}).replace('\n', '\r\n'),
 }  # fmt: skip
@@ -131,10 +102,6 @@ REFUSED_ATTITUDES = {
     ),
     'orekit order': (aem('2.0', {'QUATERNION_TYPE': 'FIRST'}), 'no keyword QUATERNION_TYPE'),
     'orekit keyword': (aem('1.0', {'WRONG_KEYWORD': '123'}), '1.0 has no keyword WRONG_KEYWORD'),
-    'xml direction': (
-        aem_xml('2.0', f'<ATTITUDE_DIR>B2A</ATTITUDE_DIR>{XML_2}', 'quaternionAngVel', FORWARD),
-        'no keyword ATTITUDE_DIR',
-    ),
     'orekit no type': (aem('1.0', {'ATTITUDE_TYPE': None}), 'ATTITUDE_TYPE is missing'),
     'orekit spin': (aem('1.0', {'ATTITUDE_TYPE': 'SPIN'}), 'SPIN, not QUATERNION: convert'),
     'rate of 1.0': (aem('2.0', {'ATTITUDE_TYPE': 'QUATERNION/RATE'}), 'type QUATERNION/RATE'),
@@ -151,9 +118,8 @@ REFUSED_ATTITUDES = {
     'not finite': (aem('2.0', {}, '0 0 nan 1'), 'is not finite'),
     'no data': (aem('2.0', {}, 'x').replace(f'{T[0]} x\n{T[1]} x\n', ''), 'without data'),
     'another message': ('CCSDS_APM_VERS = 2.0\n', 'not with CCSDS_AEM_VERS'),
-    'another in xml': ('<omm id="CCSDS_OMM_VERS" version="2.0"/>', 'the message is OMM'),
+    'xml': ('<?xml version="1.0"?>\n<aem/>', 'it is XML: convert it to KVN'),
     'version 3': (aem('3.0', {}), "version '3.0' is not 1.0 or 2.0"),
-    'xml cut': (aem_xml('2.0', XML_2, 'quaternionAngVel', FORWARD)[:-40], 'not XML'),
 }  # fmt: skip
 
 
@@ -222,20 +188,6 @@ def state(seconds: float) -> str:
     return ' '.join(map(repr, map(float, (*position, *VELOCITY_KM_S))))
 
 
-def oem_xml(unit: str = '') -> str:
-    names = ('X', 'Y', 'Z', 'X_DOT', 'Y_DOT', 'Z_DOT')
-    states = ''
-    for time, seconds in zip(T, (0, 10), strict=True):
-        numbers = zip(names, state(seconds).split(), strict=True)
-        values = ''.join(f'<{name}{unit}>{value}</{name}>' for name, value in numbers)
-        states += f'<stateVector><EPOCH>{time}</EPOCH>{values}<X_DDOT>0</X_DDOT></stateVector>'
-    return (
-        '<oem id="CCSDS_OEM_VERS" version="3.0"><header/><body><segment><metadata>'
-        '<CENTER_NAME>SSB</CENTER_NAME><REF_FRAME>ICRF</REF_FRAME><TIME_SYSTEM>UTC</TIME_SYSTEM>'
-        f'</metadata><data>{states}</data></segment></body></oem>'
-    )
-
-
 COVARIANCE = (
     'COVARIANCE_START\nEPOCH = 2026-05-15T07:20:00\nCOV_REF_FRAME = RTN\n0.1\n0.1 0.2\n'
     'COVARIANCE_STOP\n'
@@ -253,7 +205,6 @@ VELOCITIES = {
     'oem covariance': oem('2.0', {}, end=COVARIANCE),
     # B-2, table 5-3: accelerations are optional.
     'spacetools acceleration': oem('3.0', {}, ' 0 0 0', head='CLASSIFICATION = PUBLIC\n'),
-    'ccsds-ndm xml': oem_xml(),
 }
 
 REFUSED_VELOCITIES = {
@@ -266,7 +217,6 @@ REFUSED_VELOCITIES = {
         oem('2.0', {}).replace(state(10), '1 2 3'), '3 numbers at 2026-05-15T07:20:10.0'
     ),
     'covariance cut': (oem('2.0', {}, end=COVARIANCE[:60]), 'ends in the covariance: truncated'),
-    'metres': (oem_xml(' units="m"'), 'X in m, not in km'),
     'unusable': (oem('2.0', {**STK, 'USEABLE_STOP_TIME': T[0]}), 'no velocity for 1 of 1'),
     'aem': (aem('2.0', {}), 'not with CCSDS_OEM_VERS'),
 }  # fmt: skip
