@@ -282,9 +282,7 @@ def read_segments(path: Path, kind: str) -> list[Segment]:
     text = mission_records.text_of(path)
     try:
         if text.lstrip().startswith('<'):
-            raise ValueError(
-                'it is XML: convert it to KVN (the package ccsds-ndm does)'
-            )
+            raise ValueError('it is XML: convert it to KVN (the package ccsds-ndm does)')
         segments = _kvn_segments(text, kind)
         if not segments:
             raise ValueError('no segment')
