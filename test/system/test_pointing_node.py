@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export.c_camera import TABLE_FILE
-from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ros.camera import line_of_sight
 from starcal_ros.records import Calibration
 
@@ -47,7 +47,7 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not any(Path(one, 'share/rclcpp/cmake').is_dir() for one in prefixes if one):
         pytest.skip('no rclcpp with its headers: PyPI has none')
     folder = tmp_path_factory.mktemp('pointing_node')
-    export(COMPILED_IN, 'c', folder, None)
+    export(COMPILED_IN, 'c', folder, Request())
     definitions = (f'-DSTARCAL_CAMERA_DIR={folder}', f'-DPython3_EXECUTABLE={sys.executable}')
     build = os.environ | {'CMAKE_PREFIX_PATH': os.pathsep.join(filter(None, prefixes))}
     for command in (
@@ -92,7 +92,7 @@ def test_it_answers_with_the_lines_of_sight_of_the_python_package(
         return '' if answer.successful else answer.reason
 
     assert np.abs(sights() - expected(COMPILED_IN, asked)).max() < SAME_DIRECTION
-    export(UPLINKED, 'c', tmp_path, None, table=True)
+    export(UPLINKED, 'c', tmp_path, Request(table=True))
     table = tmp_path / TABLE_FILE
     assert set_table(table) == ''
     assert np.abs(sights() - expected(UPLINKED, asked)).max() < SAME_DIRECTION

@@ -25,17 +25,22 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
+from starcal_ground.mission.export.export_formats import export, format_named, FORMATS, Request
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
+
+if TYPE_CHECKING:
+    from starcal_ros.records import StarObservations
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     what = 'calibration.json or its folder'
     add('calibration', type=Path, metavar='DIR', help=what)
-    what = 'format: spice, ck, isd, opencv, ros, giant, mrcal or c'
+    what = '; '.join(f'{row.name}: {row.what}' for row in FORMATS)
     add('--to', required=True, metavar='FORMAT', help=what)
     what = 'folder for the files, created if absent'
     add('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
@@ -63,7 +68,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import products
     from starcal_ground.bags.reader import read_observations
-    from starcal_ground.mission.export.export_formats import export
     from starcal_ground.mission.export.spice import SpiceNames
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
@@ -73,13 +77,14 @@ def run(args: argparse.Namespace) -> int:
     if args.spacecraft_id is not None:
         names = arguments.record_of(SpiceNames, args)
     products.make_folder(args.output)
-    recorded = [file.with_name(products.OBSERVATIONS_FILE)] if args.to == 'ck' else []
-    if recorded and not recorded[0].exists():
-        raise OptionError(f'--to ck: needs {recorded[0]} with the stars of the images')
-    observations = read_observations(recorded, products.OBSERVATIONS_TOPIC)
-    done = export(
-        *(calibration, args.to, args.output, names, args.table, observations, args.kernels)
-    )
+    recorded = file.with_name(products.OBSERVATIONS_FILE)
+    observations: tuple[StarObservations, ...] = ()
+    if format_named(args.to).needs_observations:
+        if not recorded.exists():
+            raise OptionError(f'--to {args.to}: needs {recorded} with the stars of the images')
+        observations = tuple(read_observations([recorded], products.OBSERVATIONS_TOPIC))
+    asked = Request(names, args.table, observations, args.kernels)
+    done = export(calibration, args.to, args.output, asked)
     written = ', '.join(str(args.output / name) for name in done.files)
     terminal.print_text(f'written: {written}')
     if not calibration.accepted:

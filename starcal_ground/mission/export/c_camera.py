@@ -19,7 +19,7 @@ import zlib
 
 import numpy as np
 
-from starcal_ground.mission.export.exported import ascii_line, origin
+from starcal_ground.mission.export.exported import ascii_line, Content, origin
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import pixel_grid
@@ -39,6 +39,11 @@ _VECTOR_STEP_K = 7.0  # of the temperature from one vector to the next
 _NO_FOLD = sys.float_info.max  # the table has finite numbers only
 _NO_VARIANCE = 1e-14  # of the largest, scaled: rounding
 _BYTES_A_LINE = 20
+
+
+def c_content(calibration: Calibration, table: bool) -> Content:
+    """C99 source of a calibration, or the table of its numbers alone."""
+    return Content({TABLE_FILE: c_table(calibration)} if table else c_files(calibration))
 
 
 def c_files(calibration: Calibration) -> dict[str, str]:

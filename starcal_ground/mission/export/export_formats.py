@@ -1,80 +1,214 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Files of a calibration in a format of another tool."""
+"""
+Files of a calibration in a format of another tool.
+
+A format is a row of `FORMATS`: its name, its line of help, what it needs and what makes its files.
+Help, checks, the interface document and the tests read the rows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from starcal_ground.mission.export import camera_models, spice
-from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.exported import Content
-from starcal_ground.products import check_outputs
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.record_fields import nearest
-from starcal_ros.records import Calibration, StarObservations
 
-FORMATS = ('spice', 'ck', 'isd', 'opencv', 'ros', 'giant', 'mrcal', 'c')
-_OF_ALIGNMENT = ('ros', 'spice', 'ck')
-_OF_SPICE = ('spice', 'ck', 'isd')
+if TYPE_CHECKING:
+    from starcal_ground.mission.export.exported import Content
+    from starcal_ground.mission.export.spice import SpiceNames
+    from starcal_ros.records import Calibration, StarObservations
 
 
-def export(
-    calibration: Calibration,
-    kind: str,
-    folder: Path,
-    names: spice.SpiceNames | None,
-    table: bool = False,
-    observations: Iterable[StarObservations] = (),
-    kernels: Sequence[Path] = (),
-) -> Content:
+@dataclass(frozen=True)
+class Request:
+    """
+    What a format may need besides the calibration.
+
+    ``names`` are None where the NAIF ID of the spacecraft is not given; ``table``: only the
+    numbers of the calibration, for code that was compiled before; ``observations`` and ``kernels``
+    (LSK and SCLK of the spacecraft) are those of the images.
+    """
+
+    names: SpiceNames | None = None
+    table: bool = False
+    observations: Sequence[StarObservations] = ()
+    kernels: Sequence[Path] = ()
+
+
+@dataclass(frozen=True)
+class Format:
+    """
+    A row of `FORMATS`.
+
+    ``what`` is its line of help, ``files`` and ``left_out`` its cells in docs/mission.md.
+    """
+
+    name: str
+    what: str
+    files: str
+    left_out: str
+    make: Callable[[Calibration, Request], Content]
+    needs_alignment: bool = False
+    needs_observations: bool = False
+    has_table: bool = False
+
+
+# Each imports its own: `starcal --help` reads the rows, and would take a second longer.
+
+
+def _spice(made: Calibration, asked: Request) -> Content:
+    from starcal_ground.mission.export import spice
+
+    return spice.spice_kernels(made, spice.checked_names(asked.names))
+
+
+def _ck(made: Calibration, asked: Request) -> Content:
+    from starcal_ground.mission.export import spice
+
+    names = spice.checked_names(asked.names)
+    return spice.ck_of_images(made, asked.observations, names, asked.kernels)
+
+
+def _isd(made: Calibration, asked: Request) -> Content:
+    from starcal_ground.mission.export import camera_models, spice
+
+    return camera_models.isd_files(made, spice.checked_names(asked.names))
+
+
+def _opencv(made: Calibration, _: Request) -> Content:
+    from starcal_ground.mission.export import camera_models
+
+    return camera_models.opencv_yaml(made)
+
+
+def _ros(made: Calibration, _: Request) -> Content:
+    from starcal_ground.mission.export import camera_models
+
+    return camera_models.ros_yaml(made)
+
+
+def _giant(made: Calibration, _: Request) -> Content:
+    from starcal_ground.mission.export import camera_models
+
+    return camera_models.giant_json(made)
+
+
+def _mrcal(made: Calibration, _: Request) -> Content:
+    from starcal_ground.mission.export import camera_models
+
+    return camera_models.mrcal_cameramodel(made)
+
+
+def _c(made: Calibration, asked: Request) -> Content:
+    from starcal_ground.mission.export import c_camera
+
+    return c_camera.c_content(made, asked.table)
+
+
+FORMATS = (
+    Format(
+        'spice',
+        'FK and IK of SPICE',
+        '`camera.tf`: the camera as TKFRAME in the star tracker frame; `camera.ti`: field of view,'
+        ' lens model, skew, field, sigmas, with the equations in comments',
+        'changes with temperature are keywords that SPICE does not apply',
+        _spice,
+        needs_alignment=True,
+    ),
+    Format(
+        'ck',
+        'attitude at each image for SPICE, with --kernels',
+        '`camera.bc`: attitude at each image by its stars, type 3 (below)',
+        'sigma and attitudes between images',
+        _ck,
+        needs_alignment=True,
+        needs_observations=True,
+    ),
+    Format(
+        'isd',
+        'ALE and ISIS',
+        "`camera_isd.json`: the camera's keys of an ALE ISD (`radtan`); `camera_isis.ti`: ISIS"
+        ' keywords (`OD_K`)',
+        'field and terms that `plumb_bob` lacks; ISIS: all but radial distortion',
+        _isd,
+    ),
+    Format(
+        'c',
+        'C99 source, or with --table its numbers alone',
+        '`starcal_camera.h` and `starcal_camera.c` for flight software, or `starcal_camera.bin`'
+        ' with `--table` ([onboard.md](onboard.md))',
+        '1-sigma of the changes with temperature',
+        _c,
+        has_table=True,
+    ),
+    Format(
+        'giant',
+        'arguments of GIANT',
+        "`giant_camera.json`: arguments of GIANT's `OpenCVModel`",
+        'field, tilt, `equidistant`',
+        _giant,
+    ),
+    Format(
+        'mrcal',
+        'a model of mrcal',
+        '`camera.cameramodel`; its reference frame is the star tracker',
+        'skew, field, tilt, `equidistant`',
+        _mrcal,
+    ),
+    Format(
+        'opencv',
+        'YAML of OpenCV',
+        '`opencv.yaml` for `cv2.FileStorage`',
+        'skew, field',
+        _opencv,
+    ),
+    Format(
+        'ros',
+        'YAML of ROS',
+        '`camera_info.yaml` and `alignment.yaml` (TransformStamped)',
+        'skew, field',
+        _ros,
+        needs_alignment=True,
+    ),
+)
+
+
+def format_named(name: str) -> Format:
+    """The row of a name; raises OptionError for an unknown one."""
+    for row in FORMATS:
+        if row.name == name:
+            return row
+    from starcal_ros.record_fields import nearest
+
+    names = [row.name for row in FORMATS]
+    raise OptionError(f'--to: {name!r} is not one of {", ".join(names)}{nearest(name, names)}')
+
+
+def export(calibration: Calibration, kind: str, folder: Path, asked: Request) -> Content:
     """
     Write a calibration to a folder in one of `FORMATS`; return what was written.
 
-    Raises OptionError for an unknown format, or names that SPICE does not allow. Raises
-    ProductError when a file cannot be written, and as `check_outputs` does.
-
-    Parameters
-    ----------
-    names : SpiceNames or None
-        Needed for ``spice``, ``ck`` and ``isd``.
-    table : bool
-        For ``c``: the binary table alone.
-    observations, kernels
-        For ``ck``: of the images, and the LSK and SCLK of the spacecraft.
+    Raises OptionError for an unknown format, for something that it needs and that is missing,
+    and for names that SPICE does not allow. Raises ProductError when a file cannot be written, and
+    as `check_outputs` does.
     """
-    if kind not in FORMATS:
-        raise OptionError(
-            f'--to: {kind!r} is not one of {", ".join(FORMATS)}{nearest(kind, FORMATS)}'
-        )
-    if table and kind != 'c':
-        raise OptionError(f'--table: only --to c has a table, not {kind}')
-    if kind in _OF_ALIGNMENT and not calibration.has_alignment:
-        others = ', '.join(other for other in FORMATS if other not in _OF_ALIGNMENT)
+    from starcal_ground.products import check_outputs
+    from starcal_ros.formats.products.product_files import write_atomically
+
+    row = format_named(kind)
+    if asked.table and not row.has_table:
+        others = ' or '.join(other.name for other in FORMATS if other.has_table)
+        raise OptionError(f'--table: only --to {others} has a table, not {kind}')
+    if row.needs_alignment and not calibration.has_alignment:
+        others = ', '.join(other.name for other in FORMATS if not other.needs_alignment)
         raise OptionError(
             f'--to {kind}: the calibration is of the camera alone, without the alignment that'
             f' {kind} needs; choose one of {others}'
         )
-    if kind in _OF_SPICE:
-        if names is None:
-            raise OptionError(f'--to {kind}: give the NAIF ID of the spacecraft, --spacecraft-id')
-        spice.check_names(names)
-    naif = names or spice.SpiceNames(0)
-    makers: Mapping[str, Callable[[], Content]] = {
-        'spice': lambda: spice.spice_kernels(calibration, naif),
-        'ck': lambda: spice.ck_of_images(calibration, observations, naif, kernels),
-        'isd': lambda: camera_models.isd_files(calibration, naif),
-        'opencv': lambda: camera_models.opencv_yaml(calibration),
-        'ros': lambda: camera_models.ros_yaml(calibration),
-        'giant': lambda: camera_models.giant_json(calibration),
-        'mrcal': lambda: camera_models.mrcal_cameramodel(calibration),
-        'c': lambda: Content(
-            {TABLE_FILE: c_table(calibration)} if table else c_files(calibration)
-        ),
-    }
-    made = makers[kind]()
-    check_outputs((folder / name for name in made.files), kernels)
+    made = row.make(calibration, asked)
+    check_outputs((folder / name for name in made.files), asked.kernels)
     for name, content in made.files.items():
         write_atomically(folder / name, content)
     return made

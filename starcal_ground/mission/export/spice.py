@@ -129,8 +129,10 @@ def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
     return boresight, corners
 
 
-def check_names(names: SpiceNames) -> None:
-    """Raise OptionError for identifiers that SPICE does not allow."""
+def checked_names(names: SpiceNames | None) -> SpiceNames:
+    """The names of a request; raises OptionError for none, or for what SPICE does not allow."""
+    if names is None:
+        raise OptionError('--spacecraft-id: give the NAIF ID of the spacecraft')
     if names.spacecraft_id >= 0:
         raise OptionError(f'--spacecraft-id: {names.spacecraft_id} is not a negative NAIF ID')
     if names.instrument_id > 0:
@@ -139,6 +141,7 @@ def check_names(names: SpiceNames) -> None:
         raise OptionError(f'--star-tracker-id: {names.star_tracker_id} is the ID of the camera')
     if not 0 <= names.pixel_size_um < 1e4:
         raise OptionError(f'--pixel-size-um: {names.pixel_size_um:g} is not within 0 to 10000')
+    return names
 
 
 def _frame_kernel(

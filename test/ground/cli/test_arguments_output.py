@@ -229,7 +229,9 @@ def test_each_command_that_writes_is_in_the_table() -> None:
     }
     table = (*WRITING, *WITH_NODES)
     assert {words.partition(' ')[0] for words in table} == {*writing, 'report'}
-    assert {words.split()[3] for words in table if words.startswith('export')} == {*FORMATS}
+    assert {words.split()[3] for words in table if words.startswith('export')} == {
+        row.name for row in FORMATS
+    }
 
 
 @pytest.mark.parametrize('command', [*WRITING, *WITH_NODES])

@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
 from starcal_ros.estimation.problem import camera_at
@@ -206,7 +206,7 @@ def test_the_budget_and_the_identity_of_the_calibration(tmp_path: Path) -> None:
 def test_a_program_takes_a_new_table_without_compiling_again(tmp_path: Path) -> None:
     program = built(calibration('plumb_bob'), tmp_path)
     newer = with_correlations(calibration('equidistant', with_field=True, temperature=True))
-    done = export(newer, 'c', tmp_path, None, table=True)
+    done = export(newer, 'c', tmp_path, Request(table=True))
     assert list(done.files) == [TABLE_FILE]
     table = tmp_path / TABLE_FILE
     assert run(program, 'status', table)[0] == 0

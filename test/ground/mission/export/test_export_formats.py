@@ -19,7 +19,10 @@ from scipy.spatial.transform import Rotation
 import spiceypy
 import yaml
 
-from starcal_ground.mission.export.export_formats import export, FORMATS
+from starcal_ground.cli.commands import export as export_command
+from starcal_ground.cli.main import main
+from starcal_ground.mission.export import export_formats
+from starcal_ground.mission.export.export_formats import export, Format, FORMATS, Request
 from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid, project
@@ -61,7 +64,7 @@ def opencv_pixels(
 )
 def test_opencv_sees_a_star_where_the_calibration_does(tmp_path, model, skew, with_field) -> None:
     made = calibration(model, skew, with_field)
-    done = export(made, 'opencv', tmp_path, None)
+    done = export(made, 'opencv', tmp_path, Request())
     storage = cv2.FileStorage(str(tmp_path / 'opencv.yaml'), cv2.FILE_STORAGE_READ)
     K = storage.getNode('camera_matrix').mat()
     D = storage.getNode('distortion_coefficients').mat()
@@ -88,7 +91,7 @@ def parts(done: Content) -> list[str]:
 
 def test_ros_files_are_the_camera_without_skew_and_the_transform(tmp_path: Path) -> None:
     made = calibration(with_field=True)
-    done = export(made, 'ros', tmp_path, None)
+    done = export(made, 'ros', tmp_path, Request())
     pixels, directions = grid_of(made)
     seen = project(read_camera_info(tmp_path / 'camera_info.yaml'), directions)
     assert worst_px(seen, pixels) == pytest.approx(done.worst_px, abs=SAME_PX)
@@ -102,7 +105,7 @@ def test_ros_files_are_the_camera_without_skew_and_the_transform(tmp_path: Path)
 def test_giant_has_the_skew_and_the_focal_change(tmp_path: Path, model: str) -> None:
     """By the equations that GIANT publishes: it is on no package registry."""
     made = calibration(model, temperature=True)
-    done = export(made, 'giant', tmp_path, None)
+    done = export(made, 'giant', tmp_path, Request())
     content = json.loads((tmp_path / 'giant_camera.json').read_text())
     named = content['OpenCVModel']
     assert (named['a1'], named['a2']) == (4e-5, -6e-7)
@@ -135,7 +138,7 @@ def test_giant_has_the_skew_and_the_focal_change(tmp_path: Path, model: str) -> 
 def test_a_model_of_mrcal_has_the_error_it_states(tmp_path: Path, model: str) -> None:
     """By OpenCV, whose model and order mrcal documents for LENSMODEL_OPENCVn."""
     made = calibration(model)
-    done = export(made, 'mrcal', tmp_path, None)
+    done = export(made, 'mrcal', tmp_path, Request())
     lines = (tmp_path / 'camera.cameramodel').read_text().splitlines()
     content = ast.literal_eval('\n'.join(line for line in lines if not line.startswith('#')))
     fx, fy, cx, cy, *D = content['intrinsics']
@@ -153,7 +156,7 @@ def test_a_model_of_mrcal_has_the_error_it_states(tmp_path: Path, model: str) ->
 
 
 def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path: Path) -> None:
-    done = export(calibration(skew=0.0, temperature=True), 'opencv', tmp_path, None)
+    done = export(calibration(skew=0.0, temperature=True), 'opencv', tmp_path, Request())
     cost = {loss.part: loss.cost_px for loss in done.losses}
     # 4e-5 per degree at the corner farthest from the principal point (651.25, 505.75).
     corner_px = math.hypot(651.25, 1023 - 505.75)
@@ -172,7 +175,7 @@ READERS: dict[str, Callable[[str], object]] = {
 }
 
 
-@pytest.mark.parametrize('kind', [kind for kind in FORMATS if kind != 'ck'])
+@pytest.mark.parametrize('kind', [row.name for row in FORMATS if not row.needs_observations])
 def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> None:
     made = dataclasses.replace(
         calibration('plumb_bob'),
@@ -184,7 +187,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
         sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
     )
     names = SpiceNames(-999, camera_frame='CAMERA', star_tracker_frame='TRACKER')
-    for name in export(made, kind, tmp_path, names).files:
+    for name in export(made, kind, tmp_path, Request(names)).files:
         path = tmp_path / name
         text = path.read_text('ascii')
         assert all(line.isprintable() for line in text.split('\n')), path
@@ -198,10 +201,32 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
 
 def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r'did you mean opencv'):
-        export(calibration(), 'opencvv', tmp_path, None)
+        export(calibration(), 'opencvv', tmp_path, Request())
     with pytest.raises(OptionError, match=r'--spacecraft-id'):
-        export(calibration(), 'spice', tmp_path, None)
-    assert len(FORMATS) == 8
+        export(calibration(), 'spice', tmp_path, Request())
+
+
+def test_a_format_is_added_by_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As CONTRIBUTING.md says, from outside of the package."""
+
+    def focal_lengths(made: Calibration, _: Request) -> Content:
+        fx, _, fy, _, _ = made.geometry.camera.intrinsics
+        return Content({'focal.txt': f'{fx:.3f} {fy:.3f}'})
+
+    row = Format('focal', 'focal lengths as text', '`focal.txt`', 'all but these', focal_lengths)
+    rows = (*FORMATS, dataclasses.replace(row, needs_alignment=True))
+    for module in (export_formats, export_command):
+        monkeypatch.setattr(module, 'FORMATS', rows)
+    export(calibration(), 'focal', tmp_path, Request())
+    assert (tmp_path / 'focal.txt').read_text() == '3641.500 3642.300'
+    alone = dataclasses.replace(calibration(), parent_frame='')
+    with pytest.raises(OptionError, match='camera alone'):
+        export(alone, 'focal', tmp_path, Request())
+    with pytest.raises(SystemExit):
+        main(['export', '--help'])
+    assert 'focal: focal lengths as text' in ' '.join(capsys.readouterr().out.split())
 
 
 def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
@@ -214,7 +239,7 @@ def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
 def test_a_camera_without_alignment_is_not_exported_with_one(kind: str, tmp_path: Path) -> None:
     alone = dataclasses.replace(calibration('plumb_bob'), parent_frame='')
     with pytest.raises(OptionError, match=f'--to {kind}: the calibration is of the camera alone'):
-        export(alone, kind, tmp_path, None)
+        export(alone, kind, tmp_path, Request())
 
 
 ROTATIONS = {
@@ -234,7 +259,7 @@ def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(
             made.geometry, star_tracker_from_camera_xyzw=Rotation.from_rotvec(rotation).as_quat()
         )
         made = dataclasses.replace(made, geometry=turned, parent_frame=frame)
-        (text,) = export(made, kind, tmp_path, None).files.values()
+        (text,) = export(made, kind, tmp_path, Request()).files.values()
         assert (ROTATIONS[kind] in text) is bool(frame)
 
 
@@ -262,7 +287,7 @@ def test_isd_and_isis_keywords_have_the_errors_they_state(
 ) -> None:
     made = calibration(model, with_field=with_field)
     names = SpiceNames(-999, pixel_size_um=pixel_size_um)
-    done = export(made, 'isd', tmp_path, names)
+    done = export(made, 'isd', tmp_path, Request(names))
     pixels, directions = grid_of(made)
     isd = json.loads((tmp_path / 'camera_isd.json').read_text())
     found_px = worst_px(usgs_pixels(isd, directions), pixels)
@@ -294,7 +319,7 @@ def test_isd_and_isis_keywords_have_the_errors_they_state(
 def test_an_exported_camera_is_read_as_a_prior_camera(
     tmp_path: Path, form: str, model: str
 ) -> None:
-    made = export(calibration(model, 0.0, False), form, tmp_path, None)
+    made = export(calibration(model, 0.0, False), form, tmp_path, Request())
     camera = read_camera_info(tmp_path / next(iter(made.files)))
     pixels, directions = grid_of(calibration(model, 0.0, False))
     assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6

@@ -13,7 +13,7 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 import spiceypy
 
-from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
@@ -31,7 +31,7 @@ def load(tmp_path: Path):
     """Load the kernels of a calibration into a clean kernel pool."""
 
     def loaded(made: Calibration, names: SpiceNames = NAMES) -> tuple[str, str]:
-        paths = [tmp_path / name for name in export(made, 'spice', tmp_path, names).files]
+        paths = [tmp_path / name for name in export(made, 'spice', tmp_path, Request(names)).files]
         for path in paths:
             spiceypy.furnsh(str(path))
         fk, ik = (path.read_text('ascii') for path in paths)
@@ -180,14 +180,14 @@ def test_names_that_spice_does_not_take_are_refused(
     names: SpiceNames, words: str, tmp_path: Path
 ) -> None:
     with pytest.raises(OptionError, match=words):
-        export(calibration(), 'spice', tmp_path, names)
+        export(calibration(), 'spice', tmp_path, Request(names))
 
 
 def test_a_field_of_view_wider_than_a_half_space_is_left_out(tmp_path: Path) -> None:
     made = calibration('equidistant')
     camera = made.geometry.camera.replace(fx=400.0, fy=400.0)
     wide = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=camera))
-    done = export(wide, 'spice', tmp_path, NAMES)
+    done = export(wide, 'spice', tmp_path, Request(NAMES))
     assert '_FOV_' not in (tmp_path / 'camera.ti').read_text().split('begindata')[1]
     assert 'half space' in done.losses[-1].part
 

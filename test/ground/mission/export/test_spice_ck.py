@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 import spiceypy
 
-from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight
@@ -47,7 +47,7 @@ def written(
 ) -> Content:
     kernels = [write_lsk(folder / 'leap.tls'), write_sclk(folder / 'clock.tsc')]
     names = SpiceNames(CLOCK_ID, star_tracker_id=tracker)
-    return export(made, 'ck', folder, names, observations=images, kernels=kernels)
+    return export(made, 'ck', folder, Request(names, observations=images, kernels=kernels))
 
 
 @pytest.mark.parametrize('tracker', [0, FRAME_ID])
@@ -57,7 +57,7 @@ def test_spice_has_the_attitude_of_each_image_and_none_between(
     refused = refused_image(FIRST_NS - 10**10, 1296, 1024, 'no_match', '')
     images = [refused, *map(observed, range(len(TRUTH)))]
     done = written(tmp_path, MADE, images, tracker)
-    export(MADE, 'spice', tmp_path, SpiceNames(CLOCK_ID, star_tracker_id=FRAME_ID))
+    export(MADE, 'spice', tmp_path, Request(SpiceNames(CLOCK_ID, star_tracker_id=FRAME_ID)))
     spiceypy.kclear()
     for name in (*done.files, 'leap.tls', 'clock.tsc', 'camera.tf'):
         spiceypy.furnsh(str(tmp_path / name))
@@ -87,7 +87,7 @@ def test_without_stars_or_clock_it_is_refused_and_nothing_is_written(tmp_path: P
     other = SpiceNames(-42)
     kernels = [tmp_path / 'leap.tls', tmp_path / 'clock.tsc']
     with pytest.raises(ProductError, match=r'camera\.bc: .*SPICE'):
-        export(MADE, 'ck', tmp_path, other, observations=[observed(0)], kernels=kernels)
+        export(MADE, 'ck', tmp_path, Request(other, observations=[observed(0)], kernels=kernels))
     assert not (tmp_path / 'camera.bc').exists()
     warmer = dataclasses.replace(observed(0), temperature_degc=30.0)
     assert written(tmp_path, MADE, [warmer], 0).worst_px == 0.0
