@@ -29,7 +29,7 @@ from starcal_ground.simulation.rendering import images
 from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.errors import StarcalError
 from starcal_ros.records import Calibration, CameraGeometry
 from studies.trials import rms
@@ -73,7 +73,7 @@ def camera_of(seed: int) -> tuple[Scenario, float]:
     """A campaign of a random camera, and half of its diagonal, degrees."""
     rng = np.random.default_rng([seed, 28])
     half_deg = 0.5 * math.exp(rng.uniform(*np.log(FIELDS_DEG)))
-    model = list(COEFFICIENTS)[seed % len(COEFFICIENTS)]
+    model = list(LENSES)[seed % len(LENSES)]
     half_px = 0.5 * math.hypot(*SIZE)
     is_fisheye = model == 'equidistant'
     reach = math.radians(half_deg) if is_fisheye else math.tan(math.radians(half_deg))
@@ -91,7 +91,7 @@ def camera_of(seed: int) -> tuple[Scenario, float]:
         'tau_x': rng.normal(0.0, 0.002),
         'tau_y': rng.normal(0.0, 0.002),
     }
-    lens = [values.get(name, 0.0) for name in COEFFICIENTS[model]]
+    lens = [values.get(name, 0.0) for name in LENSES[model].coefficients]
     fy = fx * (1.0 + rng.normal(0.0, 3e-4))
     camera = CameraModel(*SIZE, np.array([fx, 0.0, fy, *middle, *lens]), model)
     ra_deg, z = rng.uniform(0.0, 360.0, IMAGES), rng.uniform(-1.0, 1.0, IMAGES)

@@ -30,7 +30,7 @@ from starcal_ground.simulation.scenario import Detector, Scenario, Scene
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project
-from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
+from starcal_ros.camera.lens import fold_radius2, LENSES
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, StarObservations
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
@@ -287,7 +287,7 @@ def _optics(world: World, base: Scenario) -> tuple[CameraGeometry, CameraGeometr
     corner = math.hypot(camera.width, camera.height) / 2.0 / focal_px
     middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
     while True:
-        c = np.zeros(len(COEFFICIENTS[world.model]))
+        c = np.zeros(len(LENSES[world.model].coefficients))
         share = rng.dirichlet([4.0, 2.0, 1.0]) * np.append(1.0, rng.choice([-1.0, 1.0], 2))
         c[:3] = world.corner * share / corner ** np.array([2, 4, 6])
         if not is_fisheye:

@@ -26,7 +26,7 @@ from starcal_ground.blind.images import FEWEST_SOURCES, ImageSearch
 from starcal_ground.blind.search import SkyMatch
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera.lens import COEFFICIENTS, ideal_points
+from starcal_ros.camera.lens import ideal_points, LENSES
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
@@ -237,7 +237,7 @@ def _noise(pixels: Pixels) -> Floats:
 def ideal_camera(size: tuple[int, int], focal_px: float, model: str = _PINHOLE) -> CameraModel:
     """A camera of this size (width, height) without distortion, its axis in the middle."""
     middle = (size[0] - 1) / 2, (size[1] - 1) / 2
-    none = np.zeros(len(COEFFICIENTS[model]))
+    none = np.zeros(len(LENSES[model].coefficients))
     return CameraModel(*size, np.array([focal_px, 0.0, focal_px, *middle, *none]), model)
 
 

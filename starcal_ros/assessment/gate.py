@@ -15,7 +15,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import INTRINSIC_NAMES
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
@@ -437,7 +437,7 @@ _UNITS: dict[str, tuple[str, ...]] = {
     POINTING: ('arcsec',),
     **dict.fromkeys([FOCAL, *INTRINSIC_NAMES], ('px',)),
     **dict.fromkeys(ALIGNMENT_NAMES, ('arcsec',)),
-    **{name: ('',) for names in COEFFICIENTS.values() for name in names},
+    **{name: ('',) for lens in LENSES.values() for name in lens.coefficients},
 }
 _FORM = re.compile(r'\s*(\w+)\s*=\s*([\d.]+(?:e-?\d+)?)\s*([a-z]*)\s*(?:@\s*([\d.]+)\s*%\s*)?')
 

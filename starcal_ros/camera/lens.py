@@ -25,34 +25,75 @@ With r2 = x^2 + y^2 the distorted point of the OpenCV models is::
     (x', y') = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) (x, y)
 
 Sources: OpenCV 4 documentation, "Camera Calibration and 3D Reconstruction" and its ``fisheye``;
-ROS ``sensor_msgs/distortion_models.hpp``.  Coefficients are (c,) in the order of `COEFFICIENTS`,
+ROS ``sensor_msgs/distortion_models.hpp``.  Coefficients are (c,) in the order of their names,
 or (c, n) for n points.  Complex numbers pass through, for complex-step derivatives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 import functools
 
 import numpy as np
 
 from starcal_ros.arrays import Floats
 
-_PLUMB_BOB = ('k1', 'k2', 'k3', 'p1', 'p2')
-_RATIONAL = (*_PLUMB_BOB, 'k4', 'k5', 'k6')
-_THIN_PRISM = (*_RATIONAL, 's1', 's2', 's3', 's4')
 
-COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
-    'plumb_bob': _PLUMB_BOB,
-    'rational_polynomial': _RATIONAL,
-    'thin_prism': _THIN_PRISM,
-    'tilted': (*_THIN_PRISM, 'tau_x', 'tau_y'),
-    'equidistant': ('k1', 'k2', 'k3', 'k4'),
-}
-"""Name of a lens model -> names of its coefficients, in order."""
+@dataclass(frozen=True)
+class LensModel:
+    """
+    A row of `LENSES`: what the rest of the package asks a lens model.
 
-_EQUIDISTANT = 'equidistant'
-_WITH_PRISM = ('thin_prism', 'tilted')
+    Attributes
+    ----------
+    coefficients : tuple of str
+        Names, in order; the functions take the numbers as (c,), or (c, n) for n points.
+    distort, by_ideal, by_coefficients, fold_radius2 : callable
+        As the functions `distort`, `distort_jacobian`, `coefficient_jacobian` and `fold_radius2`
+        of this module, without the name of the model.
+    is_angular : bool
+        The ideal plane has the angle from the optical axis in place of its tangent.
+    is_redundant : bool
+        Coefficients of the numerator and the denominator can grow together without an effect.
+    is_guarded : bool
+        Newton's method may start beyond the fold or a pole, from where it does not return.
+    ros, ros_order : str, tuple of int
+        ``distortion_model`` of a ``CameraInfo``, and the place of each number of its D.
+    opencv : str
+        Its namespace in OpenCV: ``pinhole`` (none) or ``fisheye``.
+    mrcal, giant : str
+        Name of the model in mrcal, and class in GIANT; empty: it has none.
+    equations : tuple of str
+        From x, y and r2 to x', y', for the comments of files.
+    """
+
+    name: str
+    coefficients: tuple[str, ...]
+    distort: Callable[[Floats, Floats], Floats]
+    by_ideal: Callable[[Floats, Floats], Floats]
+    by_coefficients: Callable[[Floats, Floats], Floats]
+    fold_radius2: Callable[..., float]
+    ros: str
+    ros_order: tuple[int, ...]
+    equations: tuple[str, ...]
+    is_angular: bool = False
+    is_redundant: bool = False
+    is_guarded: bool = True
+    opencv: str = 'pinhole'
+    mrcal: str = ''
+    giant: str = ''
+
+
+def lens_named(name: str) -> LensModel:
+    """Row of `LENSES`; raises ValueError for a name that it does not have."""
+    try:
+        return LENSES[name]
+    except KeyError:
+        known = ', '.join(LENSES)
+        raise ValueError(f'lens model: {name!r} is not one of {known}') from None
+
+
 # Below this angle 1 - t / tan(t) loses digits; the terms left out of the series are under 1e-14.
 _SERIES_RAD = 0.2
 _NO_ROOT = 1e-100  # reciprocal of a squared radius beyond any detector
@@ -62,11 +103,11 @@ def ideal_points(model: str, directions_camera: Floats) -> Floats:
     """
     Points (..., 2) where camera-frame directions (..., 3) of any length meet the ideal plane.
 
-    NaN where the model has none: Z <= 0 of a perspective model, the backward axis of
-    ``equidistant``.
+    NaN where the model has none: Z <= 0 of a perspective model, the backward axis of an angular
+    one.
     """
     z = directions_camera[..., 2]
-    if model != _EQUIDISTANT:
+    if not LENSES[model].is_angular:
         z = np.where(z.real > 0, z, np.nan)
         return np.asarray(directions_camera[..., :2] / z[..., None])
     x, y = directions_camera[..., 0], directions_camera[..., 1]
@@ -84,7 +125,7 @@ def ideal_points(model: str, directions_camera: Floats) -> Floats:
 
 def directions_of(model: str, ideal: Floats) -> Floats:
     """Unit directions (..., 3) in the camera frame of ideal points (..., 2)."""
-    if model != _EQUIDISTANT:
+    if not LENSES[model].is_angular:
         directions = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
     theta = np.hypot(ideal[..., 0], ideal[..., 1])
@@ -100,7 +141,7 @@ def ideal_by_rotation(model: str, ideal: Floats) -> Floats:
     """
     x, y = ideal[..., 0], ideal[..., 1]
     theta = np.empty((2, 3, *x.shape)).transpose(0, *range(2, x.ndim + 2), 1)
-    if model == _EQUIDISTANT:
+    if LENSES[model].is_angular:
         m = _bend(x * x + y * y)
         theta[0, ..., 0] = m * x * y
         theta[0, ..., 1] = m * y * y - 1.0
@@ -133,20 +174,27 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
 
     NaN where ``tilted`` would look at the detector from behind.
     """
-    x, y = ideal[..., 0], ideal[..., 1]
-    r2 = x * x + y * y
-    g, _, _ = _radial(model, r2, coefficients)
-    if model == _EQUIDISTANT:
-        return points_of(g * x, g * y)
-    p1, p2 = coefficients[3:5]
-    g = g + 2 * (p1 * y + p2 * x)  # the terms of p1 and p2 share this factor of x and y
-    xd, yd = g * x + p2 * r2, g * y + p1 * r2
-    if model in _WITH_PRISM:
-        s1, s2, s3, s4 = coefficients[8:12]
-        xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
-    if model == 'tilted':
-        xd, yd, _ = _tilt(xd, yd, *coefficients[12:])
-    return points_of(xd, yd)
+    return LENSES[model].distort(ideal, coefficients)
+
+
+def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
+    """Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37)."""
+    return LENSES[model].by_ideal(ideal, coefficients)
+
+
+def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
+    """Derivatives (2, c, ...) of `distort` at ideal points (..., 2) by the c coefficients."""
+    return LENSES[model].by_coefficients(ideal, coefficients)
+
+
+def fold_radius2(model: str, coefficients: Floats) -> float:
+    """
+    Squared radius of the ideal plane from which the radial distortion has no inverse.
+
+    There the distorted radius stops growing, or a rational polynomial has its pole; infinite
+    where it grows without end.  180 degrees at most for an angular model.
+    """
+    return LENSES[model].fold_radius2(*coefficients.tolist())
 
 
 def points_of(x: Floats, y: Floats) -> Floats:
@@ -155,70 +203,141 @@ def points_of(x: Floats, y: Floats) -> Floats:
     return both.transpose(*range(1, both.ndim), 0)
 
 
-def _radial(model: str, r2: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats | float]:
-    """Factor g of the radial distortion, its derivative by r2, and the denominator of g."""
-    k1, k2, k3 = coefficients[:3]
-    if model == _EQUIDISTANT:
-        k4 = coefficients[3]
+@dataclass(frozen=True)
+class _OpenCv:
+    """A perspective model of OpenCV: radial and decentring terms, and the parts that it adds."""
+
+    count: int  # coefficients
+    has_denominator: bool = True
+    has_prism: bool = True
+    has_tilt: bool = True
+
+    def distort(self, ideal: Floats, coefficients: Floats) -> Floats:
+        x, y = ideal[..., 0], ideal[..., 1]
+        r2 = x * x + y * y
+        g, _, _ = self._radial(r2, coefficients)
+        p1, p2 = coefficients[3:5]
+        g = g + 2 * (p1 * y + p2 * x)  # the terms of p1 and p2 share this factor of x and y
+        xd, yd = g * x + p2 * r2, g * y + p1 * r2
+        if self.has_prism:
+            s1, s2, s3, s4 = coefficients[8:12]
+            xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
+        if self.has_tilt:
+            xd, yd, _ = _tilt(xd, yd, *coefficients[12:])
+        return points_of(xd, yd)
+
+    def _radial(self, r2: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats | float]:
+        """Factor g of the radial distortion, its derivative by r2, and the denominator of g."""
+        k1, k2, k3 = coefficients[:3]
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        g_r2 = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+        if not self.has_denominator:
+            return g, g_r2, 1.0
+        k4, k5, k6 = coefficients[5:8]
+        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        g = g / denominator
+        return g, (g_r2 - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator, denominator
+
+    def by_ideal(self, ideal: Floats, coefficients: Floats) -> Floats:
+        x, y = ideal[..., 0], ideal[..., 1]
+        r2 = x * x + y * y
+        g, g_r2, _ = self._radial(r2, coefficients)
+        p1, p2 = coefficients[3:5]
+        J = _radial_jacobian(x, y, g + 2 * (p1 * y + p2 * x), g_r2, p1, p2)
+        if self.has_prism:
+            s1, s2, s3, s4 = coefficients[8:12]
+            J[..., 0, :] += 2 * (s1 + 2 * s2 * r2)[..., None] * ideal
+            J[..., 1, :] += 2 * (s3 + 2 * s4 * r2)[..., None] * ideal
+        if self.has_tilt:
+            xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+            J = _tilt_jacobian(xd, yd, *coefficients[12:]) @ J
+        return J
+
+    def by_coefficients(self, ideal: Floats, coefficients: Floats) -> Floats:
+        x, y = ideal[..., 0], ideal[..., 1]
+        r2 = x * x + y * y
+        J = np.zeros((2, self.count, *x.shape))
+        _by_powers(J[:, :3], x, y, r2)
+        J[0, 3] = J[1, 4] = 2 * x * y
+        J[0, 4], J[1, 3] = r2 + 2 * x * x, r2 + 2 * y * y
+        if self.has_denominator:
+            g, _, denominator = self._radial(r2, coefficients)
+            J[:, :3] /= denominator
+            J[:, 5:8] = -g * J[:, :3]
+        if self.has_prism:
+            J[0, 8] = J[1, 10] = r2
+            J[0, 9] = J[1, 11] = r2 * r2
+        if self.has_tilt:
+            _by_tilt(J, ideal, coefficients)
+        return J
+
+    @functools.lru_cache(maxsize=64)  # noqa: B019  a few records, which live as long as the module
+    def fold_radius2(self, *coefficients: float) -> float:
+        k1, k2, k3 = coefficients[:3]
+        if not self.has_denominator:
+            return _least_positive_root([7 * k3, 5 * k2, 3 * k1, 1.0])
+        numerator = np.poly1d([k3, k2, k1, 1.0])
+        denominator = np.poly1d([*coefficients[7:4:-1], 1.0])
+        growth = numerator * denominator + np.poly1d([2.0, 0.0]) * (
+            numerator.deriv() * denominator - numerator * denominator.deriv()
+        )
+        return min(_least_positive_root(growth.coeffs), _least_positive_root(denominator.coeffs))
+
+
+class _Equidistant:
+    """The polynomial of the angle of Kannala and Brandt."""
+
+    @staticmethod
+    def distort(ideal: Floats, coefficients: Floats) -> Floats:
+        x, y = ideal[..., 0], ideal[..., 1]
+        k1, k2, k3, k4 = coefficients
+        r2 = x * x + y * y
         g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-        return g, k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4)), 1.0
-    g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    g_r2 = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    if model == 'plumb_bob':
-        return g, g_r2, 1.0
-    k4, k5, k6 = coefficients[5:8]
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    g = g / denominator
-    return g, (g_r2 - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator, denominator
+        return points_of(g * x, g * y)
+
+    @staticmethod
+    def by_ideal(ideal: Floats, coefficients: Floats) -> Floats:
+        x, y = ideal[..., 0], ideal[..., 1]
+        k1, k2, k3, k4 = coefficients
+        r2 = x * x + y * y
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        return _radial_jacobian(x, y, g, k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4)))
+
+    @staticmethod
+    def by_coefficients(ideal: Floats, coefficients: Floats) -> Floats:
+        del coefficients
+        x, y = ideal[..., 0], ideal[..., 1]
+        J = np.zeros((2, 4, *x.shape))
+        _by_powers(J, x, y, x * x + y * y)
+        return J
+
+    @staticmethod
+    @functools.lru_cache(maxsize=64)
+    def fold_radius2(k1: float, k2: float, k3: float, k4: float) -> float:
+        # The odd polynomial's derivative by the radius.
+        return min(_least_positive_root([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0]), np.pi**2)
 
 
-def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37)."""
-    x, y = ideal[..., 0], ideal[..., 1]
-    r2 = x * x + y * y
-    g, g_r2, _ = _radial(model, r2, coefficients)
-    p1, p2 = coefficients[3:5] if model != _EQUIDISTANT else (0.0, 0.0)
-    g = g + 2 * (p1 * y + p2 * x)
+def _radial_jacobian(
+    x: Floats, y: Floats, g: Floats, g_r2: Floats, p1: float = 0.0, p2: float = 0.0
+) -> Floats:
+    """Derivatives (..., 2, 2) of radial and decentring terms by x and y, g with the latter."""
     by_x, by_y = 2 * g_r2 * x, 2 * g_r2 * y
-    x_by_x, y_by_y = g + x * (by_x + 4 * p2), g + y * (by_y + 4 * p1)
-    cross = x * (by_y + 2 * p1) + 2 * p2 * y
-    kind = np.result_type(ideal, coefficients)
-    J = np.empty((2, 2, *x.shape), kind).transpose(*range(2, x.ndim + 2), 0, 1)
-    J[..., 0, 0], J[..., 1, 1] = x_by_x, y_by_y
-    J[..., 0, 1] = J[..., 1, 0] = cross
-    if model in _WITH_PRISM:
-        s1, s2, s3, s4 = coefficients[8:12]
-        J[..., 0, :] += 2 * (s1 + 2 * s2 * r2)[..., None] * ideal
-        J[..., 1, :] += 2 * (s3 + 2 * s4 * r2)[..., None] * ideal
-    if model == 'tilted':
-        xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
-        J = _tilt_jacobian(xd, yd, *coefficients[12:]) @ J
+    J = np.empty((2, 2, *x.shape), g.dtype).transpose(*range(2, x.ndim + 2), 0, 1)
+    J[..., 0, 0], J[..., 1, 1] = g + x * (by_x + 4 * p2), g + y * (by_y + 4 * p1)
+    J[..., 0, 1] = J[..., 1, 0] = x * (by_y + 2 * p1) + 2 * p2 * y
     return J
 
 
-def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """Derivatives (2, c, ...) of `distort` at ideal points (..., 2) by the c coefficients."""
-    x, y = ideal[..., 0], ideal[..., 1]
-    r2 = x * x + y * y
-    J = np.zeros((2, len(COEFFICIENTS[model]), *x.shape))
+def _by_powers(J: Floats, x: Floats, y: Floats, r2: Floats) -> None:
+    """Derivatives (2, k, ...) by the coefficients of r2, r2^2 and so on, into J."""
     J[0, 0], J[1, 0] = x * r2, y * r2
-    for k in range(1, 4 if model == _EQUIDISTANT else 3):
+    for k in range(1, J.shape[1]):
         np.multiply(J[:, k - 1], r2, out=J[:, k])
-    if model == _EQUIDISTANT:
-        return J
-    J[0, 3] = J[1, 4] = 2 * x * y
-    J[0, 4], J[1, 3] = r2 + 2 * x * x, r2 + 2 * y * y
-    if model == 'plumb_bob':
-        return J
-    g, _, denominator = _radial(model, r2, coefficients)
-    J[:, :3] /= denominator
-    J[:, 5:8] = -g * J[:, :3]
-    if model == 'rational_polynomial':
-        return J
-    J[0, 8] = J[1, 10] = r2
-    J[0, 9] = J[1, 11] = r2 * r2
-    if model == 'thin_prism':
-        return J
+
+
+def _by_tilt(J: Floats, ideal: Floats, coefficients: Floats) -> None:
+    """Derivatives (2, 14, ...) by the angles of the detector into J, the others through them."""
     tau_x, tau_y = coefficients[12:]
     xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
     J[:, :12] = np.einsum('...ij,jk...->ik...', _tilt_jacobian(xd, yd, tau_x, tau_y), J[:, :12])
@@ -230,7 +349,6 @@ def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Flo
     J[1, 12] = (-cx * sy * xd - yt * w_by_x) / w
     J[0, 13] = -xt * w_by_y / w
     J[1, 13] = (-sy * yd - sx * cy * xd - yt * w_by_y) / w
-    return J
 
 
 def _tilt(x: Floats, y: Floats, tau_x: Floats, tau_y: Floats) -> tuple[Floats, Floats, Floats]:
@@ -252,33 +370,6 @@ def _tilt_jacobian(x: Floats, y: Floats, tau_x: Floats, tau_y: Floats) -> Floats
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) / w[..., None, None]
 
 
-def fold_radius2(model: str, coefficients: Floats) -> float:
-    """
-    Squared radius of the ideal plane from which the radial distortion has no inverse.
-
-    There the distorted radius stops growing, or a rational polynomial has its pole; infinite
-    where it grows without end.  180 degrees at most for ``equidistant``.
-    """
-    return _fold_radius2(model, *coefficients.tolist())
-
-
-@functools.lru_cache(maxsize=64)
-def _fold_radius2(model: str, *coefficients: float) -> float:
-    if model == _EQUIDISTANT:
-        k1, k2, k3, k4 = coefficients
-        # The odd polynomial's derivative by the radius.
-        return min(_least_positive_root([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0]), np.pi**2)
-    k1, k2, k3 = coefficients[:3]
-    if model == 'plumb_bob':
-        return _least_positive_root([7 * k3, 5 * k2, 3 * k1, 1.0])
-    numerator = np.poly1d([k3, k2, k1, 1.0])
-    denominator = np.poly1d([*coefficients[7:4:-1], 1.0])
-    growth = numerator * denominator + np.poly1d([2.0, 0.0]) * (
-        numerator.deriv() * denominator - numerator * denominator.deriv()
-    )
-    return min(_least_positive_root(growth.coeffs), _least_positive_root(denominator.coeffs))
-
-
 def _least_positive_root(polynomial: object) -> float:
     """Least positive root of a polynomial with the constant 1, highest power first."""
     # The reciprocals of the roots are sought: a first coefficient of 1e-313 overflows as divisor.
@@ -288,44 +379,122 @@ def _least_positive_root(polynomial: object) -> float:
     return float(real.min(initial=np.inf))
 
 
-# Number of coefficients in ROS -> lens model, for `rational_polynomial` and its OpenCV extensions.
-_BY_COUNT = {8: 'rational_polynomial', 12: 'thin_prism', 14: 'tilted'}
+def _of_opencv(
+    name: str, coefficients: tuple[str, ...], parts: _OpenCv, mrcal: str = '', giant: str = ''
+) -> LensModel:
+    """Row of a perspective model of OpenCV."""
+    is_rational = parts.has_denominator
+    return LensModel(
+        name,
+        coefficients,
+        parts.distort,
+        parts.by_ideal,
+        parts.by_coefficients,
+        parts.fold_radius2,
+        'rational_polynomial' if is_rational else 'plumb_bob',
+        (0, 1, 3, 4, 2, *range(5, len(coefficients))),  # ROS has k3 after p1 and p2
+        _RATIONAL_EQUATIONS if is_rational else _BROWN_EQUATIONS,
+        is_redundant=is_rational,
+        is_guarded=is_rational,
+        mrcal=mrcal,
+        giant=giant,
+    )
+
+
+_BROWN = ('k1', 'k2', 'k3', 'p1', 'p2')
+_RATIONAL = (*_BROWN, 'k4', 'k5', 'k6')
+_PRISM = (*_RATIONAL, 's1', 's2', 's3', 's4')
+_BROWN_EQUATIONS = (
+    'g  = 1 + k1 r2 + k2 r2^2 + k3 r2^3',
+    "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)",
+    "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y",
+)
+_RATIONAL_EQUATIONS = (
+    'g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)',
+    "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2",
+    "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2",
+    'then, with tau_x and tau_y, the tilted detector of OpenCV; absent coefficients are 0',
+)
+_EQUIDISTANT = LensModel(
+    'equidistant',
+    ('k1', 'k2', 'k3', 'k4'),
+    _Equidistant.distort,
+    _Equidistant.by_ideal,
+    _Equidistant.by_coefficients,
+    _Equidistant.fold_radius2,
+    'equidistant',
+    (0, 1, 2, 3),
+    (
+        'x = theta cos(phi), y = theta sin(phi) in place of X/Z, Y/Z, with theta the',
+        'angle from +Z in radians and phi the azimuth from +X;',
+        "(x', y') = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) (x, y)",
+    ),
+    is_angular=True,
+    opencv='fisheye',
+)
+
+LENSES: dict[str, LensModel] = {
+    lens.name: lens
+    for lens in (
+        _of_opencv(
+            'plumb_bob',
+            _BROWN,
+            _OpenCv(5, has_denominator=False, has_prism=False, has_tilt=False),
+            mrcal='LENSMODEL_OPENCV5',
+            giant='OpenCVModel',
+        ),
+        _of_opencv(
+            'rational_polynomial',
+            _RATIONAL,
+            _OpenCv(8, has_prism=False, has_tilt=False),
+            mrcal='LENSMODEL_OPENCV8',
+            giant='OpenCVModel',
+        ),
+        _of_opencv(
+            'thin_prism',
+            _PRISM,
+            _OpenCv(12, has_tilt=False),
+            mrcal='LENSMODEL_OPENCV12',
+            giant='OpenCVModel',
+        ),
+        _of_opencv('tilted', (*_PRISM, 'tau_x', 'tau_y'), _OpenCv(14)),
+        _EQUIDISTANT,
+    )
+}
+"""Name -> lens model."""
 
 
 def ros_distortion(model: str, coefficients: Floats) -> tuple[str, Floats]:
     """
     ``distortion_model`` and ``D`` (c,) of a ``CameraInfo``.
 
-    ROS has k3 after p1 and p2, and the name ``rational_polynomial`` for OpenCV's models of 8, 12
-    and 14 coefficients, which its readers pass to OpenCV.
+    ROS has the name ``rational_polynomial`` for OpenCV's models of 8, 12 and 14 coefficients,
+    which its readers pass to OpenCV.
     """
-    if model == _EQUIDISTANT:
-        return model, np.array(coefficients)
-    ros_model = 'plumb_bob' if model == 'plumb_bob' else 'rational_polynomial'
-    return ros_model, np.asarray(coefficients)[[0, 1, 3, 4, 2, *range(5, len(coefficients))]]
+    lens = LENSES[model]
+    return lens.ros, np.asarray(coefficients)[list(lens.ros_order)]
 
 
 def from_ros_distortion(distortion_model: str, D: Sequence[float]) -> tuple[str, Floats]:
     """
     Lens model and coefficients (c,) of a ``CameraInfo``.
 
-    Raises ValueError for an unknown model or a wrong number of coefficients.
+    No coefficients at all are zeros.  Raises ValueError for an unknown model or a wrong number of
+    coefficients.
     """
-    if distortion_model in (_EQUIDISTANT, 'fisheye'):
-        if len(D) != 4:
-            raise ValueError(f'{len(D)} coefficients of {distortion_model}, which has 4')
-        return _EQUIDISTANT, np.array(D, np.float64)
-    if distortion_model == 'plumb_bob':
-        if len(D) not in (4, 5):
-            raise ValueError(f'{len(D)} coefficients of plumb_bob, which has 4 or 5')
-        model, D = distortion_model, [*D, 0.0][:5]
-    elif distortion_model == 'rational_polynomial' or distortion_model.startswith('thin_prism'):
-        if len(D) not in _BY_COUNT:
-            raise ValueError(f'{len(D)} coefficients of {distortion_model}, not 8, 12 or 14')
-        model = _BY_COUNT[len(D)]
-    else:
-        raise ValueError(
-            f'{distortion_model!r} is not plumb_bob, rational_polynomial, thin_prism, equidistant '
-            'or fisheye'
-        )
-    return model, np.array(D, np.float64)[[0, 1, 4, 2, 3, *range(5, len(D))]]
+    asked = 'equidistant' if distortion_model == 'fisheye' else distortion_model
+    if asked.startswith('thin_prism'):
+        asked = 'rational_polynomial'
+    named = [lens for lens in LENSES.values() if lens.ros == asked]
+    if not named:
+        known = ', '.join(dict.fromkeys(lens.ros for lens in LENSES.values()))
+        raise ValueError(f'{distortion_model!r} is not {known}, thin_prism or fisheye')
+    if not len(D) or (asked == 'plumb_bob' and len(D) == 4):  # ROS 1 wrote no k3
+        D = [*D, *[0.0] * (len(named[0].coefficients) - len(D))]
+    for lens in named:
+        if len(lens.coefficients) == len(D):
+            values = np.empty(len(D))
+            values[list(lens.ros_order)] = D
+            return lens.name, values
+    counts = ' or '.join(str(len(lens.coefficients)) for lens in named)
+    raise ValueError(f'{len(D)} coefficients of {distortion_model}, which has {counts}')

@@ -4,7 +4,7 @@ The camera: an ideal image plane, a lens model, skew; inverse, derivatives and c
 
 The parameters are one vector, in this order everywhere::
 
-    fx skew fy cx cy  then the coefficients of the lens model (`lens.COEFFICIENTS`)
+    fx skew fy cx cy  then the coefficients of the lens model (`lens.LENSES`)
 
 With (x', y') the distorted point of the image plane (`lens.distort`)::
 
@@ -38,7 +38,7 @@ INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 
 def parameter_names(model: str) -> tuple[str, ...]:
     """Names of the parameters of a lens model, in order."""
-    return INTRINSIC_NAMES + lens.COEFFICIENTS[model]
+    return INTRINSIC_NAMES + lens.LENSES[model].coefficients
 
 
 PARAMETER_NAMES = parameter_names('plumb_bob')
@@ -62,7 +62,7 @@ class CameraModel(Record):
     A camera: image size in pixels, parameters and lens model.
 
     ``parameters`` is (p,) in the order of `parameter_names`; ``model`` a key of
-    `lens.COEFFICIENTS`; ``field`` a displacement that the lens model does not describe.  Raises
+    `lens.LENSES`; ``field`` a displacement that the lens model does not describe.  Raises
     ValueError for an unknown model, for parameters that are not p finite numbers, and for a focal
     length that is not positive.
 
@@ -84,10 +84,7 @@ class CameraModel(Record):
 
     def __post_init__(self) -> None:
         """Freeze a float copy of the parameters."""
-        if self.model not in lens.COEFFICIENTS:
-            raise ValueError(
-                f'lens model: {self.model!r} is not one of {", ".join(lens.COEFFICIENTS)}'
-            )
+        lens.lens_named(self.model)
         parameters = np.array(self.parameters, np.float64)
         count = len(self.parameter_names)
         if parameters.shape != (count,) or not np.isfinite(parameters).all():
@@ -115,7 +112,7 @@ class CameraModel(Record):
 
     @property
     def distortion(self) -> Floats:
-        """Coefficients (c,) of the lens model, in the order of `lens.COEFFICIENTS`."""
+        """Coefficients (c,) of the lens model, in the order of `lens.LENSES`."""
         return self.parameters[5:]
 
     @property
@@ -170,7 +167,7 @@ def check_plausible(camera: CameraModel) -> None:
     width, height = camera.width, camera.height
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     side_px = max(width, height)
-    if camera.model == 'equidistant':
+    if lens.LENSES[camera.model].is_angular:
         least_px = float(np.hypot(width, height)) / (2 * np.pi)
     else:
         least_px = _MIN_FOCAL_OF_SIDE * side_px
@@ -332,7 +329,7 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
 def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
     """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
     e = np.asarray(directions_camera, np.float64)
-    if model == 'equidistant':
+    if lens.LENSES[model].is_angular:
         return lens.ideal_points(model, e)
     z_inverse = 1.0 / e[..., 2]
     return np.asarray(e[..., :2] * z_inverse[..., None])
@@ -352,7 +349,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         pixels = pixels - field.displacement_px(pixels)
     target = _plane_points(camera, pixels)
     # Newton's method does not return from beyond a fold or a pole: start and steps stay inside.
-    guarded = model != 'plumb_bob'
+    guarded = lens.LENSES[model].is_guarded
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
     error = np.full(target.shape, np.inf)
     for _ in range(_INVERSE_STEPS):
@@ -455,11 +452,10 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     """
     if model == camera.model and not camera.has_field:
         return dataclasses.replace(camera, field=None), 0.0
-    if model not in lens.COEFFICIENTS:
-        raise ValueError(f'lens model: {model!r} is not one of {", ".join(lens.COEFFICIENTS)}')
+    is_angular = lens.lens_named(model).is_angular
     names = parameter_names(model)
     known = dict(zip(camera.parameter_names, camera.parameters, strict=True))
-    same_plane = 'equidistant' not in (model, camera.model)
+    same_plane = not (is_angular or lens.LENSES[camera.model].is_angular)
     start = np.array([known.get(name, 0.0) for name in names])
     if not same_plane:
         start[5:] = 0.0
@@ -502,7 +498,7 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     # Numerator and denominator of a rational polynomial can grow together: without a penalty
     # the coefficients reach 10^4 for a gain of 1e-3 px.
     held_px = np.diag(np.where(np.arange(len(start.parameters)) < 5, 0.0, _HELD_PX))[free][:, free]
-    if start.model in ('plumb_bob', 'equidistant'):
+    if not lens.LENSES[start.model].is_redundant:
         held_px = held_px[:0]
 
     def residual(x: Floats) -> Floats:

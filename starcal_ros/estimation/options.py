@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import ALL_PARAMETER_NAMES, parameter_names
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.problem import METHODS
@@ -189,7 +189,7 @@ def estimated_parameters(options: CalibrationOptions, model: str) -> tuple[str, 
     return tuple(
         name
         for asked in options.estimate
-        for name in (COEFFICIENTS[model] if asked == 'distortion' else (asked,))
+        for name in (LENSES[model].coefficients if asked == 'distortion' else (asked,))
     )
 
 

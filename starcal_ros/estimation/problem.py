@@ -66,7 +66,7 @@ class Problem:
     ----------
     method : str
     model : str
-        Lens model, of `lens.COEFFICIENTS`; it has p camera parameters.
+        Lens model, of `lens.LENSES`; it has p camera parameters.
     free : (f,) int
         Camera parameters that are estimated, ascending.
     prior_parameters, prior_sigma : (p,)

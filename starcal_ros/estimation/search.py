@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera.lens import coefficient_jacobian, COEFFICIENTS
+from starcal_ros.camera.lens import coefficient_jacobian, LENSES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.equations import arrow, stars_alone
@@ -128,7 +128,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
         first_from_star_tracker=mountings,
         mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
         time_s=late_s - np.average(late_s, weights=stars),
-        is_weak=is_default & np.isin(camera.parameter_names, COEFFICIENTS[model]),
+        is_weak=is_default & np.isin(camera.parameter_names, LENSES[model].coefficients),
     )
 
 
@@ -142,7 +142,7 @@ def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
     show.
     """
     corner = 0.5 * np.array([camera.width, camera.height]) / camera.parameters[0]
-    none = np.zeros(len(COEFFICIENTS[camera.model]))
+    none = np.zeros(len(LENSES[camera.model].coefficients))
     effect, half_way = (
         np.linalg.norm(coefficient_jacobian(camera.model, part * corner, none), axis=0)
         for part in (1.0, 0.5)

@@ -164,7 +164,7 @@ def normal_blocks(
     Parameters
     ----------
     model : str
-        Lens model, of `lens.COEFFICIENTS`.
+        Lens model, of `lens.LENSES`.
     parameters : (p,) or (m, p)
         Camera parameters of all images, or of each.
     camera_from_icrf : (m, 3, 3)

@@ -36,6 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.amplitudes import UNSTATED
 from starcal_ros.estimation.problem import (
@@ -506,7 +507,7 @@ def _by_scale(model: str, pixels: Floats, directions: Floats, image: Indices) ->
     del pixels, image
     x, y, z = directions
     sine = np.hypot(x, y)
-    if model == 'equidistant':  # the angle in place of its tangent
+    if LENSES[model].is_angular:  # the angle in place of its tangent
         z = np.arctan2(sine, z) / np.maximum(sine, 1e-12)
     return np.stack([z * y, -z * x, 0.0 * x])[:, None]
 

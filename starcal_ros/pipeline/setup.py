@@ -28,7 +28,7 @@ from starcal_ros import options
 from starcal_ros.arrays import AnyArray, Floats, Indices, Pixels
 from starcal_ros.assessment.gate import GateOptions, requirements_of
 from starcal_ros.camera import CameraModel
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import IngestError, OptionError
@@ -155,7 +155,7 @@ class SetupOptions:
         'lens model to estimate; prior: the model of the prior camera; auto: the smallest model'
         ' that leaves no significant residual field, as for images without attitudes and camera'
         ' file; other models start from a fit to the prior camera',
-        choices=('prior', 'auto', *COEFFICIENTS),
+        choices=('prior', 'auto', *LENSES),
     )
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 0.0),

@@ -25,7 +25,7 @@ from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.predictions import Residuals, residuals_of
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert, ros_fit
 from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import errors_as, OptionError, TooFewObservations
@@ -273,7 +273,9 @@ def estimate_with_smallest_lens(
     """
     least = math.inf
     best: tuple[Estimate, CameraGeometry] | None = None
-    others = sorted(COEFFICIENTS.keys() - {prior.camera.model}, key=lambda m: len(COEFFICIENTS[m]))
+    others = sorted(
+        LENSES.keys() - {prior.camera.model}, key=lambda m: len(LENSES[m].coefficients)
+    )
     for model in (prior.camera.model, *others):
         camera, worst_px = convert(prior.camera, model)
         if not math.isfinite(worst_px):
@@ -293,8 +295,8 @@ def estimate_with_smallest_lens(
         ratio = estimate.posterior.field.likelihood_ratio
         if ratio < _CHANCE:
             return estimate, started
-        if ratio + _PER_COEFFICIENT * len(COEFFICIENTS[model]) < least:
-            least = ratio + _PER_COEFFICIENT * len(COEFFICIENTS[model])
+        if ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients) < least:
+            least = ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients)
             best = estimate, started
     if best is None:
         raise TooFewObservations('no lens model describes the prior camera')

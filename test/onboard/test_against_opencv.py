@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
-from starcal_ros.camera.lens import COEFFICIENTS, ros_distortion
+from starcal_ros.camera.lens import LENSES, ros_distortion
 
 # Distortion at the edge of a 20 degree field and of a wide one: (k1, k2, k3, p1, p2) scales.
 NARROW = np.array([0.1, 0.3, 1.0, 1e-3, 1e-3])
@@ -116,7 +116,7 @@ LARGEST = np.r_[0.2, 0.05, 0.01, 2e-3, 2e-3, 0.2, 0.05, 0.01, np.full(4, 2e-3), 
 
 def random_lens(model: str, seed: int) -> CameraModel:
     rng = np.random.default_rng(seed)
-    count = len(COEFFICIENTS[model])
+    count = len(LENSES[model].coefficients)
     scale = np.array([0.05, 0.02, 5e-3, 1e-3]) if model == 'equidistant' else LARGEST[:count]
     intrinsics = [1500.0, 0.0, 1500 * (1 + 0.001 * rng.normal()), *rng.normal([1295, 1023], 15)]
     return CameraModel(2592, 2048, np.r_[intrinsics, scale * rng.uniform(-1, 1, count)], model)
@@ -134,7 +134,7 @@ def opencv_of(camera: CameraModel, e: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return pixels.reshape(-1, 2), J.reshape(len(e), 2, -1)
 
 
-@pytest.mark.parametrize('model', COEFFICIENTS)
+@pytest.mark.parametrize('model', LENSES)
 @pytest.mark.parametrize('seed', range(3))
 def test_pixels_of_every_model(model: str, seed: int) -> None:
     camera = random_lens(model, seed)
@@ -144,7 +144,7 @@ def test_pixels_of_every_model(model: str, seed: int) -> None:
     np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize('model', COEFFICIENTS)
+@pytest.mark.parametrize('model', LENSES)
 def test_derivatives_of_every_model(model: str) -> None:
     camera = random_lens(model, 7)
     e = directions(7, 0.8)
@@ -169,7 +169,7 @@ def test_derivatives_of_every_model(model: str) -> None:
     np.testing.assert_allclose(J_rotation, -rotation, rtol=0, atol=1e-11 * 1500)
 
 
-@pytest.mark.parametrize('model', COEFFICIENTS)
+@pytest.mark.parametrize('model', LENSES)
 def test_line_of_sight_of_every_model(model: str) -> None:
     camera = random_lens(model, 11).replace(fx=3000.0, fy=3001.0)  # no fold within the detector
     e = line_of_sight(camera, pixel_grid(camera, 25, 20))

@@ -23,7 +23,7 @@ from starcal_ground.mission.export.exported import ascii_line, Content, origin
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import pixel_grid
-from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
+from starcal_ros.camera.lens import fold_radius2
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import calibration_text
@@ -32,6 +32,8 @@ from starcal_ros.records import Calibration, ResidualField
 TABLE_FILE = 'starcal_camera.bin'
 _MAGIC = b'STARCALT'
 _VERSION = 1  # STARCAL_TABLE_VERSION
+# The enumeration of starcal_camera.c.
+_MODELS = ('plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidistant')
 _MOST_WAVES = 128  # STARCAL_MAX_WAVES
 _NAME_SIZE = 32  # STARCAL_NAME_SIZE
 _VECTORS_A_SIDE = 5
@@ -69,9 +71,12 @@ def c_table(calibration: Calibration) -> bytes:
     """
     Binary table of a calibration.
 
-    Raises OptionError for a field with more waves than the C code has room for.
+    Raises OptionError for a lens model that the C code does not have, and for a field with more
+    waves than it has room for.
     """
     camera = calibration.geometry.camera
+    if camera.model not in _MODELS:
+        raise OptionError(f'--to c: the C code has no lens model {camera.model}')
     field = _factored(calibration)
     terms = np.empty((0, 2), np.int64) if camera.field is None else camera.field.orders
     if terms.max(initial=0) >= _MOST_WAVES:
@@ -108,7 +113,7 @@ def c_table(calibration: Calibration) -> bytes:
     body += triangle.T[np.triu_indices(len(triangle))].astype('<i2').tobytes()
     head = struct.pack(
         '<8I12xq32s16x',
-        list(COEFFICIENTS).index(camera.model),
+        _MODELS.index(camera.model),
         camera.width,
         camera.height,
         len(terms),

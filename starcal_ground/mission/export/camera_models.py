@@ -27,16 +27,11 @@ from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_
 from starcal_ground.products import CAMERA_INFO_FILE, camera_info_text, yaml_text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
-from starcal_ros.camera.lens import ros_distortion
+from starcal_ros.camera.lens import LENSES, ros_distortion
 from starcal_ros.records import Calibration
 
-_OF_GIANT = ('plumb_bob', 'rational_polynomial', 'thin_prism')  # within OpenCVModel
+_LARGEST = 'thin_prism'  # of the models that GIANT and mrcal have
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
-_MRCAL = {
-    'plumb_bob': 'LENSMODEL_OPENCV5',
-    'rational_polynomial': 'LENSMODEL_OPENCV8',
-    'thin_prism': 'LENSMODEL_OPENCV12',
-}
 
 
 def opencv_yaml(calibration: Calibration) -> exported.Content:
@@ -57,7 +52,7 @@ def opencv_yaml(calibration: Calibration) -> exported.Content:
         '---',
         f'image_width: {camera.width}',
         f'image_height: {camera.height}',
-        f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
+        f'lens_model: {LENSES[camera.model].opencv}',
         *_opencv_matrix('camera_matrix', camera.camera_matrix),
         *_opencv_matrix('distortion_coefficients', D[None, :]),
         *(_opencv_matrix('rotation', rotation) if aligned else []),
@@ -98,7 +93,7 @@ def giant_json(calibration: Calibration) -> exported.Content:
     ``star_tracker_from_camera_xyzw`` is a separate key: a camera model of GIANT has no alignment.
     """
     own = calibration.geometry.camera.model
-    camera, made = exported.fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
+    camera, made = exported.fitted(calibration, own if LENSES[own].giant else _LARGEST, ())
     # GIANT has the change of the focal length with temperature: it is no loss.
     losses = tuple(loss for loss in made.losses if 'focal' not in loss.part)
     made = dataclasses.replace(made, losses=losses)
@@ -130,14 +125,14 @@ def giant_json(calibration: Calibration) -> exported.Content:
 def mrcal_cameramodel(calibration: Calibration) -> exported.Content:
     """Text for ``mrcal.cameramodel``; ``extrinsics`` are rt_cam_ref."""
     own = calibration.geometry.camera.model
-    camera, made = exported.fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
+    camera, made = exported.fitted(calibration, own if LENSES[own].mrcal else _LARGEST, ('skew',))
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
     rt = [*calibration.geometry.star_tracker_from_camera.inv().as_rotvec().tolist(), 0.0, 0.0, 0.0]
     lines = [
         *_commented(exported.about(calibration, made)),
         '{',
-        f"    'lensmodel':  '{_MRCAL[camera.model]}',",
+        f"    'lensmodel':  '{LENSES[camera.model].mrcal}',",
         f"    'extrinsics': {rt!r},",
         f"    'intrinsics': {[fx, fy, cx, cy, *D.tolist()]!r},",
         f"    'imagersize': {[camera.width, camera.height]!r},",

@@ -28,6 +28,7 @@ from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.detector_field import COSINE_DOMAIN
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.estimation.problem import camera_at
@@ -43,25 +44,6 @@ _INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID
 _SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
 _WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
 UM_PER_MM = 1000.0
-
-_MODEL_IN_WORDS = {
-    'plumb_bob': (
-        'g  = 1 + k1 r2 + k2 r2^2 + k3 r2^3',
-        "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)",
-        "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y",
-    ),
-    'equidistant': (
-        'x = theta cos(phi), y = theta sin(phi) in place of X/Z, Y/Z, with theta the',
-        'angle from +Z in radians and phi the azimuth from +X;',
-        "(x', y') = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) (x, y)",
-    ),
-}
-_OPENCV_IN_WORDS = (
-    'g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)',
-    "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2",
-    "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2",
-    'then, with tau_x and tau_y, the tilted detector of OpenCV; absent coefficients are 0',
-)
 
 
 @dataclass(frozen=True)
@@ -259,7 +241,7 @@ def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
         'A direction (X, Y, Z) of the camera frame is seen at pixel (u, v), with',
         'x = X/Z, y = Y/Z, r2 = x^2 + y^2, and LENS_COEFFICIENTS named by LENS_TERMS:',
         '',
-        *(f'   {line}' for line in _MODEL_IN_WORDS.get(camera.model, _OPENCV_IN_WORDS)),
+        *(f'   {line}' for line in LENSES[camera.model].equations),
         "   u = FOCAL_LENGTH_PX(1) x' + SKEW_PX y' + CCD_CENTER(1)",
         "   v = FOCAL_LENGTH_PX(2) y' + CCD_CENTER(2)",
     ]

@@ -52,9 +52,8 @@ class _CameraInfo:
         fx, skew, cx, zero, fy, cy = K[:6]
         if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):
             raise ValueError(f'camera_matrix.data: {list(K)} is not [fx s cx 0 fy cy 0 0 1]')
+        # None: ROS writes so where a lens has no distortion.
         data = list(self.distortion_coefficients.data)
-        if not data:  # none: ROS writes so where a lens has no distortion
-            data = [0.0] * (4 if self.distortion_model in ('equidistant', 'fisheye') else 5)
         try:
             model, distortion = from_ros_distortion(self.distortion_model[:60], data)
         except ValueError as error:

@@ -21,11 +21,11 @@ from starcal_ros.camera import (
 )
 from starcal_ros.camera.lens import (
     coefficient_jacobian,
-    COEFFICIENTS,
     distort,
     distort_jacobian,
     fold_radius2,
     ideal_points,
+    LENSES,
 )
 from starcal_ros.camera.projection import convert, ros_fit
 
@@ -317,8 +317,8 @@ def test_a_tilted_detector_is_not_seen_from_behind() -> None:
 @each_camera
 def test_a_camera_becomes_one_of_a_larger_model(camera: CameraModel) -> None:
     e = line_of_sight(camera, pixel_grid(camera, 9, 7))
-    for model, names in COEFFICIENTS.items():
-        larger = set(camera.parameter_names[5:]) <= set(names)
+    for model, row in LENSES.items():
+        larger = set(camera.parameter_names[5:]) <= set(row.coefficients)
         if 'equidistant' in (model, camera.model) or not larger:
             continue
         converted, worst_px = convert(camera, model)
@@ -354,7 +354,7 @@ def test_what_a_pinhole_cannot_see_costs_everything() -> None:
 
 
 def test_models_and_their_names() -> None:
-    for model in COEFFICIENTS:
+    for model in LENSES:
         assert set(parameter_names(model)) <= set(ALL_PARAMETER_NAMES)
     with pytest.raises(ValueError, match='9 finite numbers'):
         CameraModel(10, 10, CAMERAS['paper'].parameters, 'equidistant')

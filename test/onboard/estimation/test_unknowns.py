@@ -30,7 +30,7 @@ from scipy.special import eval_jacobi
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project, rotation_jacobian
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.estimation import unknowns as module
 from starcal_ros.estimation.equations import star_columns, tracker_turns
 from starcal_ros.estimation.problem import attitude_errors
@@ -146,7 +146,7 @@ def test_a_derivative_by_pixels_is_that_of_the_projection(
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
 def test_lateral_colour_is_a_change_of_the_focal_length(model: str) -> None:
     centre_px, angle = np.array([600.0, 400.0]), np.linspace(0.0, 1.2, 7)
-    parameters = np.r_[[900.0, 0.0, 900.0], centre_px, np.zeros(len(COEFFICIENTS[model]))]
+    parameters = np.r_[[900.0, 0.0, 900.0], centre_px, np.zeros(len(LENSES[model].coefficients))]
     camera = CameraModel(WIDTH, HEIGHT, parameters, model)
     e = np.stack([0.8 * np.sin(angle), 0.6 * np.sin(angle), np.cos(angle)], axis=1)
     turns = module._by_scale(model, e.T, e.T, np.zeros(7, np.int64))[:, 0]

@@ -16,7 +16,7 @@ import spiceypy
 from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid
-from starcal_ros.camera.lens import COEFFICIENTS
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.errors import OptionError
 from starcal_ros.records import Calibration
 
@@ -50,7 +50,7 @@ def seen_at(direction: np.ndarray) -> np.ndarray:
     """Pixel of a direction by the numbers and the equations of the IK alone."""
     model = spiceypy.gcpool('INS-999001_LENS_MODEL', 0, 1)[0]
     terms = spiceypy.gcpool('INS-999001_LENS_TERMS', 0, 20)
-    term = dict.fromkeys(COEFFICIENTS['tilted'], 0.0)
+    term = dict.fromkeys(LENSES['tilted'].coefficients, 0.0)
     term |= dict(zip(terms, pool('LENS_COEFFICIENTS'), strict=True))
     k1, k2, k3, p1, p2, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = term.values()
     X, Y, Z = direction

@@ -116,7 +116,7 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
     ('old', 'new', 'says'),
     [
         ('plumb_bob', 'equidistant', 'distortion_model: 5 coefficients of equidistant, .* has 4'),
-        ('plumb_bob', 'rational_polynomial', 'rational_polynomial, not 8, 12 or 14'),
+        ('plumb_bob', 'rational_polynomial', 'rational_polynomial, which has 8 or 12 or 14'),
         ('plumb_bob', 'double_sphere', "distortion_model: 'double_sphere' is not plumb_bob, rat"),
         ('plumb_bob', '[1]', r'distortion_model: \[1\] is not a text'),
         ('image_width: 640', '', "key 'image_width' is missing"),
@@ -147,7 +147,7 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         (
             '[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]',
             '[-0.1]',
-            '1 coefficients of plumb_bob, .* 4 or 5',
+            '1 coefficients of plumb_bob, which has 5',
         ),
         ('-0.1, 1e-2', 'true, 1e-2', r'coefficients.data\[0\]: True is not a number'),
         ('-0.1, 1e-2', 'big, 1e-2', r"coefficients.data\[0\]: 'big' is not a number"),
