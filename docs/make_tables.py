@@ -2,8 +2,8 @@
 """
 Write the tables of docs/icd.md from the code: ``python -m docs.make_tables [--check]``.
 
-Parameters come from the options dataclasses, refusal reasons from the records.  With --check
-nothing is written; the exit status is 1 if a table is out of date.
+Parameters come from the options dataclasses, refusal reasons and needed fields from the records.
+With --check nothing is written; the exit status is 1 if a table is out of date.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 import re
 import sys
+import textwrap
 from typing import Any
 
 from starcal_ros.pipeline.setup import (
@@ -23,7 +24,8 @@ from starcal_ros.pipeline.setup import (
     OPTION_CLASSES,
     PlayerOptions,
 )
-from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
+from starcal_ros.record_fields import fields_of as fields_of_record
+from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS, StarObservations
 from tools.write_parameters import allowed, as_yaml, fields_of
 
 FILE = Path(__file__).parent / 'icd.md'
@@ -49,7 +51,15 @@ def reason_table(reasons: Mapping[str, str]) -> str:
     return '\n'.join(['| reason | meaning |', '|---|---|', *rows])
 
 
+def needed_fields() -> str:
+    """Names of the fields that a message of observations needs: those without a default."""
+    kinds = fields_of_record(StarObservations).values()
+    needed = [f'`{kind.in_messages}`' for kind in kinds if not kind.has_default]
+    return textwrap.fill(f'Needed are {", ".join(needed[:-1])} and {needed[-1]}.', 120)
+
+
 TABLES = {
+    'needed fields of observations': needed_fields(),
     'basic parameters': parameter_table(*OPTION_CLASSES, *NODE_OPTION_CLASSES, basic=True),
     'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
     'parameters of star_observer': parameter_table(ObserverOptions),

@@ -212,7 +212,7 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
     """
     Plain values of the message of a record by the names of its fields; arrays have their shapes.
 
-    Fields that the message does not have are omitted.
+    Fields that the message does not have are omitted, and empty arrays that may be missing.
 
     Raises ValueError with the name of an array whose size contradicts other fields.
     """
@@ -231,7 +231,10 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
         elif kind.kind is np.ndarray:
             for word in filter(_is_word, kind.dimensions):
                 sizes[word] = int(getattr(message, str(word)))
-            values[field] = _shaped(np.asarray(getattr(message, field)), kind, field, sizes)
+            flat = np.asarray(getattr(message, field))
+            if kind.has_default and not flat.size:
+                continue  # ROS has no other way to leave a sequence out
+            values[field] = _shaped(flat, kind, field, sizes)
             sizes |= zip(kind.dimensions, values[field].shape, strict=True)
         else:
             values[field] = _value(kind, getattr(message, field))
@@ -265,8 +268,6 @@ def _shaped(
         shape[shape.index(-1)] = flat.size // known if known else 0
     elif -1 in shape:  # both sides have the same name: a square
         shape = [math.isqrt(flat.size) if size == -1 else size for size in shape]
-    if not flat.size and kind.low is not None and not kind.is_finite:
-        return np.full(shape, math.nan, flat.dtype)  # left out: numbers that are not known
     if flat.size != math.prod(shape):
         raise ValueError(f'{field}: {flat.size} numbers, not {" x ".join(map(str, shape))}')
     return flat.reshape(shape)
