@@ -96,9 +96,8 @@ def zeroed(value: Any, is_sequence: bool) -> Any:
     return type(value)()
 
 
-NEEDED = {
-    kind.in_messages for kind in fields_of(StarObservations).values() if not kind.has_default
-}
+KINDS = fields_of(StarObservations).items()
+NEEDED = {kind.in_messages for _, kind in KINDS if not kind.has_default}
 
 
 @pytest.mark.parametrize('lacking', FIELDS[1:])
