@@ -155,7 +155,8 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
             f'A is of a camera of {camera_a.width} x {camera_a.height}, '
             f'B of one of {camera_b.width} x {camera_b.height}: they cannot be compared'
         )
-    difference, covariance = np.empty(0), np.empty((0, 0))
+    difference: Floats = np.empty(0)
+    covariance: Floats = np.empty((0, 0))
     if camera_a.model == camera_b.model:
         difference = parameter_difference(b.geometry, a.geometry)
         covariance = a.covariance + b.covariance

@@ -594,7 +594,7 @@ REMEDIES: Mapping[str, str] = {
         'record attitudes more often, or raise max_attitude_gap_s if the vehicle turns evenly'
     ),
     'frozen_attitude': 'record the attitudes that the star tracker measures',
-    'out_of_order': 'use one topic for each camera, and sort the images of a bag by their stamps',
+    'out_of_order': 'use one topic for each camera, and send images in the order of their stamps',
     'overexposed': 'expose for a shorter time',
     'blank': 'check that the camera is read out',
     'frozen': 'check that the camera is read out',

@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -69,7 +70,9 @@ class RawMessage:
     """
     A message as recorded or received.
 
-    ``view`` is serialised CDR with its header, ``definition`` that of its type in the bag.
+    ``view`` is serialised CDR with its header, ``definition`` that of its type in the bag;
+    ``place`` is its file, the offset of its chunk there, or its own, and its number in the chunk;
+    None where the reader does not know it.
     """
 
     topic: str
@@ -77,6 +80,7 @@ class RawMessage:
     definition: str
     log_time_ns: int
     view: memoryview
+    place: tuple[Path, int, int] | None = None
 
     @property
     def data(self) -> bytes:
