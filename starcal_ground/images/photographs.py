@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-import glob
 import importlib
 import io
 import itertools
@@ -27,7 +26,16 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ground.file_kinds import FileKind, FITS, IMAGES_READ, JPEG, kind_of, RAW, UNKNOWN
+from starcal_ground.file_kinds import (
+    FileKind,
+    FITS,
+    IMAGES_READ,
+    JPEG,
+    kind_of,
+    matching,
+    RAW,
+    UNKNOWN,
+)
 from starcal_ground.images.time_systems import middle_of_exposure, number
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -93,13 +101,11 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
     """
     files: list[Path] = []
     bags: list[Path] = []
-    for path in paths:
-        if glob.has_magic(str(path)) and not path.exists():
-            names = sorted(glob.glob(str(path)))
-            if not names:
-                raise IngestError(f'{path}: no such files')
-            files += map(Path, names)
-        elif not path.is_dir():
+    expanded = {pattern: matching(pattern) for pattern in paths}
+    if nothing := next((pattern for pattern, found in expanded.items() if not found), None):
+        raise IngestError(f'{nothing}: no such files')
+    for path in itertools.chain.from_iterable(expanded.values()):
+        if not path.is_dir():
             files.append(path)
         elif not (any(path.glob('*.mcap*')) or (path / 'metadata.yaml').exists()):
             files += sorted(file for file in path.iterdir() if not file.name.startswith('.'))

@@ -18,11 +18,11 @@ file to calibrate the bag.
 import argparse
 from collections.abc import Sequence
 import dataclasses
-import glob
 from pathlib import Path
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.file_kinds import matching
 from starcal_ros.errors import OptionError
 
 
@@ -124,8 +124,7 @@ def _expanded(patterns: Sequence[str]) -> list[Path]:
     """Files of patterns, each once, in order of their names."""
     files: dict[Path, None] = {}
     for pattern in patterns:
-        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
-        if not names:
+        if not (found := matching(Path(pattern))):
             raise OptionError(f'--images: no file matches {pattern}')
-        files |= dict.fromkeys(map(Path, names))
+        files |= dict.fromkeys(found)
     return list(files)
