@@ -87,7 +87,7 @@ def calibrate_into(
         raise OptionError(selection.without_images())
     products.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    products.write_observations(observed.observations, folder, source.setup.frames.camera_frame)
+    products.write_observations(observed.observations, folder, source.setup)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
         if with_report:
@@ -136,7 +136,7 @@ def _calibrated(
         raise TooFewObservations(f'{failure.reason}{look}') from error
     made = with_images_to_reach(made)
     if made.observations is not observed.observations:
-        products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
+        products.write_observations(made.observations, folder, made.setup)
     return made
 
 

@@ -16,7 +16,7 @@ from starcal_ros.formats.bag.reader import Topics as Topics
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, OF_THE_STARS, StarObservations
 
 _OF_A_STAR_TRACKER = (
     *('prior_alignment', 'star_tracker_sigma_arcsec', 'star_tracker_slow_arcsec'),
@@ -181,8 +181,17 @@ def read(
     read or a topic is not in it.
     """
     if topics.observations:
-        recorded = reader.read_observations(paths, topics.observations)
-        yield from (record for record in recorded if wanted is None or wanted(record.time_ns))
+        for record in reader.read_observations(paths, topics.observations):
+            if wanted is not None and not wanted(record.time_ns):
+                continue
+            if record.star_tracker == OF_THE_STARS:
+                if setup.has_tracker:
+                    raise BagError(
+                        f'{paths[0]}: observations of a camera alone, where a star tracker is set'
+                        ' up: starcal calibrate takes them without one'
+                    )
+                record = dataclasses.replace(record, star_tracker='')
+            yield record
         return
     track = Track(setup.prior)
     for frame in _frames(paths, topics, setup):

@@ -121,6 +121,8 @@ class AttitudeSample:
     icrf_from_star_tracker_xyzw: Floats
 
 
+OF_THE_STARS = '(stars)'
+"""In place of a star tracker in recordings: the attitude is that of the image's own stars."""
 LEAST_DEGC, MOST_DEGC = -273.15, 1000.0
 """Lowest and highest temperature of a camera."""
 _Name = Annotated[str, fields.Most(most_characters=100)]
@@ -156,7 +158,8 @@ class StarObservations(fields.Record):
     icrf_from_star_tracker_xyzw : (4,)
         Star tracker attitude at ``time_ns``; identity if there is none.
     star_tracker : str
-        Frame of the star tracker that gave the attitude; empty: the first, or the only one.
+        Frame of the star tracker that gave the attitude; empty: the first, or the only one, or in
+        memory none.
     first_from_star_tracker_xyzw : (4,)
         Orientation of that star tracker in the frame of the first, as assumed; the identity for
         the first.  ``icrf_from_star_tracker`` times it is the attitude as received.
