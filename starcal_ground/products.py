@@ -29,7 +29,6 @@ from starcal_ros.files import is_marked
 from starcal_ros.formats.bag import rosbag2
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
-from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -104,11 +103,15 @@ def _matrix(rows: int, values: Floats) -> dict[str, object]:
 
 
 def write_observations(
-    observations: Iterable[StarObservations], folder: Path, setup: Setup
+    observations: Iterable[StarObservations],
+    folder: Path,
+    frame_id: str,
+    has_tracker: bool = True,
 ) -> None:
     """
-    Write the observations of a calibration, those of a camera alone as such; raises BagError.
+    Write the observations of a calibration with the frame of its camera; raises BagError.
 
+    Without a star tracker, the attitudes are those of the stars.
     Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
     """
     path = folder / OBSERVATIONS_FILE
@@ -122,9 +125,9 @@ def write_observations(
 
     with BagWriter(path) as writer:
         for record in observations:
-            if not setup.has_tracker:
+            if not has_tracker:
                 record = replace(record, star_tracker=OF_THE_STARS)
-            writer.write_observations(OBSERVATIONS_TOPIC, record, setup.frames.camera_frame)
+            writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
