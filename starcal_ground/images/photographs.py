@@ -48,6 +48,7 @@ from starcal_ros.formats.image_files import (
     read_fits,
     read_image,
 )
+from starcal_ros.text import counted
 
 # Of files whose content says nothing, as of damaged ones; HEIC, of telephones, is not read.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts', '.heic')
@@ -157,7 +158,7 @@ class Refusals:
 
 
 def _left_out(names: Sequence[str], reason: str) -> str:
-    count = '1 file' if len(names) == 1 else f'{len(names)} files'
+    count = counted(len(names), 'file')
     more = ', ...' if len(names) > _NAMES_SHOWN else ''
     return f'left out: {count} ({", ".join(names[:_NAMES_SHOWN])}{more}): {reason}'
 

@@ -17,6 +17,7 @@ from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, OF_THE_STARS, StarObservations
+from starcal_ros.text import counted
 
 _OF_A_STAR_TRACKER = (
     *('prior_alignment', 'star_tracker_sigma_arcsec', 'star_tracker_slow_arcsec'),
@@ -75,7 +76,7 @@ def _without_others(there: Sequence[reader.Topic], chosen: Topics) -> Topics:
     for topic in there:
         if topic.name in names and (topic.name, topic.type_name) not in chosen.read:
             reader.log_damage(
-                f'{topic.name}: {topic.count} messages of {topic.type_name} are not read'
+                f'{topic.name}: {counted(topic.count, "message")} of {topic.type_name} not read'
             )
     return chosen
 

@@ -24,6 +24,7 @@ from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
 from starcal_ground.file_kinds import matching
 from starcal_ros.errors import OptionError
+from starcal_ros.text import counted
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -108,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
         made = recording.write_bag(
             args.output, files, options, guard, attitudes, velocities, prior, advance, further
         )
-    print_text(f'bag {made.bag}: {len(files)} images')
+    print_text(f'bag {made.bag}: {counted(len(files), "image")}')
     for note in made.notes:
         print_text(f'note: {note}')
     if made.params:

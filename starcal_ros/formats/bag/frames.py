@@ -30,6 +30,7 @@ from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.formats.messages.message_codec import RawMessage
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import ARC_S, attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.text import counted
 
 _LATE_NS = NANOSECONDS_PER_SECOND  # a sample is recorded at most so long after later ones
 _ARC_NS = round(ARC_S * NANOSECONDS_PER_SECOND)
@@ -241,8 +242,9 @@ def _report_changed(
     )
     if changed:
         on_damage(
-            f'telemetry is recorded more than a second out of order; {changed} images before it'
-            ' were measured without it; sort the messages of the bag by time'
+            'telemetry is recorded more than a second out of order, after'
+            f' {counted(changed, "image")} that it belongs to; sort the messages of the bag by'
+            ' time'
         )
 
 

@@ -220,5 +220,5 @@ def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
     assert Source(tuple(bags), chosen, setup).image_count == 1
     (record,) = topics.read(bags, chosen, setup)
     assert not record.refusal and len(record) > 100
-    said = [f'{stray}: 1 messages of std_msgs/msg/String are not read'] if stray else []
+    said = [f'{stray}: 1 message of std_msgs/msg/String not read'] if stray else []
     assert caplog.messages == said

@@ -192,8 +192,8 @@ def test_late_samples_are_reported(tmp_path: Path) -> None:
     assert (count, differ) == (IMAGES, 1)
     (sentence,) = said
     assert sentence == (
-        'telemetry is recorded more than a second out of order; 1 images before it'
-        ' were measured without it; sort the messages of the bag by time'
+        'telemetry is recorded more than a second out of order, after'
+        ' 1 image that it belongs to; sort the messages of the bag by time'
     )
 
 
