@@ -43,7 +43,7 @@ def test_a_lens_that_cannot_be_estimated_loses_without_a_traceback(source: str) 
         if not KB97.is_dir():
             pytest.skip('lco_kb97_observations is not on this machine')
         values = read_parameter_file(KB97 / 'params.yaml', NODES)
-        values |= {name: str(KB97 / values[name]) for name in ('camera_info_url', 'catalog')}
+        values |= {name: str(KB97 / str(values[name])) for name in ('camera_info_url', 'catalog')}
         setup = load_setup(values)
         ensemble = Ensemble()
         for record in read_observations([KB97 / 'observations.mcap'], '/observations'):
