@@ -2,8 +2,9 @@
 """
 Write the tables of the documents from the code: ``python -m docs.make_tables [--check]``.
 
-Parameters come from the options dataclasses, refusal reasons from the records, export formats from
-their rows.  With --check nothing is written; the exit status is 1 if a table is out of date.
+Parameters come from options dataclasses, refusal reasons and needed fields from records, export
+formats from their rows.  With --check nothing is written; the exit status is 1 if a table is
+out of date.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 import re
 import sys
+import textwrap
 from typing import Any
 
 from starcal_ground.bags.player_options import PlayerOptions
@@ -24,7 +26,8 @@ from starcal_ros.pipeline.setup import (
     ObserverOptions,
     OPTION_CLASSES,
 )
-from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
+from starcal_ros.record_fields import fields_of as fields_of_record
+from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS, StarObservations
 from tools.write_parameters import allowed, as_yaml, fields_of
 
 DOCUMENTS = Path(__file__).parent
@@ -50,6 +53,13 @@ def reason_table(reasons: Mapping[str, str]) -> str:
     return '\n'.join(['| reason | meaning |', '|---|---|', *rows])
 
 
+def needed_fields() -> str:
+    """Names of the fields that a message of observations needs: those without a default."""
+    kinds = fields_of_record(StarObservations).values()
+    needed = [f'`{kind.in_messages}`' for kind in kinds if not kind.has_default]
+    return textwrap.fill(f'Needed are {", ".join(needed[:-1])} and {needed[-1]}.', 120)
+
+
 def format_table() -> str:
     """Table of the export formats, their files, and what they leave out."""
     rows = [f'| `{row.name}` | {row.files} | {row.left_out} |' for row in FORMATS]
@@ -58,6 +68,7 @@ def format_table() -> str:
 
 TABLES = {
     'icd.md': {
+        'needed fields of observations': needed_fields(),
         'basic parameters': parameter_table(*OPTION_CLASSES, *NODE_OPTION_CLASSES, basic=True),
         'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
         'parameters of star_observer': parameter_table(ObserverOptions),

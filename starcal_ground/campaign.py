@@ -24,6 +24,7 @@ from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import check_site, Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
+from starcal_ros.text import counted
 
 _FOR_WANT_OF_STARS = {REQUIREMENTS, 'min_coverage'}  # checks that fail, of a sound calibration
 
@@ -219,7 +220,7 @@ def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:
 
         for group in refusals(observations):
             detail = f' ({group.detail})' if group.detail else ''
-            count = f'{group.count} of {len(observations)} images'
+            count = f'{group.count} of {counted(len(observations), "image")}'
             yield f'{count} refused, {group.reason}: {group.meaning}{detail}'
 
 

@@ -91,7 +91,8 @@ class Comparison:
     ----------
     difference, sigma : (p,)
         B less A of `Calibration.parameter_names`, and its 1-sigma if their errors are
-        independent.  The alignment angles (rad) are passive small rotations in the camera frame.
+        independent; (0,) for two lens models.  The alignment angles (rad) are passive small
+        rotations in the camera frame.
     rotation_rad : float
         The rotation common to all lines of sight.
     before, after : DifferenceMap
@@ -139,7 +140,8 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     """
     Difference of B from A.
 
-    Raises ProductError when the cameras differ in size or model, or a pixel has no line of sight.
+    Of two lens models only the lines of sight are compared.  Raises ProductError when the cameras
+    differ in size, or a pixel has no line of sight.
 
     >>> import starcal_ground, starcal_ros
     >>> calibration = starcal_ros.read_calibration('out')
@@ -153,12 +155,12 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
             f'A is of a camera of {camera_a.width} x {camera_a.height}, '
             f'B of one of {camera_b.width} x {camera_b.height}: they cannot be compared'
         )
-    if camera_a.model != camera_b.model:
-        raise ProductError(
-            f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
-        )
-    difference = parameter_difference(b.geometry, a.geometry)
-    sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
+    difference: Floats = np.empty(0)
+    covariance: Floats = np.empty((0, 0))
+    if camera_a.model == camera_b.model:
+        difference = parameter_difference(b.geometry, a.geometry)
+        covariance = a.covariance + b.covariance
+    sigma = np.sqrt(np.diag(covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     rotation, _ = Rotation.align_vectors(new, old)
     of_a, of_b = (
@@ -167,8 +169,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     )
     sight_sigma_rad = np.hypot(of_a.sigma_arcsec, of_b.sigma_arcsec) * ARCSECOND_RAD
     shape_sigma_rad = np.hypot(of_a.shape_sigma_arcsec, of_b.shape_sigma_arcsec) * ARCSECOND_RAD
-    compared = len(sigma) - 3 * (not (a.has_alignment and b.has_alignment))
-    covariance = (a.covariance + b.covariance)[:compared, :compared]
+    compared = slice(None if a.has_alignment and b.has_alignment else -3)
     return Comparison(
         a=a,
         b=b,
@@ -177,7 +178,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         rotation_rad=float(rotation.magnitude()),
         before=_map(new - old, a.geometry, sight_sigma_rad),
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
-        total=chi_squared(difference[:compared], covariance),
+        total=chi_squared(difference[compared], covariance[compared, compared]),
         notes=_notes(a, b, difference, sigma),
     )
 
@@ -239,6 +240,12 @@ def _ratio(values: Floats, sigma: Floats) -> Floats:
 
 def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) -> tuple[str, ...]:
     notes = []
+    lens_a, lens_b = a.geometry.camera.model, b.geometry.camera.model
+    if lens_a != lens_b:
+        notes.append(
+            f'A has the lens model {lens_a}, B {lens_b}: their parameters mean different cameras,'
+            ' so the lines of sight alone are compared'
+        )
     for name, calibration in (('A', a), ('B', b)):
         if not calibration.accepted:
             notes.append(f'the gate refused {name}: {"; ".join(calibration.reasons)}')
@@ -278,14 +285,16 @@ def content(comparison: Comparison) -> dict[str, object]:
         return {**lengths, 'difference_px': moved.difference_px, 'sigmas': moved.sigmas}
 
     total, aligned = comparison.total, comparison.is_aligned
+    names = comparison.a.parameter_names if comparison.difference.size else ()
+    angles = comparison.difference[-3:] / ARCSECOND_RAD
     values = {
-        'parameter_names': comparison.a.parameter_names,
+        'parameter_names': names,
         'a': comparison.a.geometry.camera.parameters,
         'b': comparison.b.geometry.camera.parameters,
         'difference': comparison.difference,
         'sigma': comparison.sigma,
         'sigmas': comparison.sigmas,
-        'alignment_arcsec': comparison.difference[-3:] / ARCSECOND_RAD if aligned else None,
+        'alignment_arcsec': angles if aligned and angles.size else None,
         'common_rotation_arcsec': comparison.rotation_rad / ARCSECOND_RAD if aligned else None,
         'lines_of_sight': of_map(comparison.before) if aligned else None,
         'without_common_rotation': of_map(comparison.after),

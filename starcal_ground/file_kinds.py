@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
+import glob
 from pathlib import Path
 import shlex
 
@@ -86,6 +87,15 @@ def kind_of(path: Path) -> FileKind:
     return RAW if kind is TIFF and path.name.lower().endswith(_RAW_ENDINGS) else kind
 
 
+def matching(pattern: Path) -> list[Path]:
+    """The path if it exists, else those that a pattern matches, by name; a folder is literal."""
+    there = next((path for path in (pattern, *pattern.parents) if path.exists()), Path())
+    if there == pattern or not glob.has_magic(str(pattern)):
+        return [pattern]
+    rest = str(pattern.relative_to(there))
+    return sorted(there / name for name in glob.glob(rest, root_dir=there))
+
+
 def explained(error: StarcalError) -> str:
     """Text of an error; where a bag was expected, with what is there, and what helps."""
     words = str(error)
@@ -110,7 +120,19 @@ def _instead(place: Path) -> str:
                 return f'{start}: {shlex.join(["zstd", "-d", str(file)])}'
             if kind in (SQLITE_BAG, ROS_1_BAG):
                 return f'{start}: {_conversion(file, kind)} makes one'
-    return ''
+    inside = [folder for folder in sorted(place.glob('*/')) if _has_image(folder)]
+    names = ', '.join(folder.name for folder in inside[:3])
+    return (
+        f', but folders with images ({names}): give {shlex.quote(f"{place}/*")}' if names else ''
+    )
+
+
+def _has_image(folder: Path) -> bool:
+    for file in folder.iterdir():
+        with contextlib.suppress(OSError, ValueError, IngestError):
+            if kind_of(file).is_image:
+                return True
+    return False
 
 
 def _conversion(file: Path, kind: FileKind) -> str:

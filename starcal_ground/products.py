@@ -29,7 +29,13 @@ from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import is_marked
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
-from starcal_ros.records import Calibration, CameraGeometry, check_drawable, StarObservations
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    check_drawable,
+    OF_THE_STARS,
+    StarObservations,
+)
 
 OBSERVATIONS_TOPIC = '/observations'
 CAMERA_INFO_FILE = 'camera_info.yaml'
@@ -97,11 +103,15 @@ def _matrix(rows: int, values: Floats) -> dict[str, object]:
 
 
 def write_observations(
-    observations: Iterable[StarObservations], folder: Path, frame_id: str
+    observations: Iterable[StarObservations],
+    folder: Path,
+    frame_id: str,
+    has_tracker: bool = True,
 ) -> None:
     """
     Write the observations of a calibration with the frame of its camera; raises BagError.
 
+    Without a star tracker, the attitudes are those of the stars.
     Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
     """
     path = folder / OBSERVATIONS_FILE
@@ -115,6 +125,8 @@ def write_observations(
 
     with BagWriter(path) as writer:
         for record in observations:
+            if not has_tracker:
+                record = replace(record, star_tracker=OF_THE_STARS)
             writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
 
 

@@ -109,7 +109,7 @@ class TooFewObservations(StarcalError):
     >>> prior = starcal_ground.read_calibration('out').geometry
     >>> starcal_ground.calibrate([], prior)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
-    starcal_ros.errors.TooFewObservations: too few observations: 3 more images are needed...
+    starcal_ros.errors.TooFewObservations: too few observations: 3 more images (0 of 3...
     """
 
 

@@ -7,7 +7,8 @@ reader, a kill and a power loss see the old file or the new one, each whole.  A 
 temporary file; it is locked while its writer lives, and the next write to that path removes it.
 
 Each file has the digest of its content as an extended attribute, by which starcal knows later that
-it wrote the file and that nothing has changed it since.
+it wrote the file and that nothing has changed it since.  A page, which is written again and again,
+has it as its last line too, since not all file systems keep attributes.
 """
 
 from __future__ import annotations
@@ -63,14 +64,30 @@ def mark(file: IO[bytes]) -> None:
 def is_marked(file: IO[bytes]) -> bool:
     """True if starcal wrote an open file, and its content has not changed since."""
     with contextlib.suppress(OSError, AttributeError):
-        return os.getxattr(file.fileno(), _MARK) == _digest(file)
-    return False
+        if os.getxattr(file.fileno(), _MARK) == _digest(file):
+            return True
+    length = file.seek(0, os.SEEK_END) - len(_seal(b''))
+    if length < 0:
+        return False
+    digest = _seal(_digest(file, length))
+    file.seek(length)
+    return file.read() == digest
 
 
-def _digest(file: IO[bytes]) -> bytes:
+def sealed(page: bytes) -> bytes:
+    """An HTML page with its mark as the last line, which every file system keeps."""
+    return page + _seal(hashlib.sha256(page).hexdigest().encode())
+
+
+def _seal(digest: bytes) -> bytes:
+    return b'\n<!-- starcal sha256 %-64s -->\n' % digest
+
+
+def _digest(file: IO[bytes], length: int | None = None) -> bytes:
+    """SHA-256 of an open file, or of its first bytes, in hexadecimal."""
     file.seek(0)
     digest = hashlib.sha256()
-    while block := file.read(1 << 20):
+    while block := file.read(1 << 20 if length is None else min(1 << 20, length - file.tell())):
         digest.update(block)
     return digest.hexdigest().encode()
 

@@ -11,8 +11,9 @@ common: None, bool, int, float, str, lists or arrays of numbers, and mappings wi
 
 Reading is strict.  A value of another type or out of range, a wrong shape and a missing key are
 errors of one line with the path of the field, the value and what is allowed.  A key may be missing
-where its field has a default; keys without a field are ignored.  None in place of a number is NaN,
-an unknown number, unless the field is marked `Finite`.
+where its field has a default, the value for not known; of an array that may hold NaN it is NaN in
+the shape of the others.  Keys without a field are ignored.  None in place of a number is NaN, an
+unknown number, unless the field is marked `Finite`.
 """
 
 from __future__ import annotations
@@ -131,6 +132,11 @@ class FieldType:
     most_characters: int | None = None
     most_items: int | None = None
     are_different: bool = False
+
+    @property
+    def may_be_unknown(self) -> bool:
+        """True if NaN, an unknown number, is within the range allowed."""
+        return self.low is not None and not self.is_finite
 
     @property
     def allowed(self) -> str:
@@ -295,6 +301,7 @@ def read_record(record_type: type[T], content: object, path: str = '') -> T:
         raise _refused(path, content, 'an object')
     values: dict[str, Any] = {}
     sizes: dict[str, int] = {}
+    left_out: list[str] = []
     of_type: Any = record_type
     for name, kind in fields_of(of_type).items():
         names = (name, kind.in_messages)
@@ -302,7 +309,14 @@ def read_record(record_type: type[T], content: object, path: str = '') -> T:
         if key is not None:
             values[name] = read_value(kind, content[key], _inside(path, key), sizes)
         elif not kind.has_default:
-            raise ValueError(f'key {_inside(path, name)!r} is missing')
+            known = ' or '.join(repr(_inside(path, key)) for key in dict.fromkeys(names))
+            raise ValueError(f'key {known} is missing')
+        elif kind.kind is np.ndarray and kind.may_be_unknown:
+            left_out.append(name)
+    for name in left_out:  # a column has as many rows as those that are there
+        kind = fields_of(of_type)[name]
+        shape = [sizes.get(side, 0) if isinstance(side, str) else side for side in kind.dimensions]
+        values[name] = np.full(shape, math.nan, kind.dtype)
     try:
         return record_type(**values)
     except ValueError as error:  # the record's own checks

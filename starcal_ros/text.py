@@ -22,6 +22,16 @@ def printable(text: str) -> str:
     return _UNSAFE.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
+def counted(count: int, noun: str) -> str:
+    """
+    A number of things in words.
+
+    >>> counted(1, 'image'), counted(2, 'more image')
+    ('1 image', '2 more images')
+    """
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
 _SMALLEST, _LARGEST = 1e-9, 1e15
 """Beyond these, zeros are harder to count than an exponent is to read."""
 

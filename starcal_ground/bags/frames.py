@@ -5,7 +5,8 @@ Images of bags, each with the telemetry of its time, from one pass over the file
 Another thread reads and decompresses while the images before are measured.  An image waits until
 an attitude two seconds after it has been read: its rate takes those of the first of them.  Where
 that is not enough - telemetry recorded in another file, far out of order or not at all - a second
-pass reads all telemetry first, so that the order of recording changes no result.
+pass reads all telemetry first, so that the order of recording changes no result.  Of images that
+are not in the order of their stamps, the rest is sorted (`reader.by_stamp`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.formats.messages.message_codec import RawMessage
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import ARC_S, attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.text import counted
 
 _LATE_NS = NANOSECONDS_PER_SECOND  # a sample is recorded at most so long after later ones
 _ARC_NS = round(ARC_S * NANOSECONDS_PER_SECOND)
@@ -73,7 +75,7 @@ class Telemetry:
         self.velocities_left_out = 0  # not plausible; the first is reported
 
     def add(self, raw: RawMessage) -> bool:
-        """Add a message, or report damage; False if its topic had a later stamp before."""
+        """Add a message, or report damage; False if it is out of order."""
         try:
             message = reader.decode(raw)
         except BagError as error:
@@ -101,7 +103,8 @@ class Telemetry:
             bisect.insort(self.temperatures, (time_ns, temperature_degc), key=_stamp_ns)
         newest_ns = self._newest_ns.setdefault(raw.topic, time_ns)
         self._newest_ns[raw.topic] = max(newest_ns, time_ns)
-        return time_ns >= newest_ns
+        # Topics one after another are out of order too: `covers` has seen one velocity at most.
+        return time_ns >= max(newest_ns, max(self._newest_ns.values()) - _LATE_NS)
 
     def covers(self, time_ns: int) -> bool:
         """True if no further sample changes the telemetry of a time, but for very late ones."""
@@ -164,12 +167,13 @@ def read_frames(
     channel: str = '',
 ) -> Iterator[Frame | StarObservations]:
     """
-    Images of bags with their telemetry, in bag order.
+    Images of bags with their telemetry, sorted by their stamps.
 
-    An image that cannot be decoded, or a compressed one of another ``size`` (width, height),
-    becomes refused observations; ``channel`` is the colour that is taken of colour images
-    (`image_from_message`).  The first sample out of order starts the second pass; images
-    yielded before it whose telemetry that pass changes are reported to ``on_damage``.
+    They are in file order until a stamp goes back; the others follow sorted.  An image that cannot
+    be decoded, or a compressed one of another ``size`` (width, height), becomes refused
+    observations; ``channel`` is the colour that is taken of colour images (`image_from_message`).
+    The first sample out of order starts the second pass; images yielded before it whose telemetry
+    that pass changes are reported to ``on_damage``.
     """
     options = options or AttitudeOptions()
     # Which of several star trackers an image takes depends on all that are there.
@@ -181,10 +185,15 @@ def read_frames(
     )
     waiting: deque[Image | StarObservations] = deque()
     taken: list[tuple[int, Floats]] = []
-    messages = reader.read_raw(paths, topics.read, on_damage)
-    for raw in read_ahead(messages):
+    count, newest_ns, goes_back = 0, 0, False
+    for raw in read_ahead(reader.read_raw(paths, topics.read, on_damage)):
         in_order = True
         if raw.type_name in message_codec.IMAGE_TYPES:
+            stamp_ns = sensor_messages.image_stamp_ns(raw)
+            goes_back = stamp_ns < newest_ns and raw.place is not None
+            if goes_back:
+                break
+            count, newest_ns = count + 1, stamp_ns
             waiting.append(sensor_messages.image_of(raw, options.stamp_offset_s, size, channel))
         elif not is_complete:
             in_order = telemetry.add(raw)
@@ -195,8 +204,15 @@ def read_frames(
             if not is_complete and isinstance(waiting[0], Image):
                 taken.append((waiting[0].time_ns, telemetry.numbers_at(waiting[0].time_ns)))
             yield _with_telemetry(waiting.popleft(), telemetry)
+    if goes_back and not is_complete:
+        telemetry = read_telemetry(paths, topics, options, on_damage)
+        _report_changed(taken, telemetry, on_damage)
     while waiting:
         yield _with_telemetry(waiting.popleft(), telemetry)
+    if goes_back:
+        for raw in read_ahead(reader.by_stamp(paths, topics.read - topics.telemetry, count)):
+            image = sensor_messages.image_of(raw, options.stamp_offset_s, size, channel)
+            yield _with_telemetry(image, telemetry)
 
 
 def _is_too_much(waiting: Iterable[Image | StarObservations]) -> bool:
@@ -226,8 +242,9 @@ def _report_changed(
     )
     if changed:
         on_damage(
-            f'telemetry is recorded more than a second out of order; {changed} images before it'
-            ' were measured without it; sort the messages of the bag by time'
+            'telemetry is recorded more than a second out of order, after'
+            f' {counted(changed, "image")} that it belongs to; sort the messages of the bag by'
+            ' time'
         )
 
 

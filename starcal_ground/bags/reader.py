@@ -6,6 +6,7 @@ MCAP is read without ROS.  Where the wheels for that are absent, rosbag2 of ROS 
 SQLite (`rosbag2`), up to the damage.
 
 Two chunks of the file are in memory at a time: one in use, one that another thread decompresses.
+Messages may be in chunks and outside of them.
 A chunk with a wrong checksum is skipped.  If the bytes between chunks are damaged, reading
 continues at the next chunk listed in the summary; if the first chunk with the topic names is lost,
 the names come from the summary.  A truncated file has no summary and is read up to its end.
@@ -26,6 +27,7 @@ import functools
 import io
 import itertools
 import logging
+import operator
 import os
 from pathlib import Path
 import re
@@ -39,7 +41,7 @@ from starcal_ros.errors import BagError, errors_as, NotABag
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
-from starcal_ros.formats.messages.sensor_messages import image_of
+from starcal_ros.formats.messages.sensor_messages import image_of, image_stamp_ns
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import (
@@ -129,11 +131,13 @@ def read_messages(
     known = summary or Summary()
     schemas: dict[int, Schema] = dict(known.schemas)
     channels: dict[int, Channel] = dict(known.channels)
+    texts: dict[int, str] = {}  # each definition once
     read: Counter[int] = Counter()
     pieces = _Pieces(file, known, on_damage)
-    for record in pieces:
+    for record, place in pieces:
         if isinstance(record, Schema):
             schemas[record.id] = record
+            texts.pop(record.id, None)
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, McapMessage):
@@ -144,10 +148,13 @@ def read_messages(
                 continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
             names = channel.topic, (channel.topic, schema.name)
             if wanted is None or not wanted.isdisjoint(names):
-                is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
-                definition = schema.data.decode(errors='replace') if is_text else ''
-                view = memoryview(_message(record.data))
-                yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
+                if schema.id not in texts:
+                    is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
+                    texts[schema.id] = schema.data.decode(errors='replace') if is_text else ''
+                view, text = memoryview(_message(record.data)), texts[schema.id]
+                yield RawMessage(
+                    channel.topic, schema.name, text, record.log_time, view, (file, *place)
+                )
     if summary is None and pieces.complete:
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
     if known.statistics is not None:
@@ -187,7 +194,7 @@ def _loss(
 
 class _Pieces:
     """
-    Schemas, channels and messages of a file, inside and outside chunks.
+    Schemas, channels and messages of a file, inside and outside chunks, each with its place.
 
     ``complete`` is True once the end of the data was reached; ``lost`` counts the messages in
     damaged chunks by channel, from the indexes after those chunks.
@@ -198,7 +205,9 @@ class _Pieces:
         self.lost: Counter[int] = Counter()
         self._file = file
         self._on_damage = on_damage
-        self._starts = sorted(index.chunk_start_offset for index in summary.chunk_indexes)
+        chunks = sorted((i.chunk_start_offset, i.chunk_length) for i in summary.chunk_indexes)
+        self._starts = [start for start, _ in chunks]
+        self._ends = [start + length for start, length in chunks]
         self._has_chunks = bool(self._starts)
         self._reported = False
 
@@ -207,7 +216,7 @@ class _Pieces:
         self._reported = True
         self._on_damage(f'{self._file}: {text}')
 
-    def __iter__(self) -> Iterator[McapRecord]:
+    def __iter__(self) -> Iterator[tuple[McapRecord, tuple[int, int]]]:
         with regular_file(self._file) as stream:
             # A sum over the whole file would take a tenth of the time of reading it.
             has_checksum = not _lacks_checksum(stream)
@@ -234,20 +243,19 @@ class _Pieces:
                     # A wrong length or an unknown opcode has skipped the start of a chunk.
                     self.report(f'damaged after byte {read_to} of {size}')
                     return passed
-                read_to = end
+                place, read_to = read_to, end
                 if data is not None:
                     self._has_chunks = True
-                    chunk_is_sound = yield from self._of_chunk(data, read_to)
+                    chunk_is_sound = yield from self._of_chunk(data, place, read_to)
                 elif isinstance(record, MessageIndex):
                     if not chunk_is_sound:
                         self.lost[record.channel_id] += len(record.records)
                 elif isinstance(record, DataEnd):
                     self.complete = True
                     return None
-                elif not self._has_chunks or isinstance(record, (Schema, Channel)):
-                    yield record
+                elif isinstance(record, (Schema, Channel)) or self._is_outside(place):
+                    yield record, (place, 0)
                 elif isinstance(record, McapMessage):
-                    # Recorders put all messages into chunks or none, so these bytes are damaged.
                     self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
             self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')
@@ -270,14 +278,25 @@ class _Pieces:
         k = bisect.bisect_right(self._starts, offset)
         return self._starts[k] if k < len(self._starts) else None
 
-    def _of_chunk(self, data: Future[bytes], end: int) -> Any:
+    def _is_outside(self, offset: int) -> bool:
+        """
+        True if a record is outside all chunks; else it is the content of a damaged one.
+
+        The summary has their places; without it, bytes after damage may be anything.
+        """
+        if not self._starts:
+            return not (self._has_chunks and self._reported)
+        k = bisect.bisect_right(self._starts, offset) - 1
+        return k < 0 or offset >= self._ends[k]
+
+    def _of_chunk(self, data: Future[bytes], start: int, end: int) -> Any:
         """Records of a chunk; returns False if its checksum or compression is invalid."""
         try:
             content = data.result()
         except Exception as error:
             self.report(f'skipped the damaged chunk that ends at byte {end}: {error}')
             return False
-        yield from _inside(content)
+        yield from ((record, (start, k)) for k, record in enumerate(_inside(content)))
         return True
 
 
@@ -501,8 +520,23 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
         return fitting[0]
     if not fitting:
         listed = ', '.join(topic.name for topic in there) or 'none in cdr, the encoding of ROS 2'
+        if not there and any(map(_is_of_ros_1, mcap_files(paths))):
+            raise BagError(
+                f'{where}: an MCAP of ROS 1 messages: convert the bag that it was made from by'
+                ' rosbags-convert --src bag.bag --dst bag'
+            )
         raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
     raise BagError(f'{where}: several topics of type {type_name}: {listed}')
+
+
+def _is_of_ros_1(file: Path) -> bool:
+    """True if the profile of a file, or a channel, is of ROS 1."""
+    if rosbag2.READS_BAGS:
+        return False
+    with regular_file(file) as stream:
+        start = stream.read(len(MAGIC) + _RECORD.size + 8)
+    encodings = {c.message_encoding for c in (read_summary(file) or Summary()).channels.values()}
+    return start.endswith(b'\x04\0\0\0ros1') or 'ros1' in encodings
 
 
 def read_raw(
@@ -516,6 +550,45 @@ def read_raw(
         yield from read_messages(file, wanted, on_damage)
 
 
+def by_stamp(
+    paths: Iterable[Path | str], images: Iterable[Wanted], start: int = 0
+) -> Iterator[RawMessage]:
+    """
+    Serialised images in the order of their stamps, without the first ones in file order.
+
+    Their stamps are read first, then the images one by one, each with its chunk; two chunks are in
+    memory.  Damage is not reported again.
+    """
+    kinds: dict[tuple[str, str, str], tuple[str, str, str]] = {}  # each definition once
+    places = []
+    for raw in itertools.islice(read_raw(paths, images, lambda _: None), start, None):
+        kind = (raw.topic, raw.type_name, raw.definition)
+        kind = kinds.setdefault(kind, kind)
+        places.append((image_stamp_ns(raw), raw.place, raw.log_time_ns, kind))
+    chunks: dict[tuple[Path, int], list[McapRecord]] = {}
+    for _, place, log_time_ns, kind in sorted(places, key=operator.itemgetter(0)):
+        assert place is not None  # the reader of MCAP files knows it
+        file, offset, number = place
+        chunk = chunks.pop((file, offset), None) or _records_at(file, offset)
+        chunks = dict([*chunks.items(), ((file, offset), chunk)][-2:])
+        record = chunk[number]
+        assert isinstance(record, McapMessage)  # as when its place was found
+        yield RawMessage(*kind, log_time_ns, memoryview(_message(record.data)), place)
+
+
+def _records_at(file: Path, offset: int) -> list[McapRecord]:
+    """Records of the chunk at an offset, or the record there; raises BagError after a change."""
+    try:
+        with regular_file(file) as stream:
+            stream.seek(offset)
+            limit = os.fstat(stream.fileno()).st_size
+            reader = StreamReader(stream, True, emit_chunks=True, record_size_limit=limit)
+            record = next(reader.records)
+            return list(_inside(_data_of(record))) if isinstance(record, Chunk) else [record]
+    except (OSError, StopIteration, *_DAMAGE_ERRORS) as error:
+        raise BagError(f'{file}: changed while it was read: try again') from error
+
+
 def read_images(
     paths: Iterable[Path | str],
     topic: str,
@@ -523,7 +596,7 @@ def read_images(
     on_damage: Damage = log_damage,
     channel: str = '',
 ) -> Iterator[Image | StarObservations]:
-    """Images of a topic, as `image_of` reads them."""
+    """Images of a topic in file order, as `image_of` reads them."""
     for raw in read_raw(paths, Topics(topic).read, on_damage):
         yield image_of(raw, stamp_offset_s, channel=channel)
 

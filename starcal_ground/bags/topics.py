@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import dataclasses
 from pathlib import Path
 import re
 
@@ -15,7 +16,8 @@ from starcal_ros.errors import BagError
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, OF_THE_STARS, StarObservations
+from starcal_ros.text import counted
 
 _OF_A_STAR_TRACKER = (
     *('prior_alignment', 'star_tracker_sigma_arcsec', 'star_tracker_slow_arcsec'),
@@ -74,7 +76,7 @@ def _without_others(there: Sequence[reader.Topic], chosen: Topics) -> Topics:
     for topic in there:
         if topic.name in names and (topic.name, topic.type_name) not in chosen.read:
             reader.log_damage(
-                f'{topic.name}: {topic.count} messages of {topic.type_name} are not read'
+                f'{topic.name}: {counted(topic.count, "message")} of {topic.type_name} not read'
             )
     return chosen
 
@@ -136,7 +138,7 @@ def _not_read(there: Sequence[reader.Topic], requested: str) -> str:
     """Return which topics seem to hold attitudes in messages that are not read, and the remedy."""
     return ''.join(
         f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}, which is not read: publish its'
-        ' orientation as a QuaternionStamped or PoseStamped'
+        ' orientation as a QuaternionStamped or PoseStamped, and choose that with --attitude-topic'
         for topic in there
         if topic.type_name not in codec.ATTITUDE_TYPES
         and _LIKE_ATTITUDES.search(topic.type_name.rpartition('/')[2])
@@ -180,8 +182,17 @@ def read(
     read or a topic is not in it.
     """
     if topics.observations:
-        recorded = reader.read_observations(paths, topics.observations)
-        yield from (record for record in recorded if wanted is None or wanted(record.time_ns))
+        for record in reader.read_observations(paths, topics.observations):
+            if wanted is not None and not wanted(record.time_ns):
+                continue
+            if record.star_tracker == OF_THE_STARS:
+                if setup.has_tracker:
+                    raise BagError(
+                        f'{paths[0]}: observations of a camera alone, where a star tracker is set'
+                        ' up: starcal calibrate takes them without one'
+                    )
+                record = dataclasses.replace(record, star_tracker='')
+            yield record
         return
     track = Track(setup.prior)
     for frame in _frames(paths, topics, setup):
@@ -193,6 +204,9 @@ def read(
         else:
             warn_of_clock(time_ns)
             track = track if is_sequence else Track(setup.prior)
+            # The stamps of a bag are all known: these are not images of a wrong stamp.
+            if track.latest_ns is not None and time_ns < track.latest_ns:
+                track = dataclasses.replace(track, latest_ns=None, tracked_camera=None)
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
             if on_image is not None:
@@ -232,12 +246,16 @@ def without_attitudes(
     So are bags without attitudes and observations, unless the options state a star tracker, which
     is then missing; and all bags if the camera alone is requested.
     """
-    kinds = {topic.type_name for topic in reader.topics(bags)}
+    there = reader.topics(bags)
+    kinds = {topic.type_name for topic in there}
     has_images = not kinds.isdisjoint(codec.IMAGE_TYPES)
     if camera_alone:
         return has_images
     others = {*codec.ATTITUDE_TYPES, codec.OBSERVATIONS_TYPE}
-    return has_images and not (kinds & others or requested.attitude or stated_tracker(options))
+    by_stars = not (kinds & others or requested.attitude or stated_tracker(options))
+    if has_images and by_stars and (unread := _not_read(there, '')):
+        reader.log_damage(f'no attitude is read, so the camera alone is calibrated{unread}')
+    return has_images and by_stars
 
 
 def stated_tracker(options: Mapping[str, object]) -> list[str]:

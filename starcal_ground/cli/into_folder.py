@@ -22,6 +22,7 @@ from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 
@@ -87,7 +88,7 @@ def calibrate_into(
         raise OptionError(selection.without_images())
     products.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    products.write_observations(observed.observations, folder, source.setup.frames.camera_frame)
+    _write_observations(observed.observations, folder, source.setup)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
         if with_report:
@@ -136,8 +137,15 @@ def _calibrated(
         raise TooFewObservations(f'{failure.reason}{look}') from error
     made = with_images_to_reach(made)
     if made.observations is not observed.observations:
-        products.write_observations(made.observations, folder, made.setup.frames.camera_frame)
+        _write_observations(made.observations, folder, made.setup)
     return made
+
+
+def _write_observations(
+    observations: Sequence[StarObservations], folder: Path, setup: Setup
+) -> None:
+    frame = setup.frames.camera_frame
+    products.write_observations(observations, folder, frame, setup.has_tracker)
 
 
 def _load_report() -> None:

@@ -20,7 +20,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
-from starcal_ros.text import printable
+from starcal_ros.text import counted, printable
 
 _HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
 _STALE = ('stale', 'yellow')
@@ -88,7 +88,7 @@ def _images(received: Received) -> Text:
     if last.refusal:
         line.append(f'refused, {last.refusal.replace("_", " ")}: {last.detail}', 'yellow')
     else:
-        line.append(f'{len(last)} stars', 'green')
+        line.append(counted(len(last), 'star'), 'green')
     return _lines([*lines, line])
 
 

@@ -32,7 +32,7 @@ from starcal_ground.bags.topics import (
 from starcal_ground.campaign import Source, ThroughAir
 from starcal_ground.images.photographs import image_paths
 from starcal_ground.products import make_folder, write_camera_info
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import write_atomically
@@ -44,7 +44,7 @@ from starcal_ros.pipeline.setup import (
     paths_from,
     Setup,
 )
-from starcal_ros.records import Ensemble
+from starcal_ros.records import Ensemble, OF_THE_STARS
 from starcal_ros.text import printable
 
 PARAMETER_FILE, CAMERA_FILE = 'params.yaml', 'camera.yaml'
@@ -91,6 +91,19 @@ class Given:
             )
         return True
 
+    @functools.cached_property
+    def recorded_alone(self) -> dict[str, object] | None:
+        """Options for observations whose attitudes are those of their own stars, else None."""
+        with contextlib.suppress(BagError):  # it is raised where the topics are needed
+            if topic := choose_topics(self.paths, self.topics).observations:
+                from starcal_ground.images.from_stars import options_of  # seldom needed, slow
+
+                first = next(reader.read_observations(self.paths, topic), None)
+                if first is not None and first.star_tracker == OF_THE_STARS:
+                    return {**options_of(self.options), 'prior_alignment': (0.0,) * 4}
+                return options_of(self.options) if self.camera_alone else None
+        return None
+
     def checked(self) -> tuple[Setup | None, list[Path]]:
         """
         The setup of bags with attitudes where the camera is stated, and the files of the options.
@@ -107,6 +120,9 @@ class Given:
             if self.is_by_stars or not self.states_camera:
                 frames = option_groups(self.options)['frames']
                 setup = None
+            elif alone := self.recorded_alone:
+                setup = dataclasses.replace(load_setup(alone), is_aligned=True)
+                frames = setup.frames
             else:
                 setup = load_setup(self.options)
                 frames = setup.frames

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-import glob
 import importlib
 import io
 import itertools
@@ -27,7 +26,16 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ground.file_kinds import FileKind, FITS, IMAGES_READ, JPEG, kind_of, RAW, UNKNOWN
+from starcal_ground.file_kinds import (
+    FileKind,
+    FITS,
+    IMAGES_READ,
+    JPEG,
+    kind_of,
+    matching,
+    RAW,
+    UNKNOWN,
+)
 from starcal_ground.images.time_systems import middle_of_exposure, number
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -40,6 +48,7 @@ from starcal_ros.formats.image_files import (
     read_fits,
     read_image,
 )
+from starcal_ros.text import counted
 
 # Of files whose content says nothing, as of damaged ones; HEIC, of telephones, is not read.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts', '.heic')
@@ -93,13 +102,11 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
     """
     files: list[Path] = []
     bags: list[Path] = []
-    for path in paths:
-        if glob.has_magic(str(path)) and not path.exists():
-            names = sorted(glob.glob(str(path)))
-            if not names:
-                raise IngestError(f'{path}: no such files')
-            files += map(Path, names)
-        elif not path.is_dir():
+    expanded = {pattern: matching(pattern) for pattern in paths}
+    if nothing := next((pattern for pattern, found in expanded.items() if not found), None):
+        raise IngestError(f'{nothing}: no such files')
+    for path in itertools.chain.from_iterable(expanded.values()):
+        if not path.is_dir():
             files.append(path)
         elif not (any(path.glob('*.mcap*')) or (path / 'metadata.yaml').exists()):
             files += sorted(file for file in path.iterdir() if not file.name.startswith('.'))
@@ -151,7 +158,7 @@ class Refusals:
 
 
 def _left_out(names: Sequence[str], reason: str) -> str:
-    count = '1 file' if len(names) == 1 else f'{len(names)} files'
+    count = counted(len(names), 'file')
     more = ', ...' if len(names) > _NAMES_SHOWN else ''
     return f'left out: {count} ({", ".join(names[:_NAMES_SHOWN])}{more}): {reason}'
 

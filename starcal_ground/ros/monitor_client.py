@@ -25,6 +25,7 @@ from starcal_ros import records
 from starcal_ros.formats.messages import message_codec, record_messages
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import end_quietly, is_overdue, until_told_to_end
+from starcal_ros.text import counted
 
 NAME = 'monitor'
 _PREFIX = 'starcal: '  # of the diagnostics of our nodes
@@ -55,7 +56,7 @@ class Monitor(Node):
                 callback(message)
             except (AttributeError, ValueError) as error:
                 self._unread += 1
-                words = f'{self._unread} messages cannot be read, the last: {error}'
+                words = f'{counted(self._unread, "message")} not readable, the last: {error}'
                 self._set(health={**self.received.health, 'monitor': (1, words)})
 
         return run

@@ -64,7 +64,7 @@ class GateOptions:
         ('line_of_sight=300arcsec', 'map=0.5px'),
         'upper limits of 1-sigmas, NAME=LIMIT; NAME: line_of_sight (in the star tracker frame) or'
         ' map (common rotation removed), over the detector or a share of it, @98%; pointing (rms'
-        ' over the detector), f, or a parameter; LIMIT in arcsec or px',
+        ' over the detector), f, or a parameter; LIMIT in arcsec or px; none: no requirement',
     )
     max_change_px: float = option(
         10.0,
@@ -429,7 +429,7 @@ def _significant(
     return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)
 
 
-REQUIREMENTS = 'requirements'
+REQUIREMENTS, _NONE = 'requirements', 'none'
 LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
 _UNITS: dict[str, tuple[str, ...]] = {
     LINE_OF_SIGHT: ('arcsec',),
@@ -487,9 +487,10 @@ class Requirement:
             raise OptionError(
                 f'{REQUIREMENTS}: {text}: only line_of_sight and map are over a share'
             )
-        if not (limit > 0.0 and 0.0 < share <= 1.0):
+        if not (0.0 < limit < math.inf and 0.0 < share <= 1.0):
             raise OptionError(
-                f'{REQUIREMENTS}: {text}: the sigma must be above 0, and the share at most 100 %'
+                f'{REQUIREMENTS}: {text}: the sigma must be finite and above 0, and the share at'
+                ' most 100 %'
             )
         return cls(quantity, limit, unit, share)
 
@@ -552,8 +553,14 @@ class Requirement:
 
 
 def requirements_of(texts: Iterable[str]) -> tuple[Requirement, ...]:
-    """Requirements of the option; raises OptionError for one that is not understood."""
-    return tuple(Requirement.of(text) for text in texts if text)
+    """Requirements of the option, none for ``none``; raises OptionError for any other text."""
+    texts = tuple(texts)
+    if '' in texts:  # a shell variable that is not set; without the option the defaults hold
+        raise OptionError(
+            f'{REQUIREMENTS}: an empty text is no requirement: leave the option out for the'
+            ' defaults, or write none to require no sigma'
+        )
+    return () if texts == (_NONE,) else tuple(map(Requirement.of, texts))
 
 
 def requirement_checks(calibration: Calibration, texts: Iterable[str]) -> Iterator[GateCheck]:
@@ -594,7 +601,7 @@ REMEDIES: Mapping[str, str] = {
         'record attitudes more often, or raise max_attitude_gap_s if the vehicle turns evenly'
     ),
     'frozen_attitude': 'record the attitudes that the star tracker measures',
-    'out_of_order': 'use one topic for each camera, and sort the images of a bag by their stamps',
+    'out_of_order': 'use one topic for each camera, and send images in the order of their stamps',
     'overexposed': 'expose for a shorter time',
     'blank': 'check that the camera is read out',
     'frozen': 'check that the camera is read out',

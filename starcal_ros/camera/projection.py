@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
 
@@ -448,7 +449,8 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     -------
     camera : CameraModel
     worst_px : float
-        Largest pixel error over the grid; infinite where the model cannot see all of it.
+        Largest pixel error over the grid; infinite where the model cannot see all of it, or no
+        camera of the model is found.
     """
     if model == camera.model and not camera.has_field:
         return dataclasses.replace(camera, field=None), 0.0
@@ -512,17 +514,20 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     # MINPACK scales the parameters by their columns and bounds the step.
     from scipy.optimize import least_squares  # a third of the start of a short command
 
-    solution = least_squares(
-        residual,
-        start.parameters[free],
-        jacobian,
-        method='lm',
-        x_scale='jac',
-        ftol=1e-9 if len(held_px) else 1e-15,
-        xtol=1e-15,
-        gtol=1e-15,
-        max_nfev=200,
-    )
-    fitted = moved(solution.x)
+    try:
+        solution = least_squares(
+            residual,
+            start.parameters[free],
+            jacobian,
+            method='lm',
+            x_scale='jac',
+            ftol=1e-9 if len(held_px) else 1e-15,
+            xtol=1e-15,
+            gtol=1e-15,
+            max_nfev=200,
+        )
+        fitted = moved(solution.x)
+    except ValueError:  # a step to a camera that cannot be, or to no number
+        return start, math.inf
     error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
     return fitted, float(np.where(np.isnan(error), np.inf, error).max(initial=0.0))

@@ -450,9 +450,11 @@ def _result(
     linear, after, attitudes, kept = last.linear, last.after, last.attitudes, judged.kept
     problem, layout, residual_px = linear.problem, linear.layout, last.residual_px
     found = with_shared_errors(last.posterior, last.sums, linear, weights)
-    camera = dataclasses.replace(prior.camera, field=_field_of(found, size)).replace(
-        **{problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
-    )
+    free = {problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
+    try:
+        camera = dataclasses.replace(prior.camera, field=_field_of(found, size)).replace(**free)
+    except ValueError as error:  # stars near the boresight alone allow a mirrored camera too
+        raise NotObservable(f'the {prior.camera.model} fit ends at {error}') from error
     alignment = after.camera_from_star_tracker
     geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
     covariance = _considered(found, problem)

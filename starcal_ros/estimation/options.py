@@ -15,6 +15,7 @@ from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.options import option
 from starcal_ros.records import Ensemble
+from starcal_ros.text import counted
 
 _USUAL_TRACKER_ARCSEC = 10.0  # until the scatter of the images replaces it
 
@@ -206,15 +207,16 @@ def check_enough(ensemble: Ensemble, options: CalibrationOptions) -> None:
     missing = []
     if images < options.min_images:
         missing.append(
-            f'{options.min_images - images} more images are needed '
+            f'{counted(options.min_images - images, "more image")} '
             f'({images} of {options.min_images} collected)'
         )
     if stars < options.min_stars:
         missing.append(
-            f'{options.min_stars - stars} more stars are needed '
+            f'{counted(options.min_stars - stars, "more star")} '
             f'({stars} of {options.min_stars} collected)'
         )
     if missing:
         refused = sum(ensemble.refused.values())
-        also = f'; {refused} images were refused' if refused else ''
-        raise TooFewObservations('too few observations: ' + ' and '.join(missing) + also)
+        also = f'; {counted(refused, "image")} refused' if refused else ''
+        words = f'{" and ".join(missing)} needed{also}'
+        raise TooFewObservations(f'too few observations: {words}')

@@ -27,6 +27,7 @@ from starcal_ros.identification.prediction import (
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
 from starcal_ros.stars.detection import Sources
+from starcal_ros.text import counted
 
 # Number of the brightest predictions and sources that vote; all pairs fill one histogram.
 _VOTERS = 100
@@ -82,7 +83,7 @@ def acquire(
         if most >= _SOUND_SHARE * min(len(sources.snr), _DEPTHS[0]):
             break
     if best_px is None:
-        raise refused or ImageRefused('no_match', f'{len(sources.snr)} star-like sources')
+        raise refused or ImageRefused('no_match', counted(len(sources.snr), 'star-like source'))
     return best_px
 
 

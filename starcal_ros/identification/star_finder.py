@@ -50,6 +50,7 @@ from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
 from starcal_ros.stars.image_model import CentroidOptions, ImageModel, Instrument, model_image
 from starcal_ros.stars.psf_fit import stamp_radius_px
 from starcal_ros.stars.streak import Streak, without_streaks
+from starcal_ros.text import counted
 
 _SEARCH_SIGMAS = 3.0
 _CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
@@ -290,7 +291,7 @@ def _observations(
         width=width,
         height=height,
         refusal='too_few_stars' if few else '',
-        detail=f'{measured} stars measured, {_MIN_STARS} needed' if few else '',
+        detail=f'{counted(measured, "star")} measured, {_MIN_STARS} needed' if few else '',
         icrf_from_star_tracker_xyzw=exposure.icrf_from_star_tracker_xyzw,
         attitude_gap_s=exposure.attitude_gap_s,
         catalog_id=catalog.id[index][good],
@@ -387,7 +388,7 @@ def _find(
     )
     if len(sources.snr) < _MIN_STARS:
         raise ImageRefused(
-            'no_stars', f'{len(sources.snr)} star-like sources, {_MIN_STARS} needed'
+            'no_stars', f'{counted(len(sources.snr), "star-like source")}, {_MIN_STARS} needed'
         )
     tilt_rad, roll_rad = search.reach_rad(camera)
     reach_px = tilt_rad * float(camera.parameters[0])

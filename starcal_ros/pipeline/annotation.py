@@ -13,6 +13,7 @@ import numpy as np
 from starcal_ros.arrays import Floats, Picture, Pixels, Singles
 from starcal_ros.camera import project
 from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.text import counted
 
 Color = tuple[int, int, int]  # blue, green, red
 
@@ -146,7 +147,7 @@ def _draw_legend(
         if count
     ]
     if not observations.refusal:
-        used = f'{len(observations)} stars: predicted, measured'
+        used = f'{counted(len(observations), "star")}: predicted, measured'
         lines.insert(0, (Mark(cv2.MARKER_CROSS, _PREDICTED), used))
     if not lines:
         return

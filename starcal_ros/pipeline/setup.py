@@ -50,6 +50,7 @@ from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.frame_checks import ScreeningOptions
 from starcal_ros.stars.hot_pixels import hot_in_dark, HotPixels, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import CentroidOptions
+from starcal_ros.text import counted
 from starcal_ros.untrusted import shown
 
 _LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
@@ -106,8 +107,8 @@ def check_field_of_stars(
         if in_field >= _FEWEST_STARS:
             return
     raise OptionError(
-        f'magnitude_limit: {magnitude_limit:g} leaves {len(catalog)} stars in the catalog,'
-        f' {in_field:.2g} in a mean field of the camera where it is deepest; raise it, or'
+        f'magnitude_limit: {magnitude_limit:g} leaves {counted(len(catalog), "star")} in the'
+        f' catalog, {in_field:.2g} in a mean field of the camera where it is deepest; raise it, or'
         ' give a deeper catalog (starcal catalog)'
     )
 

@@ -262,17 +262,18 @@ def estimate_with_smallest_lens(
     A model is accepted where the likelihood of a field beside it is not larger than chance makes
     it: structure over the detector, which a model does not lose by having more coefficients alone.
     Where none is accepted, the model with the least evidence for a field is, each coefficient
-    counted as 2.
+    counted as 2.  A model that cannot be estimated is left out.
 
     Raises
     ------
     TooFewObservations
-        When there are too few images or stars for the model of the prior camera.
+        When no model can be estimated, with the shortage of the first.
     OptionError
         For options that do not go together.
     """
     least = math.inf
     best: tuple[Estimate, CameraGeometry] | None = None
+    shortage = TooFewObservations('no lens model describes the prior camera')
     others = sorted(
         LENSES.keys() - {prior.camera.model}, key=lambda m: len(LENSES[m].coefficients)
     )
@@ -283,10 +284,9 @@ def estimate_with_smallest_lens(
         started = dataclasses.replace(prior, camera=camera)
         try:
             estimate = estimate_calibration(ensemble, started, options, colours_of)
-        except TooFewObservations:
-            if model == prior.camera.model:
-                raise
-            continue  # the stars do not determine a model that large
+        except TooFewObservations as error:
+            shortage = error if model == prior.camera.model else shortage
+            continue  # the stars do not determine this model
         if estimate.termination != 'converged' and best is not None:
             continue  # lost on the way: its lack of a field means nothing
         camera = estimate.geometry.camera
@@ -299,7 +299,7 @@ def estimate_with_smallest_lens(
             least = ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients)
             best = estimate, started
     if best is None:
-        raise TooFewObservations('no lens model describes the prior camera')
+        raise shortage
     return best
 
 

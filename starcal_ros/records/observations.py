@@ -121,6 +121,8 @@ class AttitudeSample:
     icrf_from_star_tracker_xyzw: Floats
 
 
+OF_THE_STARS = '(stars)'
+"""In place of a star tracker in recordings: the attitude is that of the image's own stars."""
 LEAST_DEGC, MOST_DEGC = -273.15, 1000.0
 """Lowest and highest temperature of a camera."""
 _Name = Annotated[str, fields.Most(most_characters=100)]
@@ -133,10 +135,17 @@ _Vector = Annotated[Floats, fields.Shape((3,))]
 _UNKNOWN, _IDENTITY = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0])
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+def _no_rows() -> Singles:
+    """A column that is not known, in the record of no star."""
+    return np.empty(0, np.float32)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class StarObservations(fields.Record):
     """
     The stars measured and identified in one image, or the reason of its refusal.
+
+    A message needs the fields without a default; the default of another one means not known.
 
     Attributes
     ----------
@@ -149,7 +158,8 @@ class StarObservations(fields.Record):
     icrf_from_star_tracker_xyzw : (4,)
         Star tracker attitude at ``time_ns``; identity if there is none.
     star_tracker : str
-        Frame of the star tracker that gave the attitude; empty: the first, or the only one.
+        Frame of the star tracker that gave the attitude; empty: the first, or the only one, or in
+        memory none.
     first_from_star_tracker_xyzw : (4,)
         Orientation of that star tracker in the frame of the first, as assumed; the identity for
         the first.  ``icrf_from_star_tracker`` times it is the attitude as received.
@@ -205,22 +215,24 @@ class StarObservations(fields.Record):
     time_ns: fields.Stamp
     width: _Side
     height: _Side
-    refusal: Annotated[str, _REFUSAL]
-    detail: str
+    refusal: Annotated[str, _REFUSAL] = ''
+    detail: str = ''
     icrf_from_star_tracker_xyzw: Annotated[_Attitude, fields.Named('attitude')]
-    attitude_gap_s: Annotated[float, fields.Within(0)]
+    attitude_gap_s: Annotated[float, fields.Within(0)] = math.nan
     catalog_id: Annotated[Integers, fields.Shape(('n',))]
     direction_icrf: Annotated[Floats, fields.Finite(), fields.Shape(('n', 3)), fields.Unit(1e-6)]
-    magnitude: _FloatsOrNaN
+    magnitude: _FloatsOrNaN = dataclasses.field(default_factory=_no_rows)
     measured_px: Annotated[Floats, fields.Finite(), fields.Shape(('n', 2))]
     covariance_px2: Annotated[Floats, fields.Finite(), fields.Shape(('n', 3))]
-    flux_dn: _FloatsOrNaN
-    snr: _FloatsOrNaN
-    refused_stars: Annotated[Mapping[str, fields.Count], fields.Most(100, most_items=50)]
-    background_dn: _FiniteOrNaN
-    noise_dn: _FiniteOrNaN
-    psf_sigma_px: _FiniteOrNaN
-    catalog_digest: _Name
+    flux_dn: _FloatsOrNaN = dataclasses.field(default_factory=_no_rows)
+    snr: _FloatsOrNaN = dataclasses.field(default_factory=_no_rows)
+    refused_stars: Annotated[Mapping[str, fields.Count], fields.Most(100, most_items=50)] = (
+        dataclasses.field(default_factory=dict)
+    )
+    background_dn: _FiniteOrNaN = 0.0
+    noise_dn: _FiniteOrNaN = 0.0
+    psf_sigma_px: _FiniteOrNaN = 0.0
+    catalog_digest: _Name = ''
     temperature_degc: Annotated[float, fields.Within(LEAST_DEGC, MOST_DEGC)] = math.nan
     star_tracker: _Name = ''
     first_from_star_tracker_xyzw: Annotated[_Attitude, fields.Named('first_from_star_tracker')] = (
@@ -256,22 +268,11 @@ class StarObservations(fields.Record):
             time_ns=time_ns,
             width=size[0],
             height=size[1],
-            refusal='',
-            detail='',
             icrf_from_star_tracker_xyzw=_IDENTITY.copy(),
-            attitude_gap_s=math.nan,
             catalog_id=np.empty(0, np.int64),
             direction_icrf=np.empty((0, 3)),
-            magnitude=np.empty(0, np.float32),
             measured_px=np.empty((0, 2)),
             covariance_px2=np.empty((0, 3)),
-            flux_dn=np.empty(0, np.float32),
-            snr=np.empty(0, np.float32),
-            refused_stars={},
-            background_dn=0.0,
-            noise_dn=0.0,
-            psf_sigma_px=0.0,
-            catalog_digest='',
         )
         return dataclasses.replace(empty, **known)  # type: ignore[arg-type]
 

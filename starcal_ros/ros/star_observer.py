@@ -38,6 +38,7 @@ from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waitin
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
 from starcal_ros.sky.attitude import attitude_sample
+from starcal_ros.text import counted
 
 NAME = 'star_observer'
 _ATTITUDES = (QuaternionStamped, PoseStamped, TransformStamped, Imu)
@@ -136,7 +137,9 @@ class StarObserver(StarcalNode):
         if self._worker is None:
             return
         if len(self._queue):
-            self.get_logger().warning(f'{len(self._queue)} images dropped from the queue')
+            self.get_logger().warning(
+                f'{counted(len(self._queue), "image")} dropped from the queue'
+            )
         self._queue.close()
         self._worker.join()
         self._worker = None
@@ -384,7 +387,7 @@ class StarObserver(StarcalNode):
                 self._publish(observations)
         if images:
             self.get_logger().info(
-                f'{len(images)} images without a match measured again: {len(used)} used'
+                f'{counted(len(images), "image")} without a match measured again: {len(used)} used'
             )
         return used
 
@@ -408,7 +411,7 @@ class StarObserver(StarcalNode):
             seconds = observations.time_ns / NANOSECONDS_PER_SECOND
             self.get_logger().warning(f'image at {seconds:.3f} s: {text}')
         else:
-            self.get_logger().debug(f'{len(observations)} stars')
+            self.get_logger().debug(counted(len(observations), 'star'))
 
     def _publish_annotated(
         self, image: Image, observations: StarObservations, geometry: CameraGeometry

@@ -146,7 +146,7 @@ def test_options_are_checked_by_name() -> None:
 
 
 def test_too_few_images_are_refused() -> None:
-    with pytest.raises(starcal_ground.TooFewObservations, match='1 more images are needed'):
+    with pytest.raises(starcal_ground.TooFewObservations, match='1 more image .* needed'):
         starcal_ground.calibrate(ensemble().images[:2], SCENARIO.prior)
 
 

@@ -19,6 +19,7 @@ from starcal_ground.cli import main
 from starcal_ground.comparison import compare
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
+from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_calibration, write_calibration
@@ -214,6 +215,31 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
     )
     with pytest.raises(ProductError, match='640 x 512.*641 x 512'):
         compare(tiny, dataclasses.replace(tiny, geometry=bigger))
+
+
+@pytest.mark.parametrize('model', ['rational_polynomial', 'equidistant'])
+def test_two_lens_models_are_compared_by_their_lines_of_sight(
+    tiny: Calibration, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera, worst_px = convert(tiny.geometry.camera, model)
+    count = len(camera.parameters) + 3
+    geometry = dataclasses.replace(tiny.geometry, camera=camera)
+    none = np.zeros((count, count))
+    other = dataclasses.replace(tiny, geometry=geometry, covariance=none, field=None)
+    found = compare(tiny, other)
+    # The conversion states its error in pixels; the angle of one is at most that of the centre.
+    assert found.before.length_px.max() <= 1.01 * worst_px + 1e-9
+    assert np.isfinite(found.after.sigmas).all() and found.total.degrees_of_freedom == 0
+    for name, calibration in (('a', tiny), ('b', other)):
+        write_calibration(calibration, tmp_path / f'{name}.json')
+    command = ['compare', str(tmp_path / 'a.json'), str(tmp_path / 'b.json')]
+    assert main.main(command) == 0
+    said = capsys.readouterr().out
+    assert f'lens model plumb_bob, B {model}' in said and 'parameter  ' not in said
+    assert 'common rotation' in said and 'sigma' in said
+    assert main.main([*command, '--json']) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content['parameter_names'] == content['difference'] == []
 
 
 def test_the_tool_compares(

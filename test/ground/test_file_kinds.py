@@ -7,6 +7,7 @@ from collections.abc import Callable
 import contextlib
 from pathlib import Path
 import re
+import shlex
 import shutil
 import sqlite3
 import subprocess
@@ -20,7 +21,8 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
-from starcal_ground.file_kinds import explained
+from starcal_ground.file_kinds import explained, matching
+from starcal_ground.images.photographs import image_paths
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE
 from starcal_ros.records import Image
@@ -169,3 +171,35 @@ def test_files_are_read_in_the_order_of_their_first_messages(
     stamps = [image.time_ns for image in reader.read_images(given, '/image')]
     assert stamps == sorted(stamps) and len(stamps) == 3
     assert reader.mcap_files([tmp_path, *given]) == [tmp_path / name for name in names]
+
+
+@pytest.mark.parametrize(
+    ('pattern', 'names'),
+    [
+        ('night[1]', ['night[1]']),
+        ('night[1]/*.png', ['night[1]/a.png', 'night[1]/b.png']),
+        ('night[1]/a.png', ['night[1]/a.png']),
+        ('night[1]/a[1].png', []),
+        ('night?1?/[ab].png', ['night[1]/a.png', 'night[1]/b.png']),
+        ('night[2]/*.png', []),
+        ('night2', ['night2']),
+    ],
+)
+def test_a_folder_that_exists_is_no_pattern(
+    tmp_path: Path, pattern: str, names: list[str]
+) -> None:
+    (tmp_path / 'night[1]').mkdir()
+    for name in ('a.png', 'b.png'):
+        (tmp_path / 'night[1]' / name).touch()
+    assert matching(tmp_path / pattern) == [tmp_path / name for name in names]
+
+
+def test_a_folder_of_folders_with_images_names_them(tmp_path: Path) -> None:
+    for night in ('a', 'b', 'no images'):
+        (tmp_path / night).mkdir()
+        (tmp_path / night / 'x.png').write_bytes(b'' if ' ' in night else b'\x89PNG\r\n\x1a\n')
+    with pytest.raises(BagError) as error:
+        reader.mcap_files([tmp_path])
+    said = explained(error.value)
+    assert said.endswith(f'but folders with images (a, b): give {shlex.quote(f"{tmp_path}/*")}')
+    assert [path.parent.name for path in image_paths([tmp_path / '*'])] == ['a', 'b', 'no images']

@@ -53,7 +53,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     arguments.add_output(command, 'DIR', f'{_DIR} (needed)')
     what = (
         'a sigma to reach, such as line_of_sight=5arcsec@98%%, map=0.1px, pointing=10arcsec or'
-        ' f=0.1px, in place of the option requirements; may be repeated'
+        ' f=0.1px, in place of the option requirements; may be repeated; none: no requirement'
     )
     command.add_argument('--require', action='append', metavar='NAME=LIMIT', help=what)
     what = 'write no report; starcal report DIR writes it later'

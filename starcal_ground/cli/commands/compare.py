@@ -53,26 +53,27 @@ def run(args: argparse.Namespace) -> int:
 def print_comparison(comparison: Comparison) -> None:
     """Print the differences of parameters, alignment and lines of sight."""
     a, b = (c.geometry.camera for c in (comparison.a, comparison.b))
-    of_a = dict(zip(a.parameter_names, a.parameters, strict=True))
     difference, sigma = comparison.difference, comparison.sigma
     rows = [
         (
             name,
-            text.to_sigma(of_a[name], sigma[k]) if name in of_a else '',
+            text.to_sigma(a.parameters[k], sigma[k]),
             text.to_sigma(b.parameters[k], sigma[k]),
             text.to_sigma(difference[k], sigma[k], '+'),
             text.significant(sigma[k], 2) if sigma[k] else 'held',
             _sigmas(difference[k], sigma[k]),
         )
         for k, name in enumerate(b.parameter_names)
+        if difference.size
     ]
     arcsec, sigma_arcsec = difference[-3:] / ARCSECOND_RAD, sigma[-3:] / ARCSECOND_RAD
     rows += [
         (f'alignment {axis}', '', '', f'{d:+.2f}″', f'{s:.2f}″', _sigmas(d, s))
-        for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
+        for axis, d, s in zip('xyz'[: len(arcsec)], arcsec, sigma_arcsec, strict=True)
         if comparison.is_aligned
     ]
-    terminal.print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
+    if rows:
+        terminal.print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
     terminal.print_table(
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [

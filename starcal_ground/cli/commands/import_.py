@@ -18,12 +18,13 @@ file to calibrate the bag.
 import argparse
 from collections.abc import Sequence
 import dataclasses
-import glob
 from pathlib import Path
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.file_kinds import matching
 from starcal_ros.errors import OptionError
+from starcal_ros.text import counted
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -108,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
         made = recording.write_bag(
             args.output, files, options, guard, attitudes, velocities, prior, advance, further
         )
-    print_text(f'bag {made.bag}: {len(files)} images')
+    print_text(f'bag {made.bag}: {counted(len(files), "image")}')
     for note in made.notes:
         print_text(f'note: {note}')
     if made.params:
@@ -124,8 +125,7 @@ def _expanded(patterns: Sequence[str]) -> list[Path]:
     """Files of patterns, each once, in order of their names."""
     files: dict[Path, None] = {}
     for pattern in patterns:
-        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
-        if not names:
+        if not (found := matching(Path(pattern))):
             raise OptionError(f'--images: no file matches {pattern}')
-        files |= dict.fromkeys(map(Path, names))
+        files |= dict.fromkeys(found)
     return list(files)

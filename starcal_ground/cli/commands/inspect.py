@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.constants import utc_text
 from starcal_ros.errors import BagError, NotFromStars, OptionError
-from starcal_ros.text import significant
+from starcal_ros.text import counted, significant
 
 if TYPE_CHECKING:
     from starcal_ground.planning.inspect import Inspection, TopicContent
@@ -124,7 +124,7 @@ def _print_images(inspection: Inspection) -> None:
     assert chosen is not None  # images come from a chosen topic
     attitudes = ', '.join(filter(None, (chosen.attitude, *chosen.more_attitudes)))
     terminal.print_wrapped(
-        f'{inspection.images - bad} of {inspection.images} images of '
+        f'{inspection.images - bad} of {counted(inspection.images, "image")} of '
         f'{chosen.image or chosen.observations} can be used'
         + (f', with the attitudes of {attitudes}' if attitudes else '')
     )

@@ -25,6 +25,7 @@ import dataclasses
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
+from starcal_ros.text import counted
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         made = simulated_bag.write_bag(
             scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
         )
-    print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
+    print_text(f'bag {made.bag}, {counted(scenario.image_count, "image")}, seed {args.seed}')
     print_text(f'truth {made.truth}')
     if scenario.table is not None:
         table = made.params.with_name(made.params.name.replace('params.yaml', 'gaia.csv'))

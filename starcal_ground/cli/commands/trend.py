@@ -23,6 +23,7 @@ from pathlib import Path
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import OptionError
+from starcal_ros.text import counted
 
 _FAILURES_SHOWN = 5
 
@@ -86,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
     terminal.print_text(f'calibrations: {page.calibrations}; look at {page.path}')
     if done.silent == fleet.MOST_SILENT:
         arguments.complain(
-            f'{args.root}: the last {done.silent} files cannot be read; run again when the store'
-            ' answers: the others are left for that run'
+            f'{args.root}: the last {counted(done.silent, "file")} not readable; run again when'
+            ' the store answers: the others are left for that run'
         )
         return arguments.EXIT_REFUSED
     return arguments.EXIT_ACCEPTED if page.calibrations else arguments.EXIT_REFUSED

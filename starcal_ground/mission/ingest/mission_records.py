@@ -2,10 +2,11 @@
 """
 Records that the readers of mission formats return, CSV tables of them, and strict reading.
 
-CSV tables have a header of named columns.  A column of times is ``time_utc``, ``time_tai``,
-``time_tt``, ``time_tdb`` or ``time_gps`` (dates) or ``time_ns`` (UTC stamps).  Attitudes are
-``qx, qy, qz, qw``, the orientation of the star tracker in the ICRF; velocities ``vx_m_s, vy_m_s,
-vz_m_s``, barycentric along ICRF axes; ``file`` names an image.
+CSV tables have a header of named columns, in any case, separated by commas, semicolons or tabs.  A
+column of times is ``time_utc``, ``time_tai``, ``time_tt``, ``time_tdb`` or ``time_gps`` (dates) or
+``time_ns`` (UTC stamps).  Attitudes are ``qx, qy, qz, qw``, the orientation of the star tracker in
+the ICRF; velocities ``vx_m_s, vy_m_s, vz_m_s``, barycentric along ICRF axes; ``file`` names an
+image.
 
 Readers run in a child process with limits of memory and time.  A file of a few megabytes can
 inflate to gigabytes, keep a library busy for minutes, name a pipe that nobody writes to, or crash
@@ -20,6 +21,7 @@ from collections.abc import Callable, Iterator
 import csv
 from dataclasses import dataclass
 import functools
+import itertools
 import math
 import os
 from pathlib import Path
@@ -162,10 +164,13 @@ def _rows(
 ) -> Iterator[tuple[int, Result]]:
     """Rows, one at a time: their stamps and what a function reads in them."""
     lines = (match[0] for match in re.finditer(r'[^\r\n]+', text_of(path)))
-    table = csv.DictReader(line for line in lines if not line.startswith('#'))
+    lines = (line for line in lines if not line.startswith('#'))
+    header = next(lines, '')
+    mark = max(',;\t', key=header.count)  # of spreadsheets, which differ by country
+    table = csv.DictReader(itertools.chain([header], lines), delimiter=mark)
     number = 1
     try:
-        names = [name.strip() for name in table.fieldnames or ()]
+        names = [name.strip().lower() for name in table.fieldnames or ()]
         missing = [name for name in needed if name not in names]
         if missing or not any(_is_time(name) for name in names):
             wanted = ', '.join((*missing, 'time_utc'))

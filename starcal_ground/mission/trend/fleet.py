@@ -8,7 +8,9 @@ worker of Dask.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 import contextlib
 from dataclasses import dataclass, field, replace
 import errno
@@ -401,8 +403,17 @@ def _answers(
     first = list(itertools.islice(tasks, 1))
     tasks = itertools.chain(first, tasks)
     if first and (workers or scheduler):
-        with _cluster(workers, scheduler) as (client, ahead):
-            yield from _as_completed(client, ahead, tasks)
+        try:
+            with _cluster(workers, scheduler) as (client, ahead):
+                yield from _as_completed(client, ahead, tasks)
+        # A worker that is killed while it starts, or a scheduler that is lost.
+        except (RuntimeError, OSError, CancelledError, asyncio.CancelledError) as error:
+            option = f'--scheduler: {scheduler}' if scheduler else f'--workers: {workers}'
+            words = printable(' '.join(str(error).split())).rstrip('.')
+            raise OptionError(
+                f'{option}: Dask ended ({words}; out of memory?): run again to continue after the'
+                ' last row, or without workers'
+            ) from error
     else:
         yield from ((task, compute(task)) for task in tasks)
 

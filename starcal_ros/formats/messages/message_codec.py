@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -69,7 +70,9 @@ class RawMessage:
     """
     A message as recorded or received.
 
-    ``view`` is serialised CDR with its header, ``definition`` that of its type in the bag.
+    ``view`` is serialised CDR with its header, ``definition`` that of its type in the bag;
+    ``place`` is its file, the offset of its chunk there, or its own, and its number in the chunk;
+    None where the reader does not know it.
     """
 
     topic: str
@@ -77,6 +80,7 @@ class RawMessage:
     definition: str
     log_time_ns: int
     view: memoryview
+    place: tuple[Path, int, int] | None = None
 
     @property
     def data(self) -> bytes:
@@ -212,7 +216,7 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
     """
     Plain values of the message of a record by the names of its fields; arrays have their shapes.
 
-    Fields that the message does not have are omitted.
+    Fields that the message does not have are omitted, and empty arrays that may be missing.
 
     Raises ValueError with the name of an array whose size contradicts other fields.
     """
@@ -231,7 +235,10 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
         elif kind.kind is np.ndarray:
             for word in filter(_is_word, kind.dimensions):
                 sizes[word] = int(getattr(message, str(word)))
-            values[field] = _shaped(np.asarray(getattr(message, field)), kind, field, sizes)
+            flat = np.asarray(getattr(message, field))
+            if kind.has_default and not flat.size:
+                continue  # ROS has no other way to leave a sequence out
+            values[field] = _shaped(flat, kind, field, sizes)
             sizes |= zip(kind.dimensions, values[field].shape, strict=True)
         else:
             values[field] = _value(kind, getattr(message, field))
@@ -265,8 +272,6 @@ def _shaped(
         shape[shape.index(-1)] = flat.size // known if known else 0
     elif -1 in shape:  # both sides have the same name: a square
         shape = [math.isqrt(flat.size) if size == -1 else size for size in shape]
-    if not flat.size and kind.low is not None and not kind.is_finite:
-        return np.full(shape, math.nan, flat.dtype)  # left out: numbers that are not known
     if flat.size != math.prod(shape):
         raise ValueError(f'{field}: {flat.size} numbers, not {" x ".join(map(str, shape))}')
     return flat.reshape(shape)

@@ -29,6 +29,7 @@ from starcal_ros.records import (
 _VARIANCE_PX2 = (1e-10, 1e6)  # smallest and largest that a measured star has
 _LONGEST_DETAIL = 500  # characters
 _EXACT_VELOCITY = -1.0  # in messages: 0 is that of a sender that leaves it out
+_REFUSED_ROWS = ('refused_star_id', 'refused_star_px', 'refused_star_reason')
 # No software on board reads them: they are in calibration.json alone.
 _NOT_SENT = ('model_checks', 'statements')
 
@@ -54,7 +55,7 @@ def observations_from_message(message: codec.Message) -> StarObservations:
     Observations of a starcal/StarObservations.
 
     Fields that a sender leaves at ROS's zeros have their defaults, as have those that the message
-    of an older recording lacks.
+    of a recording lacks.  Arrays that explain each other have theirs if one of them is left out.
 
     Raises ValueError when the arrays of the message do not fit each other or hold values that no
     star can have.
@@ -62,9 +63,11 @@ def observations_from_message(message: codec.Message) -> StarObservations:
     values = codec.plain_message(StarObservations, message)
     names = ('refused_star_reasons', 'refused_star_counts')
     reasons, counts = (getattr(message, name, ()) for name in names)
-    if len(reasons) != len(counts):
+    if len(reasons) and len(counts) and len(reasons) != len(counts):
         raise ValueError(f'refused_star_reasons: {len(reasons)} reasons but {len(counts)} counts')
-    values['refused_stars'] = dict(zip(reasons, counts, strict=True))
+    values['refused_stars'] = dict(zip(reasons, counts, strict=False))
+    if not values['refused_stars'] or not values.keys() >= {*_REFUSED_ROWS}:
+        values = {name: value for name, value in values.items() if name not in _REFUSED_ROWS}
     values['detail'] = values.get('detail', '')[:_LONGEST_DETAIL]
     _forget_zeros(values)
     record = read_record(StarObservations, values)

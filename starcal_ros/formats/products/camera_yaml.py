@@ -50,6 +50,11 @@ class _CameraInfo:
         """Return the camera, K[0,1] as its skew; raises ValueError for impossible values."""
         K = self.camera_matrix.data
         fx, skew, cx, zero, fy, cy = K[:6]
+        if not any(K):
+            raise ValueError(
+                'camera_matrix (K) is zeros, an uncalibrated camera in ROS: leave camera_info_url'
+                ' out to find the camera by its stars, or state a first K'
+            )
         if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):
             raise ValueError(f'camera_matrix.data: {list(K)} is not [fx s cx 0 fy cy 0 0 1]')
         # None: ROS writes so where a lens has no distortion.
@@ -90,7 +95,9 @@ def _camera_info_values(text: str) -> Mapping[str, Any]:
         return _values_of_mrcal(text)
     if text.startswith('%YAML:1.0'):  # neither OpenCV's first line nor its tag is YAML
         text = text.partition('\n')[2].replace('!!opencv-matrix', '')
-    content = yaml_value(text)
+    # A line ends each message of ros2 topic echo; the camera of one is that of all.
+    documents = re.split(r'^---\s*$', text, flags=re.MULTILINE)
+    content = yaml_value(next(filter(str.strip, documents), ''))
     if not isinstance(content, dict):
         raise ValueError('not a camera YAML (no keys)')
     if any(isinstance(body, dict) and 'ros__parameters' in body for body in content.values()):

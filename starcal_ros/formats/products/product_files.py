@@ -21,7 +21,7 @@ import numpy as np
 from starcal_ros import untrusted
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import replacing
+from starcal_ros.files import replacing, sealed
 from starcal_ros.record_fields import Count, Finite, json_object, Quaternion, read_record
 from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
 from starcal_ros.untrusted import shown
@@ -50,10 +50,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """
     Replace a file whole: readers, and a power loss, see the old one or the new one.
 
-    Raises ProductError when the file cannot be written; the old one is then unchanged.
+    An HTML page is sealed.  Raises ProductError when the file cannot be written; the old one is
+    then unchanged.
     """
+    data = content.encode() if isinstance(content, str) else content
     with errors_as(ProductError, path, 'written'), replacing(path) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
+        file.write(sealed(data) if path.suffix == '.html' else data)
 
 
 @dataclass(frozen=True)

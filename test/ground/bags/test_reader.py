@@ -489,15 +489,30 @@ def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     assert isinstance(read, Image) and read.time_ns == 5
 
 
-def test_a_bag_without_messages_of_ros_2_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ('profile', 'encoding', 'said'),
+    [
+        ('ros1', 'ros1', 'an MCAP of ROS 1 messages: convert .* rosbags-convert --src'),
+        ('', 'ros1', 'an MCAP of ROS 1 messages'),
+        ('ros1', 'json', 'an MCAP of ROS 1 messages'),
+        ('', 'json', r'\(topics: none in cdr, the encoding of ROS 2\)'),
+    ],
+)
+@pytest.mark.parametrize('is_cut', [False, True])
+def test_a_bag_without_messages_of_ros_2_is_named(
+    tmp_path: Path, profile: str, encoding: str, said: str, is_cut: bool
+) -> None:
     """As those that other tools make of ROS 1 bags."""
     with (tmp_path / 'b.mcap').open('wb') as stream:
         writer = Writer(stream)
-        writer.start('ros1')
+        writer.start(profile)
         schema = writer.register_schema('sensor_msgs/Image', 'ros1msg', b'uint32 height')
-        writer.add_message(writer.register_channel('/image', 'ros1', schema), 1, b'', 1)
+        writer.add_message(writer.register_channel('/image', encoding, schema), 1, b'', 1)
         writer.finish()
-    with pytest.raises(BagError, match=r'\(topics: none in cdr, the encoding of ROS 2\)'):
+    if is_cut and profile:  # without a summary
+        content = (tmp_path / 'b.mcap').read_bytes()
+        (tmp_path / 'b.mcap').write_bytes(content[:-30])
+    with pytest.raises(BagError, match=said):
         bag_reader.choose_topic([tmp_path / 'b.mcap'], IMAGE_TYPE)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
@@ -84,7 +85,8 @@ def test_stars_are_found_in_the_channel_and_with_the_transforms(bag: Path) -> No
 SEVERAL = 'several topics may hold the attitudes: '
 NOT_READ = (
     'no topic of type .*QuaternionStamped.*; /a is a PoseWithCovarianceStamped, which is not read'
-    ': publish its orientation as a QuaternionStamped or PoseStamped; starcal calibrate'
+    ': publish its orientation as a QuaternionStamped or PoseStamped, and choose that with'
+    ' --attitude-topic; starcal calibrate'
     ' --camera-alone'
 )
 
@@ -139,6 +141,44 @@ def test_attitudes_that_are_not_chosen_are_named(
             topics.choose_topics(bags, Topics(attitude=asked), setup)
 
 
+@pytest.mark.parametrize(
+    ('kind', 'is_named'),
+    [
+        ('tf2_msgs/msg/TFMessage', True),
+        ('nav_msgs/msg/Odometry', True),
+        ('px4_msgs/msg/VehicleAttitude', True),
+        ('geometry_msgs/msg/PoseWithCovarianceStamped', True),
+        ('sensor_msgs/msg/Temperature', False),
+    ],
+)
+def test_attitudes_that_are_not_read_are_named_where_none_are_asked_for(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str, is_named: bool
+) -> None:
+    """Without parameters the camera was found by its stars, and nothing was said of them."""
+    reader.log_damage.cache_clear()
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_image('/image', images()[0], 'camera')
+        own: Any = writer._writer
+        schema = own.register_schema(kind, 'ros2msg', b'int8 x')
+        own.add_message(own.register_channel('/a', 'cdr', schema), 1, b'', 1)
+    assert topics.without_attitudes([tmp_path / 'bag'], Topics(), {})
+    said = f'/a is a {kind.rpartition("/")[2]}, which is not read: publish its orientation as a'
+    assert (said in caplog.text) is is_named
+
+
+def test_images_in_another_order_are_all_used(tmp_path: Path) -> None:
+    """Six of ten were: each third image after one of a later stamp began a sequence."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        for time_ns, xyzw in attitudes():
+            writer.write_attitude('/attitude', time_ns, xyzw, 'icrf')
+        for k in (3, 0, 2, 1):
+            writer.write_image('/image', images()[k], 'camera')
+    setup, paths = setup_with(), [tmp_path / 'bag']
+    records = list(topics.read(paths, topics.choose_topics(paths, Topics(), setup), setup))
+    expected = [images()[k].time_ns for k in (3, 0, 1, 2)]
+    assert [(record.time_ns, record.refusal) for record in records] == [(t, '') for t in expected]
+
+
 def test_without_a_channel_the_refusal_names_the_option(bag: Path) -> None:
     setup = setup_with()
     records = list(topics.read([bag], topics.choose_topics([bag], Topics(), setup), setup))
@@ -179,5 +219,5 @@ def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
     assert Source(tuple(bags), chosen, setup).image_count == 1
     (record,) = topics.read(bags, chosen, setup)
     assert not record.refusal and len(record) > 100
-    said = [f'{stray}: 1 messages of std_msgs/msg/String are not read'] if stray else []
+    said = [f'{stray}: 1 message of std_msgs/msg/String not read'] if stray else []
     assert caplog.messages == said

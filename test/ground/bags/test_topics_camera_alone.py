@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
+from starcal_ground import calibrate_bag
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     make_header,
@@ -140,9 +142,20 @@ def test_the_camera_alone_is_calibrated_where_it_is_requested(
 ) -> None:
     bag = TINY if with_attitudes else write_bag(tmp_path / 'bag.mcap', ODOMETRY)
     command = ['calibrate', str(bag), '--camera-alone', '-o', str(tmp_path / 'out')]
-    assert main([*command, '--params', str(TINY / 'params.yaml')]) in (0, 3)
-    assert not read_calibration(tmp_path / 'out' / 'calibration.json').has_alignment
+    given = ['--params', str(TINY / 'params.yaml')]
+    assert main([*command, *given]) in (0, 3)
+    made = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert not made.has_alignment
     assert 'not used, since the attitudes are those of the stars: prior' in capsys.readouterr().err
+    # Its observations say so: repeated from them, it gained the alignment to a star tracker.
+    out, again = str(tmp_path / 'out/observations.mcap'), str(tmp_path / 'again')
+    assert main(['calibrate', out, *given, '-o', again]) in (0, 3)
+    repeated = read_calibration(tmp_path / 'again/calibration.json')
+    assert not repeated.has_alignment
+    name = 'observations_sha256'
+    assert repeated.provenance[name] == made.provenance[name]
+    with pytest.raises(BagError, match='of a camera alone, where a star tracker is set up'):
+        calibrate_bag(out, TINY / 'params.yaml')
 
 
 @pytest.mark.parametrize('command', ['inspect', 'inspect --params', 'calibrate --params'])

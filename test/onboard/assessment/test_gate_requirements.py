@@ -130,11 +130,26 @@ def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
         ('k1=1px', 'write k1=1'),
         ('f=0.1.2px', 'not a number'),
         ('f=0.1px@98%', 'only line_of_sight and map are over a share'),
-        ('map=0px', 'above 0, and the share at most 100 %'),
+        ('map=0px', 'finite and above 0, and the share at most 100 %'),
+        ('map=1e999px', 'finite and above 0'),
+        ('map=1e-999px', 'finite and above 0'),
+        ('map=-1px', 'is not of the form'),
+        ('map=nanpx', 'is not of the form'),
+        ('map=infpx', 'is not of the form'),
         ('map=1px@101%', 'above 0, and the share at most 100 %'),
+        ('map=1px@0%', 'above 0, and the share at most 100 %'),
+        ('', 'leave the option out for the defaults, or write none'),
+        (' ', 'is not of the form'),
     ],
 )
 def test_what_is_not_understood_is_named(text: str, words: str) -> None:
-    with pytest.raises(OptionError, match='^requirements: ') as refused:
-        requirements_of([text])
-    assert words in str(refused.value)
+    for texts in ([text], ['map=1px', text]):
+        with pytest.raises(OptionError, match='^requirements: ') as refused:
+            requirements_of(texts)
+        assert words in str(refused.value)
+
+
+def test_no_requirement_is_stated_by_a_word() -> None:
+    assert requirements_of(['none']) == ()
+    with pytest.raises(OptionError, match='none'):
+        requirements_of(['none', 'map=1px'])

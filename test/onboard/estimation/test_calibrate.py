@@ -409,14 +409,14 @@ def test_too_few_are_counted_for_a_person() -> None:
     with pytest.raises(TooFewObservations) as refused:
         check_enough(two, CalibrationOptions())
     assert str(refused.value) == (
-        'too few observations: 1 more images are needed (2 of 3 collected) and '
-        '46 more stars are needed (14 of 60 collected)'
+        'too few observations: 1 more image (2 of 3 collected) and '
+        '46 more stars (14 of 60 collected) needed'
     )
     refused_too = Ensemble(clean().images[:2], {'no_match': 3, 'no_stars': 1})
     with pytest.raises(TooFewObservations) as refused:
         estimate_calibration(refused_too, PRIOR, CalibrationOptions())
     assert str(refused.value) == (
-        'too few observations: 1 more images are needed (2 of 3 collected); 4 images were refused'
+        'too few observations: 1 more image (2 of 3 collected) needed; 4 images refused'
     )
     check_enough(clean(), CalibrationOptions())
 

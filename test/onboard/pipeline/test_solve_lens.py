@@ -4,17 +4,24 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 from random_pointings import honesty, of_random_pointings  # type: ignore[import-not-found]
 
+from starcal_ground.bags.reader import read_observations
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.camera.projection import convert
+from starcal_ros.errors import TooFewObservations
+from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline.setup import load_setup, NODES
 from starcal_ros.pipeline.solve import estimate_with_smallest_lens
+from starcal_ros.records import Ensemble
 
 
 def with_lens(model: str, **coefficients: float) -> Scenario:
@@ -23,6 +30,42 @@ def with_lens(model: str, **coefficients: float) -> Scenario:
     camera, _ = convert(given.truth.camera, model)
     truth = dataclasses.replace(given.truth, camera=camera.replace(**coefficients))
     return dataclasses.replace(given, truth=truth)
+
+
+KB97 = Path(__file__).parents[4] / 'shared/realsky/lco_kb97_observations'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('source', ['noise', 'kb97'])
+def test_a_lens_that_cannot_be_estimated_loses_without_a_traceback(source: str) -> None:
+    """The trial ended at fx, fy below zero, where there is no camera."""
+    if source == 'kb97':
+        if not KB97.is_dir():
+            pytest.skip('lco_kb97_observations is not on this machine')
+        values = read_parameter_file(KB97 / 'params.yaml', NODES)
+        values |= {name: str(KB97 / str(values[name])) for name in ('camera_info_url', 'catalog')}
+        setup = load_setup(values)
+        ensemble = Ensemble()
+        for record in read_observations([KB97 / 'observations.mcap'], '/observations'):
+            ensemble = ensemble.add(record)
+        found, _ = estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)
+        assert found.geometry.camera.intrinsics[0] == pytest.approx(180540.9, rel=0.01)
+        return
+    given = of_random_pointings(1, images=12)
+    ensemble, rng, middle = true_observations(given), np.random.default_rng(1), (648.0, 512.0)
+    images = []
+    for image in ensemble.images:
+        few = image.select(np.isin(np.arange(len(image)), rng.permutation(len(image))[:6]))
+        noise = rng.normal(size=few.measured_px.shape) * 30.0
+        px = middle + (few.measured_px - middle) * 0.02 + noise
+        images.append(dataclasses.replace(few, measured_px=px))
+    options = CalibrationOptions(
+        star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec,
+        velocity_sigma_m_s=10.0,
+        method='per_image',
+    )
+    with pytest.raises(TooFewObservations, match='plumb_bob fit ends at fx, fy: -'):
+        estimate_calibration(Ensemble(tuple(images)), given.prior, options)
 
 
 def unmoved(pixels: Floats) -> Floats:

@@ -139,11 +139,13 @@ def test_an_oem_is_interpolated_and_the_earth_added(tmp_path: Path) -> None:
     assert np.abs(about_ssb.velocity_m_s - circle).max() < 0.1
 
 
-def test_tables_are_read(tmp_path: Path) -> None:
-    lines = ['# from telemetry', 'time_tdb, qx, qy, qz, qw']
-    lines += [f'{date(t, "tdb")}, ' + ', '.join(map(repr, q.tolist())) for t, q in attitudes()]
+@pytest.mark.parametrize('mark', [', ', ';', '\t', ' ; '])
+@pytest.mark.parametrize('header', ['time_tdb qx qy qz qw', 'Time_TDB QX QY QZ QW'])
+def test_tables_are_read(tmp_path: Path, mark: str, header: str) -> None:
+    lines = ['# from telemetry, or another program', mark.join(header.split())]
+    lines += [mark.join([date(t, 'tdb'), *map(repr, q.tolist())]) for t, q in attitudes()]
     path = tmp_path / 'a.csv'
-    path.write_text('\n'.join(lines) + '\n')
+    path.write_text('\ufeff' + '\n'.join(lines) + '\n')
     assert worst_rad(sources.attitudes([path], '', AT_NS), attitudes()) < 1.3e-15
     path.write_text(f'time_ns,vx_m_s,vy_m_s,vz_m_s\n{AT_NS[0]},1,2,3\n')
     assert sources.velocities([path], '', AT_NS).velocity_m_s.tolist() == [[1.0, 2.0, 3.0]]

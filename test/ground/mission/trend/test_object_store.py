@@ -237,7 +237,7 @@ def test_a_store_that_falls_silent_ends_the_run(
     store.faults = {'GET /archive/fleet/0/.*mcap': -1}
     assert trend(tmp_path) == 0
     assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
-    assert 'the last 1 files cannot be read; run' in said.err and said.err.count('\n') == 1
+    assert 'the last 1 file not readable; run' in said.err and said.err.count('\n') == 1
     store.faults = {}
     assert trend(tmp_path) == 0
     assert '1 new, 1 known, 0 failed' in capsys.readouterr().out

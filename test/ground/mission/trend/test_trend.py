@@ -10,6 +10,7 @@ from pathlib import Path
 import re
 import shutil
 
+import dask
 from fleet_tasks import kill_on_poison, kill_once  # type: ignore[import-not-found]
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
@@ -199,3 +200,16 @@ def test_a_worker_killed_in_the_run_loses_and_doubles_nothing(mission, monkeypat
     assert done == fleet.Done(computed=8) and not marker.exists()
     stamps = [row.stamp for row in Table(mission.parent).rows()]
     assert sorted(stamps) == sorted(task.stamp for task in found)
+
+
+@pytest.mark.slow
+def test_a_worker_killed_while_it_starts_is_one_line_and_the_next_run_goes_on(
+    mission, tmp_path, capsys
+) -> None:
+    killing = tmp_path / 'killing.py'
+    killing.write_text('import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n')
+    with dask.config.set({'distributed.worker.preload': [str(killing)]}):
+        assert trend(mission, '--workers', '1') == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1 and '--workers: 1: Dask ended' in said and 'run again' in said
+    assert trend(mission) == 0 and '8 new, 0 known, 0 failed' in capsys.readouterr().out

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from starcal_ros.formats.bag.typestore import (
     described,
     make_message,
     serialised,
+    started,
     store_with,
     typestore,
     typestore_of,
@@ -31,6 +34,8 @@ from starcal_ros.formats.messages.record_messages import (
     checked_observations,
     observations_to_message,
 )
+from starcal_ros.record_fields import fields_of
+from starcal_ros.records import StarObservations
 
 END = '=' * 80
 HEAD = 'std_msgs/Header header\n'
@@ -91,9 +96,13 @@ def zeroed(value: Any, is_sequence: bool) -> Any:
     return type(value)()
 
 
+KINDS = fields_of(StarObservations).items()
+NEEDED = {kind.in_messages for _, kind in KINDS if not kind.has_default}
+
+
 @pytest.mark.parametrize('lacking', FIELDS[1:])
 def test_a_message_of_another_version_is_read_and_has_zeros_for_ros(lacking: str) -> None:
-    """To the nodes its bytes were those of other fields."""
+    """All but the needed fields may lack: in a recording, in an object, and as zeros."""
     now = described(OBSERVATIONS_TYPE)[0]
     message = observations_to_message(observations(), 'camera', make_message)
     lines = [line for line in now.splitlines() if line.partition(' ')[2] != lacking]
@@ -107,8 +116,38 @@ def test_a_message_of_another_version_is_read_and_has_zeros_for_ros(lacking: str
     zero = zeroed(getattr(message, lacking), f'[] {lacking}\n' in now)
     with_zero = serialised('', OBSERVATIONS_TYPE, replace(message, **{lacking: zero}))
     assert reader.cdr_of_this_version(raw) == with_zero
-    record = checked_observations(reader.decode(raw))
-    assert not record.refusal or record.detail.startswith(('key ', 'refused_star_'))
+    of_ros = store_with(OBSERVATIONS_TYPE).deserialize_cdr(with_zero, OBSERVATIONS_TYPE)
+    for there in (reader.decode(raw), SimpleNamespace(**others), of_ros):
+        record = checked_observations(there)
+        assert bool(record.refusal) == (lacking in NEEDED), record.detail
+        assert lacking in record.detail or not record.refusal or there is of_ros
+
+
+def test_the_needed_fields_alone_are_observations(tmp_path: Path) -> None:
+    """A bag whose definition has them alone is read; what else there was is not known."""
+    now, sent = described(OBSERVATIONS_TYPE)[0], observations()
+    others = [name for name in FIELDS if name not in {*NEEDED, 'header'}]
+    own, end, nested = now.partition(END)
+    kept = [line for line in own.splitlines() if line.partition(' ')[2] not in others]
+    definition = '\n'.join([*kept, end + nested])
+    message = observations_to_message(sent, 'camera', make_message)
+    store = typestore_of(OBSERVATIONS_TYPE, definition)
+    fields = {name: getattr(message, name) for name in FIELDS if name not in others}
+    data = store.serialize_cdr(store.types[OBSERVATIONS_TYPE](**fields), OBSERVATIONS_TYPE)
+    with (tmp_path / 'needed.mcap').open('wb') as stream:
+        writer = started(stream)
+        schema = writer.register_schema(OBSERVATIONS_TYPE, 'ros2msg', definition.encode())
+        writer.add_message(writer.register_channel('/o', 'cdr', schema), 1, bytes(data), 1)
+        writer.finish()
+    (record,) = reader.read_observations([tmp_path], '/o')
+    stated = {
+        name: getattr(sent, name)
+        for name, kind in KINDS
+        if not kind.has_default and name not in ('time_ns', 'width', 'height')
+    }
+    unknown = np.full(len(sent), np.nan, np.float32)
+    stated |= dict.fromkeys(('magnitude', 'flux_dn', 'snr'), unknown)
+    assert record == StarObservations.of_image(sent.time_ns, (sent.width, sent.height), **stated)
 
 
 def test_a_type_of_others_is_that_of_ros_whatever_its_bag_says() -> None:

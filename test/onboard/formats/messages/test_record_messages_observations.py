@@ -17,6 +17,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
+from starcal_ros.record_fields import fields_of
 from starcal_ros.records import refused_image, StarObservations
 
 
@@ -124,22 +125,12 @@ def test_refused_stars_are_found_by_reason() -> None:
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
 
 
-def test_older_observations_are_read() -> None:
-    """Recordings are kept: fields that were added since have their defaults."""
-    message = observations_to_message(observations(), 'cam', plain)
-    del message.temperature_degc, message.zenith_icrf, message.refraction_arcsec
-    del message.refused_star_id, message.refused_star_px, message.refused_star_reason
-    del message.star_tracker_rate_rad_s, message.star_tracker_rate_sigma_rad_s
-    del message.velocity_sigma_m_s, message.star_tracker
-    record = observations_from_message(message)
-    assert np.isnan(record.temperature_degc) and np.isnan(record.velocity_sigma_m_s)
-    assert np.isnan(record.star_tracker_rate_rad_s).all() and np.isnan(record.zenith_icrf).all()
-    assert record.refused_stars == {'blend': 3, 'saturated': 1}
-    assert record.refused_px.shape == (0, 2)
-
-
 STAR_FIELDS = ('catalog_id', 'direction_icrf', 'measured_px', 'covariance_px2')
-NEEDED = (*STAR_FIELDS, 'header', 'width', 'height', 'attitude')
+NEEDED = {
+    kind.in_messages.split('.')[0]
+    for kind in fields_of(StarObservations).values()
+    if not kind.has_default
+}
 
 
 def zeroed(value: Any) -> Any:

@@ -369,6 +369,9 @@ FORMS = {
         KALIBR_YAML.replace('radtan', 'equidistant'), 'equidistant', [-0.1, 0.01, 1e-5, -2e-4],
     ),
     'CameraInfo of ROS 2': (INFO_YAML.removesuffix('---\n'), 'plumb_bob', [0.0] * 5),
+    'ros2 topic echo --once': (INFO_YAML, 'plumb_bob', [0.0] * 5),
+    'ros2 topic echo': (f'{INFO_YAML}{INFO_YAML}header:\n  stamp:', 'plumb_bob', [0.0] * 5),
+    'a document with its mark': (f'---\n{INFO_YAML}', 'plumb_bob', [0.0] * 5),
     'CameraInfo of ROS 1': (
         f'width: 640\nheight: 480\nD: []\nK: {K}\ndistortion_model: ""\n', 'plumb_bob', [0.0] * 5,
     ),
@@ -400,6 +403,15 @@ def test_other_forms_of_a_camera_file_are_read(form: str, tmp_path: Path) -> Non
         (KALIBR_YAML.replace('pinhole', 'omni'), "camera_model: 'omni' is not pinhole"),
         (KALIBR_YAML.replace('radtan', 'fov'), "distortion_model: 'fov' is not plumb_bob"),
         (OPENCV_YAML.replace('image_width', 'columns'), 'image_width'),
+        (
+            INFO_YAML.replace(K, str([0.0] * 9)),
+            'K.* is zeros, an uncalibrated camera in ROS: leave',
+        ),
+        (
+            OPENCV_YAML.replace(K, str([0] * 9)),
+            'K.* is zeros, an uncalibrated camera in ROS: leave',
+        ),
+        ('---\n---\n', 'not a camera YAML'),
     ],
 )
 def test_a_camera_of_another_form_that_cannot_be_read_is_one_line(
