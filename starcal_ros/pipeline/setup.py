@@ -200,7 +200,8 @@ class Setup:
     Options of every stage, with prior camera, catalog and detector frames loaded.
 
     Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
-    alignment is determined.  ``times_of`` says where stamps are from that are not of the images.
+    alignment is determined.  ``times_of`` says where stamps are from that are not of the images,
+    ``pixels_of`` which pixels of image files the images are, if they are not all, in order.
     """
 
     frames: SetupOptions
@@ -221,6 +222,7 @@ class Setup:
     flat: Floats | None = None
     mountings: tuple[Mounting, ...] = ()
     times_of: str = ''
+    pixels_of: str = ''
 
     @property
     def has_tracker(self) -> bool:
@@ -606,7 +608,7 @@ def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPix
 def _read(name: str, path: str, width: int, height: int) -> AnyArray:
     expected = f'expected one channel of {width} x {height}'
     try:
-        values, _ = read_image(Path(path.removeprefix('file://')))
+        values = read_image(Path(path.removeprefix('file://'))).values
     except IngestError as error:
         raise OptionError(f'{name}: {error}; {expected}') from error
     if values.shape != (height, width):

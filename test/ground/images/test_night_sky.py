@@ -155,7 +155,7 @@ def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
     """As a picture of a planetarium on a screen among images of the sky."""
     frames = [*tiny_images()]
     frames[4] = Image(frames[4].time_ns, zoomed(frames[4].pixels, 1.1))
-    found = from_stars(frames, load_catalog(), ideal_camera((640, 512), 1800.0))
+    found = from_stars(frames, load_catalog(), [ideal_camera((640, 512), 1800.0)])
     assert found.icrf_from_camera.keys() == {one.time_ns for one in frames} - {frames[4].time_ns}
     (focal_px,) = found.other_focal_px
     assert focal_px == pytest.approx(1.1 * found.camera.parameters[0], rel=5e-3)
