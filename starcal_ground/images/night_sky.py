@@ -470,16 +470,14 @@ def _site(
     if not _is_below_horizon(site, stars):
         options = dataclasses.asdict(site)
         return {name: options[name] for name in _SITE}, ''
-    other = dataclasses.replace(site, longitude_deg=-longitude)
-    remedy = (
-        'state the site and a clock in UTC'
-        if _is_below_horizon(other, stars)
-        else f'if it counts west, --set observer=ground --set latitude_deg={latitude:g} --set'
-        f' longitude_deg={-longitude:g}'
+    is_west = not _is_below_horizon(dataclasses.replace(site, longitude_deg=-longitude), stars)
+    west = (
+        f', or it counts west: --set observer=ground --set latitude_deg={latitude:g}'
+        f' --set longitude_deg={-longitude:g}'
     )
     return {'observer': 'ground'}, (
         f'the site of the files is not used: at longitude {longitude:g} the stars are below the'
-        f' horizon; {remedy}'
+        f' horizon: the clock is not UTC{west * is_west}'
     )
 
 

@@ -85,7 +85,8 @@ FACTS: Mapping[str, Row] = {
     'kind of the frame': Row(('IMAGETYP', 'OBSTYPE', 'FRAME'), '', 'no dark, flat or bias frame'),
 }  # fmt: skip
 
-# Of a unit in brackets at the start of a comment (section 4.3.2) over that of the table.
+_ANGLES = {key for row in FACTS.values() if row.unit == 'deg' for key in row.keywords}
+# A unit in brackets at the start of a comment (section 4.3.2), over that of the table.
 _UNITS: Mapping[str, Mapping[str, float]] = {
     's': {
         's': 1.0, 'sec': 1.0, 'second': 1.0, 'ms': 1e-3, 'msec': 1e-3, 'millisecond': 1e-3,
@@ -146,8 +147,7 @@ def _value(header: Mapping[str, Card], key: str) -> float:
     if isinstance(value, (int, float)):
         return float(value)
     words = str(value).strip()
-    angle = _SEXAGESIMAL.fullmatch(words)
-    if angle:
+    if key in _ANGLES and (angle := _SEXAGESIMAL.fullmatch(words)):
         sign, *parts, side = angle.groups()
         degrees = sum(float(part or 0) / 60.0**k for k, part in enumerate(parts))
         turned = sign == '-' or side.upper() in ('S', 'W')

@@ -9,7 +9,7 @@ at the top; what is known of this is stated by the keywords of `fits_keywords`.
 from __future__ import annotations
 
 import bz2
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import math
 import os
@@ -41,6 +41,7 @@ _TIFF_MOST_ENTRIES = 1000
 _OF_ANOTHER = re.compile(r'BPM|MASK|DQ|ERR|VAR|WHT|WEIGHT|IVAR|UNC|NOISE|BACK|BKG|FLAG|THUMB')
 _SECTION = re.compile(r'\[(\d+):(\d+),(\d+):(\d+)\]')
 _PATTERN = re.compile('[RGBCMYW]{4}')  # of a mosaic of 2 x 2 colours
+_OTHER_GREENS = 0.05
 _PATTERNS = ('RGGB', 'BGGR', 'GBRG', 'GRBG')
 
 
@@ -213,8 +214,29 @@ def _upright(
         for side in ('column', 'row')
     )
     rows = [pattern[:2], pattern[2:]]
-    shifted = (rows[(j + y + top) % 2][(i + x + left) % 2] for j in (0, 1) for i in (0, 1))
-    return values, ''.join(shifted).lower(), words
+    shifted = [rows[(j + y + top) % 2][(i + x + left) % 2] for j in (0, 1) for i in (0, 1)]
+    if _has_other_greens(values, shifted):
+        shifted = shifted[2:] + shifted[:2]
+    found = ''.join(shifted)
+    of_mosaic = f'mosaic {found} ({stated(header, "mosaic")})'
+    return values, found.lower(), ', '.join(filter(None, [words, of_mosaic]))
+
+
+def _has_other_greens(values: AnyArray, letters: Sequence[str]) -> bool:
+    """
+    True if the two sites without green of a mosaic have one level, and those of green have not.
+
+    A program that turns an image over, or counts rows from the other end, leaves the keyword as
+    it is.  The greens of a detector differ by a percent or two.
+    """
+    levels = [float(np.nanmedian(values[j::2, i::2])) for j in (0, 1) for i in (0, 1)]
+    green, other = (
+        float(
+            np.ptp([level for level, letter in zip(levels, letters, strict=True) if is_of(letter)])
+        )
+        for is_of in ('G'.__eq__, 'G'.__ne__)
+    )
+    return green > _OTHER_GREENS * abs(float(np.mean(levels))) and other < green / 3.0
 
 
 def _region(
