@@ -366,35 +366,35 @@ def _found(
         hints = {url: read_camera_info(url)}
     path = str(values.get('catalog', ''))
     catalog = load_catalog(Path(path) if path else None)
-    _check_depth(hints, catalog, bool(path), places)
+    too_few = _too_few_stars(hints, catalog, bool(path), places)
     least = option_groups(values)['calibration'].min_images
-    return by_stars.from_stars(images, catalog, [*hints.values()], least)
+    return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
 
 
-def _check_depth(
+def _too_few_stars(
     hints: Mapping[str, CameraModel],
     catalog: StarCatalog,
     is_own: bool,
     places: Sequence[tuple[float, float]],
-) -> None:
+) -> str:
     """
-    Raise NotFromStars where an image of each camera of ``hints`` has too few stars of the catalog.
+    Sentence for images of which each camera of ``hints`` has too few stars of the catalog, or ''.
 
     They are those about the richest of the places that images state, or the mean of the sky; of a
     catalog of the user (``is_own``) those of the densest field in it.
     """
     if not hints:
-        return
+        return ''
     counts = [_stars_of_field(camera, catalog, is_own, places) for camera in hints.values()]
     if max(counts) >= FEWEST_SOURCES:
-        return
+        return ''
     (by, camera), *_ = hints.items()
     across = ' x '.join(
         f'{2.0 * math.degrees(math.atan(0.5 * side / float(camera.parameters[0]))):.2f}'
         for side in (camera.width, camera.height)
     )
     place = f' at RA {places[0][0]:.2f}, Dec {places[0][1]:+.2f} deg' if places else ''
-    raise NotFromStars(
+    return (
         f'a field of {across} degrees ({by}){place} has {max(counts):.1f} stars of the catalog,'
         f' {FEWEST_SOURCES} are needed: make one of its region with starcal catalog and give it'
         f' by --set catalog=FILE; if the field is wrong, give {image_files.GIVEN}'
@@ -407,7 +407,7 @@ def _stars_of_field(
     is_own: bool,
     places: Sequence[tuple[float, float]],
 ) -> float:
-    """Number of stars of the catalog in an image of a camera, as `_check_depth` counts them."""
+    """Number of stars of the catalog in an image of a camera, as `_too_few_stars` counts them."""
     half = 0.5 * np.array([camera.width, camera.height]) / float(camera.parameters[0])
     radius_rad = math.atan(float(np.hypot(*half)))
     area_sr = 4.0 * math.asin(float(np.prod(np.sin(np.arctan(half)))))  # of a pyramid

@@ -230,12 +230,9 @@ def _has_other_greens(values: AnyArray, letters: Sequence[str]) -> bool:
     it is.  The greens of a detector differ by a percent or two.
     """
     levels = [float(np.nanmedian(values[j::2, i::2])) for j in (0, 1) for i in (0, 1)]
-    green, other = (
-        float(
-            np.ptp([level for level, letter in zip(levels, letters, strict=True) if is_of(letter)])
-        )
-        for is_of in ('G'.__eq__, 'G'.__ne__)
-    )
+    greens = [level for level, letter in zip(levels, letters, strict=True) if letter == 'G']
+    others = [level for level, letter in zip(levels, letters, strict=True) if letter != 'G']
+    green, other = float(np.ptp(greens)), float(np.ptp(others))
     return green > _OTHER_GREENS * abs(float(np.mean(levels))) and other < green / 3.0
 
 

@@ -52,7 +52,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--hdu', default='', metavar='N', help=what)
     what = 'colour to take from an RGB image or a mosaic'
     add('--channel', default='', choices=('red', 'green', 'blue'), help=what)
-    what = 'Bayer pattern of a mosaic (default: by the header); a mosaic gives half the width and height'
+    what = 'Bayer pattern of a mosaic (default: by the header), read at half the width and height'
     add('--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what)
     what = 'range of pixel values that is mapped to 16 bit (default: the range of all images)'
     add('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
