@@ -1,9 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Write the tables of docs/icd.md from the code: ``python -m docs.make_tables [--check]``.
+Write tables of documents from the code: ``python -m docs.make_tables [--check]``.
 
-Parameters come from the options dataclasses, refusal reasons from the records.  With --check
-nothing is written; the exit status is 1 if a table is out of date.
+Parameters come from the options dataclasses, refusal reasons from the records, FITS keywords from
+their table.  With --check nothing is written; the exit status is 1 if a table is out of date.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import re
 import sys
 from typing import Any
 
+from starcal_ros.formats.fits_keywords import FACTS
 from starcal_ros.pipeline.setup import (
     CalibratorOptions,
     NODE_OPTION_CLASSES,
@@ -26,7 +27,7 @@ from starcal_ros.pipeline.setup import (
 from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
 from tools.write_parameters import allowed, as_yaml, fields_of
 
-FILE = Path(__file__).parent / 'icd.md'
+DOCUMENTS = Path(__file__).parent
 
 
 def parameter_table(*option_classes: type[Any], basic: bool = False) -> str:
@@ -49,38 +50,52 @@ def reason_table(reasons: Mapping[str, str]) -> str:
     return '\n'.join(['| reason | meaning |', '|---|---|', *rows])
 
 
+def fact_table() -> str:
+    """Table of the facts that FITS headers state."""
+    rows = ['| fact | keywords, of which the first counts | unit | check |', '|---|---|---|---|']
+    for name, row in FACTS.items():
+        keywords = ', '.join(f'`{key}`' for key in row.keywords)
+        rows.append(f'| {name} | {keywords} | {row.unit or "text"} | {row.check} |')
+    return '\n'.join(rows)
+
+
 TABLES = {
-    'basic parameters': parameter_table(*OPTION_CLASSES, *NODE_OPTION_CLASSES, basic=True),
-    'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
-    'parameters of star_observer': parameter_table(ObserverOptions),
-    'parameters of calibrator': parameter_table(CalibratorOptions),
-    'parameters of bag_player': parameter_table(PlayerOptions),
-    'reasons to refuse an image': reason_table(IMAGE_REFUSALS),
-    'reasons to leave out a star': reason_table(STAR_REFUSALS),
+    'icd.md': {
+        'basic parameters': parameter_table(*OPTION_CLASSES, *NODE_OPTION_CLASSES, basic=True),
+        'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
+        'parameters of star_observer': parameter_table(ObserverOptions),
+        'parameters of calibrator': parameter_table(CalibratorOptions),
+        'parameters of bag_player': parameter_table(PlayerOptions),
+        'reasons to refuse an image': reason_table(IMAGE_REFUSALS),
+        'reasons to leave out a star': reason_table(STAR_REFUSALS),
+    },
+    'mission.md': {'facts of FITS headers': fact_table()},
 }
 
 
-def with_tables(text: str) -> str:
+def with_tables(text: str, file: str) -> str:
     """Return a document with the text between the marks of each table replaced."""
-    for name, table in TABLES.items():
+    for name, table in TABLES[file].items():
         marks = re.compile(f'(<!-- {name} -->\n).*?(<!-- end -->)', re.DOTALL)
         if len(marks.findall(text)) != 1:
-            raise SystemExit(f'{FILE.name}: expected one table marked <!-- {name} -->')
+            raise SystemExit(f'{file}: expected one table marked <!-- {name} -->')
         text = marks.sub(lambda found, table=table: found[1] + table + '\n' + found[2], text)  # type: ignore[misc]
     return text
 
 
 def main() -> int:
     """Write the tables, or check that they are up to date."""
-    parser = argparse.ArgumentParser(description='Write the tables of docs/icd.md.')
+    parser = argparse.ArgumentParser(description='Write tables of documents.')
     parser.add_argument('--check', action='store_true', help='check only, write nothing')
     check = parser.parse_args().check
-    before = FILE.read_text()
-    after = with_tables(before)
-    if check and after != before:
-        print(f'{FILE.name} is out of date: run python -m docs.make_tables')
-        return 1
-    FILE.write_text(after)
+    for file in TABLES:
+        path = DOCUMENTS / file
+        before = path.read_text()
+        after = with_tables(before, file)
+        if check and after != before:
+            print(f'{file} is out of date: run python -m docs.make_tables')
+            return 1
+        path.write_text(after)
     return 0
 
 

@@ -14,11 +14,19 @@ import numpy as np
 
 from starcal_ground.images.time_systems import from_mjd, from_text, system_of, SYSTEMS
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.fits_keywords import Card, FACTS, number_of, stated, text_of, value_of
+from starcal_ros.formats.fits_keywords import (
+    Card,
+    FACTS,
+    number_of,
+    stated,
+    text_of,
+    value_of,
+    values_of,
+)
 
 # Keywords with the time of day of a date alone: a custom older than the standard.
 _CLOCKS = {
-    'DATE-OBS': ('TIME-OBS', 'UTC-OBS', 'UT-OBS', 'UTSTART', 'UT-START', 'UTCSTART', 'UT', 'UTC'),
+    'DATE-OBS': FACTS['time of day, of a date alone'].keywords,
     'DATE-BEG': ('TIME-BEG',),
     'DATE-END': ('TIME-END', 'UTC-END', 'UT-END', 'UTEND', 'UTSTOP'),
 }
@@ -214,10 +222,10 @@ def _step_deg(header: Mapping[str, Card]) -> float:
     kind = str(header['CTYPE1'].value).upper() if 'CTYPE1' in header else 'RA'
     if not re.match('RA|DEC|GL|EL|.LON|.LAT', kind):
         return math.nan
-    column = np.nan_to_num([value_of(header, key) for key in ('CD1_1', 'CD2_1')])
+    column = np.nan_to_num(values_of(header, 'step of a column on the sky, both'))
     if not column.any():
-        steps = [value_of(header, key) for key in ('CDELT1', 'CDELT2')]
-        turn = [value_of(header, key) for key in ('PC1_1', 'PC2_1')]
+        steps = values_of(header, 'steps on the sky, both')
+        turn = values_of(header, 'turn of the steps, both')
         column = np.nan_to_num(steps) * ([1.0, 0.0] if np.isnan(turn[0]) else np.nan_to_num(turn))
     unit = str(header['CUNIT1'].value).strip().lower() if 'CUNIT1' in header else 'deg'
     return float(np.hypot(*column)) * {'arcsec': 1 / 3600.0, 'arcmin': 1 / 60.0}.get(unit, 1.0)
@@ -231,7 +239,7 @@ def pointing_of(header: Mapping[str, Card]) -> tuple[float, float] | None:
 
 def site_of(header: Mapping[str, Card]) -> tuple[float, float, float] | None:
     """Latitude, longitude (east positive, degrees) and height (m) of a header, or None."""
-    geocentric = np.array([value_of(header, f'OBSGEO-{axis}') for axis in 'XYZ'])
+    geocentric = values_of(header, 'geocentric place, all three')
     if np.linalg.norm(geocentric) > 6.3e6 and 'OBSGEO-B' not in header:  # not NaN, nor zeros
         longitude_rad, latitude_rad, height_m = erfa.gc2gd(1, geocentric)  # WGS84
         return math.degrees(latitude_rad), math.degrees(longitude_rad), float(height_m)

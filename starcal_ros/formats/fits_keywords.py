@@ -13,6 +13,10 @@ import math
 import re
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from starcal_ros.arrays import Floats
+
 
 class Card(NamedTuple):
     """Value and comment of a FITS keyword."""
@@ -23,7 +27,7 @@ class Card(NamedTuple):
 
 class Row(NamedTuple):
     """
-    Keywords of a fact, the first that states it counts; ``unit`` is empty for a text.
+    Keywords of a fact, of which the first counts; ``unit`` is empty for a text.
 
     ``low`` to ``high`` is the range of a number, ``check`` what is done with the fact.
     """
@@ -47,6 +51,10 @@ FACTS: Mapping[str, Row] = {
         'time', _COMPARED,
     ),
     'end of the exposure': Row(('DATE-END', 'MJD-END'), 'time', 'after the start'),
+    'time of day, of a date alone': Row(
+        ('TIME-OBS', 'UTC-OBS', 'UT-OBS', 'UTSTART', 'UT-START', 'UTCSTART', 'UT', 'UTC'),
+        '', 'all agree',
+    ),
     'time system': Row(('TIMESYS',), '', 'UTC, TAI, TT, TDB or GPS'),
     'exposure time': Row(
         ('XPOSURE', 'EXPTIME', 'EXPOSURE', 'EXP_TIME', 'EXPT', 'ITIME'), 's', 'positive',
@@ -67,6 +75,9 @@ FACTS: Mapping[str, Row] = {
         ('PIXSCALE', 'SECPIX', 'SECPIX1', 'IM_SCALE', 'PIXSCAL1', 'SCALE'), 'arcsec', _TRIED,
         1e-3, 3600.0,
     ),
+    'step of a column on the sky, both': Row(('CD1_1', 'CD2_1'), 'deg', _TRIED),
+    'steps on the sky, both': Row(('CDELT1', 'CDELT2'), 'deg', _TRIED),
+    'turn of the steps, both': Row(('PC1_1', 'PC2_1'), '', _TRIED),
     'right ascension': Row(
         ('CRVAL1', 'RA', 'OBJCTRA', 'RA-D', 'TELRA'), 'deg', 'stars of the catalog there',
         0.0, 360.0,
@@ -75,6 +86,7 @@ FACTS: Mapping[str, Row] = {
         ('CRVAL2', 'DEC', 'OBJCTDEC', 'DEC-D', 'TELDEC'), 'deg', 'stars of the catalog there',
         -90.0, 90.0,
     ),
+    'geocentric place, all three': Row(('OBSGEO-X', 'OBSGEO-Y', 'OBSGEO-Z'), 'm', _ABOVE),
     'latitude': Row((*_SOUTH, 'LATITUDE', 'GEOLAT', 'OBS-LAT'), 'deg', _ABOVE, -90.0, 90.0),
     'longitude': Row((*_EAST, 'LONGITUD', 'GEOLON', 'OBS-LONG'), 'deg', _ABOVE, -180.0, 360.0),
     'height': Row(
@@ -132,6 +144,11 @@ def number_of(header: Mapping[str, Card], fact: str) -> float:
         return math.nan
     value = _value(header, key) * _unit(header, key, row.unit)
     return value if row.low <= value <= row.high else math.nan
+
+
+def values_of(header: Mapping[str, Card], fact: str) -> Floats:
+    """Values of all keywords of a fact; NaN where there is none."""
+    return np.array([value_of(header, key) for key in FACTS[fact].keywords])
 
 
 def value_of(header: Mapping[str, Card], key: str) -> float:
