@@ -459,7 +459,7 @@ def _site(
     """
     Options of the site, if all files have a position and a date, and a note on one that is wrong.
 
-    A site below whose horizon the images are is that of another place, mostly of a longitude that
+    A site below whose horizon images are is that of another place, mostly of a longitude that
     counts west, or its clock is not UTC; the camera is on the ground all the same.
     """
     sites = [one.site for one in photographs if one.site is not None and one.dated and one.utc]
@@ -482,12 +482,12 @@ def _site(
 
 
 def _is_below_horizon(site: SiteOptions, stars: by_stars.FromStars) -> bool:
-    """True if most images look below the horizon of a site."""
+    """True if more than a tenth of the images, a few of which may be misidentified, are below."""
     sines = [
         float(air_above(time_ns, site)[0] @ rotation.as_matrix()[:, 2])
         for time_ns, rotation in stars.icrf_from_camera.items()
     ]
-    return bool(np.median(sines) < 0.0)
+    return float(np.percentile(sines, 10)) < 0.0
 
 
 def calibrate_images(

@@ -72,7 +72,7 @@ FACTS: Mapping[str, Row] = {
     ),
     'binning': Row(('XBINNING', 'CCDXBIN', 'CCDBINX', 'BINX', 'CCDSUM'), 'px', _TRIED, 1.0, 64.0),
     'pixel scale': Row(
-        ('PIXSCALE', 'SECPIX', 'SECPIX1', 'IM_SCALE', 'PIXSCAL1', 'SCALE'), 'arcsec', _TRIED,
+        ('PIXSCALE', 'SECPIX', 'SECPIX1', 'IM_SCALE', 'PIXSCAL1'), 'arcsec', _TRIED,
         1e-3, 3600.0,
     ),
     'step of a column on the sky, both': Row(('CD1_1', 'CD2_1'), 'deg', _TRIED),

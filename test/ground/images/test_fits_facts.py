@@ -91,7 +91,17 @@ TIMES: Mapping[str, tuple[str, ...]] = {
     'JD': (f'JD      = {MJD + 2400000.5!r}', EIGHT),
     'TT': ("DATE-OBS= '2024-03-09T22:11:09.184'", "TIMESYS = 'TT'", EIGHT),
     'TAI': ("DATE-OBS= '2024-03-09T22:10:37'", "TIMESYS = 'TAI'", EIGHT),
+    'GPS': ("DATE-AVG= '2024-03-09T22:10:22'", "TIMESYS = 'GPS'"),
+    'clocks that agree': (
+        "DATE-OBS= '2024-03-09'", "UTSTART = '22:10:00'", "UT      = '22:10:00.0'", EIGHT),
+    'UT is not TAI': ("DATE-OBS= '2024-03-09'", "UT      = '22:10:00'", "TIMESYS = 'TAI'", EIGHT),
+    'clocks of both ends': (
+        "DATE-BEG= '2024-03-09'", "TIME-BEG= '22:10'", "DATE-END= '2024-03-09'",
+        "TIME-END= '22:10:08'"),
     'ms': (START, 'EXPOSURE=               8000.0 / [ms] of the shutter'),
+    'min': ("DATE-OBS= '2024-03-09T22:09:04'", 'EXPTIME =                    2 / [min]'),
+    'seconds in words': (START, 'EXPTIME = 8.0 / Exposure time in seconds'),
+    'TIMEUNIT': ("DATE-BEG= '2024-03-09T22:09:04'", 'XPOSURE = 2', "TIMEUNIT= 'min'"),
     'EXP_TIME': (START, 'EXP_TIME=                  8.0'),
     'exposure as text': (START, "EXPTIME = '8.0     '"),
     'D exponent': (START, 'EXPTIME =                0.8D1'),
@@ -394,8 +404,10 @@ def test_a_site_whose_horizon_hides_the_stars_is_not_used(
     longitude_deg: float, clock_h: float, words: str
 ) -> None:
     true = SiteOptions('ground', 31.68, -110.88, 1270.0)
-    zeniths = [air_above(MIDDLE_NS + k * 60 * 10**9, true)[0] for k in range(3)]
+    zeniths = [air_above(MIDDLE_NS + k * 60 * 10**9, true)[0] for k in range(8)]
     angles = [(math.degrees(math.atan2(y, x)), math.degrees(math.asin(z))) for x, y, z in zeniths]
+    # The last ones are in the east, as seen from the wrong site too.
+    angles[3:] = [(ra_deg + 75.0, dec_deg) for ra_deg, dec_deg in angles[3:]]
     stars = stars_at([pointed(ra_deg, dec_deg, 0.0) for ra_deg, dec_deg in angles])
     moved_ns = round(clock_h * 3600e9)
     rotations = {time_ns + moved_ns: one for time_ns, one in stars.icrf_from_camera.items()}
