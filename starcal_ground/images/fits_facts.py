@@ -55,7 +55,7 @@ class Moment(NamedTuple):
 
 
 class FocalLength(NamedTuple):
-    """A focal length, and the keywords that state it."""
+    """A focal length, and the keywords that state it, with the factor of a pixel of a bin."""
 
     focal_px: float
     keywords: str
@@ -210,10 +210,11 @@ def _scales(header: Mapping[str, Card]) -> Iterator[tuple[float, str]]:
     step_rad = math.radians(number_of(header, 'pixel scale') / 3600.0)
     focal_mm, pixel_um = number_of(header, 'focal length'), number_of(header, 'pixel size')
     for factor in of_pixel:
+        times = f' x {factor:g}' if factor != 1.0 else ''
         if step_rad > 0.0:
-            yield 1.0 / (step_rad * factor), stated(header, 'pixel scale')
+            yield 1.0 / (step_rad * factor), stated(header, 'pixel scale') + times
         if focal_mm > 0.0 and pixel_um > 0.0:
-            keywords = f'{stated(header, "focal length")}, {stated(header, "pixel size")}'
+            keywords = f'{stated(header, "focal length")}, {stated(header, "pixel size")}{times}'
             yield 1000.0 * focal_mm / (pixel_um * factor), keywords
 
 

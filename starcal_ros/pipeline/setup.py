@@ -170,8 +170,9 @@ class SetupOptions:
     )
     image_channel: str = option(
         '',
-        'channel of rgb, bgr and bayer images to use (bayer: at half the width and height; in image'
-        ' files at their size); empty: colour images are refused, of image files green is used',
+        'channel of rgb, bgr and bayer images to use (bayer: at half the width and height; in'
+        ' image files at their size); empty: colour images are refused, of image files green is'
+        ' used',
         choices=('', *CHANNELS),
     )
     catalog: str = option('', 'star catalog file; empty: the bundled catalog', is_path=True)

@@ -22,7 +22,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.from_stars import FromStars, ideal_camera
-from starcal_ground.images.night_sky import _site, _too_few_stars, _turned, photographs_of
+from starcal_ground.images.night_sky import photographs_of
 from starcal_ground.images.photographs import (
     common_scale,
     ImageOptions,
@@ -32,6 +32,7 @@ from starcal_ground.images.photographs import (
     pixels_of,
     pixels_of_photograph,
 )
+from starcal_ground.images.stated import focal_lengths_of, half_turns, site_of, too_few_stars
 from starcal_ros.errors import IngestError
 from starcal_ros.sky.astrometry import air_above, SiteOptions
 from starcal_ros.sky.catalog import load_catalog
@@ -180,8 +181,9 @@ SCALES: Mapping[str, tuple[tuple[str, ...], tuple[float, ...]]] = {
 @pytest.mark.parametrize('name', SCALES)
 def test_the_focal_lengths_that_a_header_states(name: str, tmp_path: Path) -> None:
     cards, expected_px = SCALES[name]
-    found = look_at(file_of(tmp_path, START, EIGHT, *cards)).focal_lengths
-    assert [one.focal_px for one in found] == pytest.approx(list(expected_px), rel=1e-4)
+    one = look_at(file_of(tmp_path, START, EIGHT, *cards))
+    for found in (one.focal_lengths, focal_lengths_of([one, one])):
+        assert [f.focal_px for f in found] == pytest.approx(list(expected_px), rel=1e-4)
 
 
 SITES: Mapping[str, tuple[tuple[str, ...], tuple[float, float, float] | None]] = {
@@ -388,7 +390,7 @@ TURNS: Mapping[str, tuple[Callable[[int], Rotation], str]] = {
 @pytest.mark.parametrize('name', TURNS)
 def test_half_a_turn_between_images_is_named(name: str) -> None:
     rotation_of, words = TURNS[name]
-    note = _turned(stars_at([rotation_of(k) for k in range(10)]))
+    note = half_turns(stars_at([rotation_of(k) for k in range(10)]))
     assert note.startswith(words) and bool(words) == bool(note)
 
 
@@ -416,7 +418,7 @@ def test_a_site_whose_horizon_hides_the_stars_is_not_used(
         Photograph(Path('a'), time_ns, True, True, 640, 512, site=(31.68, longitude_deg, 1270.0))
         for time_ns in rotations
     ]
-    site, note = _site(files, stars)
+    site, note = site_of(files, stars)
     assert site['observer'] == 'ground' and ('latitude_deg' in site) == (not words)
     assert words in note and bool(words) == bool(note)
 
@@ -441,7 +443,7 @@ def test_a_field_without_stars_of_the_catalog_is_known_by_its_header(name: str) 
         f'PIXSCALE{k}': ideal_camera((640, 512), 320.0 / math.tan(math.radians(deg / 2)))
         for k, deg in enumerate(fields_deg)
     }
-    words = _too_few_stars(hints, load_catalog(), False, places)
+    words = too_few_stars(hints, load_catalog(), False, places)
     assert bool(words) != is_enough
     assert is_enough or (words.startswith('a field of ') and '(PIXSCALE0)' in words)
     assert is_enough or 'make one of its region with starcal catalog' in words
