@@ -31,7 +31,6 @@ _CLOCKS = {
     'DATE-END': ('TIME-END', 'UTC-END', 'UT-END', 'UTEND', 'UTSTOP'),
 }
 _ZONE = re.compile(r'(.*:.*?)\s*(?:([+-])(\d\d):?(\d\d)|(Z|UTC?|GMT))')
-_LOCAL = re.compile(r'LOCAL|LT|LOC')
 _JD_OF_MJD = 2400000.5
 # Two times that differ by less are the same: Julian dates of three digits, system of time.  Zones
 # differ by 15 minutes, so a start and a middle of an unknown exposure may differ by some.
@@ -80,7 +79,10 @@ def middle_of_exposure(header: Mapping[str, Card], key: str) -> int:
 def moment_of(header: Mapping[str, Card]) -> Moment:
     """When a header states that its image was taken; raises ValueError where it does not."""
     if name := stated(header, 'middle of the exposure'):
-        return _compared(header, name, *_stamp(header, name), None)
+        exposure_s = None
+        with contextlib.suppress(ValueError):  # not needed
+            exposure_s = _exposure_s(header)
+        return _compared(header, name, *_stamp(header, name), exposure_s)
     ends = [(f'{kind}-BEG', f'{kind}-END') for kind in ('DATE', 'MJD')]
     between = next((pair for pair in ends if pair[0] in header and pair[1] in header), None)
     exposure_s = None if between else _exposure_s(header)
@@ -106,9 +108,23 @@ def moment_of(header: Mapping[str, Card]) -> Moment:
 
 
 def _start(header: Mapping[str, Card]) -> str:
-    """First keyword of the start of an exposure; a clock alone is none, nor is an empty date."""
-    names = FACTS['start of the exposure'].keywords
-    return next((name for name in names if name in header and not _is_clock(header, name)), '')
+    """
+    First keyword that states the start of an exposure; empty if there is none.
+
+    Raises ValueError of the first one where all are damaged, or dates alone.
+    """
+    errors: list[Exception] = []
+    for name in FACTS['start of the exposure'].keywords:
+        if name in header and not _is_clock(header, name):
+            try:
+                _stamp(header, name)
+            except (ValueError, OverflowError) as error:
+                errors.append(error)
+            else:
+                return name
+    if errors:
+        raise errors[0]
+    return ''
 
 
 def _is_clock(header: Mapping[str, Card], name: str) -> bool:
@@ -143,18 +159,20 @@ def _compared(
 
 def _stamp(header: Mapping[str, Card], name: str) -> tuple[int, bool]:
     """Stamp of a keyword, and whether its time system is known."""
-    words = text_of(header, 'time system')
-    is_local = bool(_LOCAL.match(words.upper()))
-    system = 'UTC' if is_local else system_of(words)
+    system, is_known = 'UTC', True
+    try:
+        system = system_of(text_of(header, 'time system'))
+    except ValueError:
+        is_known = False
     value = value_of(header, name)
     if not math.isnan(value):
         days = value - (_JD_OF_MJD if name.startswith('JD') else 0.0)
-        return from_mjd(days, system), not is_local
+        return from_mjd(days, system), is_known
     text = str(header[name].value).strip().replace('/', '-')
     if ':' in text:
         zone = _ZONE.fullmatch(text)
         if not zone:
-            return from_text(text, system), not is_local
+            return from_text(text, system), is_known
         clock, sign, hours, minutes, _ = zone.groups()
         east_s = (
             (int(hours) * 3600 + int(minutes) * 60) * (-1 if sign == '-' else 1) if sign else 0
@@ -173,7 +191,7 @@ def _stamp(header: Mapping[str, Card], name: str) -> tuple[int, bool]:
     if len(stamps) != 1:
         clocks_found = f'{", ".join(clocks)} differ' if clocks else 'no keyword has one'
         raise ValueError(f'{name} = {text!r} has no time of day, and {clocks_found}: {_INSTEAD}')
-    return stamps.pop(), not is_local or clocks[0].startswith('UT')
+    return stamps.pop(), is_known or clocks[0].startswith('UT')
 
 
 def _exposure_s(header: Mapping[str, Card]) -> float | None:

@@ -87,6 +87,9 @@ TIMES: Mapping[str, tuple[str, ...]] = {
         "DATE-BEG= '2024-03-09T22:10:00'", "DATE-END= '2024-03-09T22:10:08'"),
     'DATE-OBS and DATE-END': (START, "DATE-END= '2024-03-09T22:10:08'"),
     'MJD-OBS': (f'MJD-OBS = {MJD!r}', EIGHT),
+    'MJD-OBS beside a date alone': ("DATE-OBS= '2024-03-09'", f'MJD-OBS = {MJD!r}', EIGHT),
+    'long exposure': (
+        "DATE-AVG= '2024-03-09T22:10:04'", "DATE-OBS= '2024-03-09T21:10:04'", 'EXPTIME = 7200.0'),
     'MJD-OBS as text': (f"MJD-OBS = '{MJD!r}'", EIGHT),
     'MJD-AVG': (f'MJD-AVG = {MJD + 4 / 86400!r}',),
     'JD': (f'JD      = {MJD + 2400000.5!r}', EIGHT),
@@ -130,6 +133,7 @@ DOUBTED: Mapping[str, tuple[tuple[str, ...], bool, str]] = {
         r'DATE-OBS and UT-OBS differ by 7\.00 h',
     ),
     'local by name': ((START, "TIMESYS = 'LOCAL'", EIGHT), True, "'LOCAL' is not one of UTC"),
+    'UT1': ((START, "TIMESYS = 'UT1'", EIGHT), True, "'UT1' is not one of UTC"),
     'no exposure time': ((START,), True, 'no exposure time is given'),
     'date alone': (("DATE-OBS= '2024-03-09'", EIGHT), False, 'no time of day'),
     'none': ((EIGHT,), False, 'no time'),
