@@ -99,7 +99,7 @@ def site_of(photographs: Sequence[Photograph], stars: FromStars) -> tuple[dict[s
         return {name: options[name] for name in _SITE}, ''
     is_west = not _is_below_horizon(dataclasses.replace(site, longitude_deg=-longitude), stars)
     west = (
-        f', or it counts west: --set observer=ground --set latitude_deg={latitude:g}'
+        f', or longitudes count west: --set observer=ground --set latitude_deg={latitude:g}'
         f' --set longitude_deg={-longitude:g}'
     )
     return {'observer': 'ground'}, (
@@ -139,11 +139,11 @@ def too_few_stars(
         f'{2.0 * math.degrees(math.atan(0.5 * side / float(camera.parameters[0]))):.2f}'
         for side in (camera.width, camera.height)
     )
-    place = f' at RA {places[0][0]:.2f}, Dec {places[0][1]:+.2f} deg' if places else ''
+    place = f' at RA {places[0][0]:.2f}, Dec {places[0][1]:+.2f}' if places else ''
     return (
-        f'a field of {across} degrees ({by}){place} has {max(counts):.1f} stars of the catalog,'
-        f' {FEWEST_SOURCES} are needed: make one of its region with starcal catalog and give it'
-        f' by --set catalog=FILE; if the field is wrong, give {GIVEN}'
+        f'a field of {across} deg ({by}){place} has {max(counts):.1f} stars of the catalog,'
+        f' {FEWEST_SOURCES} are needed: make a deeper one (starcal catalog) and state it (--set'
+        f' catalog=FILE); if the field is wrong, give {GIVEN}'
     )
 
 

@@ -402,7 +402,11 @@ def test_half_a_turn_between_images_is_named(name: str) -> None:
     ('longitude_deg', 'clock_h', 'words'),
     [
         (-110.88, 0.0, ''),
-        (110.88, 0.0, 'or it counts west: --set observer=ground --set latitude_deg=31.68 --set'),
+        (
+            110.88,
+            0.0,
+            'or longitudes count west: --set observer=ground --set latitude_deg=31.68 --set',
+        ),
         (-110.88, 12.0, 'the clock is not UTC'),
     ],
 )
@@ -450,4 +454,4 @@ def test_a_field_without_stars_of_the_catalog_is_known_by_its_header(name: str) 
     words = too_few_stars(hints, load_catalog(), False, places)
     assert bool(words) != is_enough
     assert is_enough or (words.startswith('a field of ') and '(PIXSCALE0)' in words)
-    assert is_enough or 'make one of its region with starcal catalog' in words
+    assert is_enough or 'make a deeper one (starcal catalog)' in words
