@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""What image files state together, and what the stars and their catalog say of it."""
+"""Facts that the files of a set state, compared with their stars and with the catalog."""
 
 from __future__ import annotations
 
