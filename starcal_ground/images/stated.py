@@ -141,7 +141,7 @@ def too_few_stars(
     )
     place = f' at RA {places[0][0]:.2f}, Dec {places[0][1]:+.2f}' if places else ''
     return (
-        f'a field of {across} deg ({by}){place} has {max(counts):.1f} stars of the catalog,'
+        f'a field of {across} deg ({by}){place} has {counts[0]:.1f} stars of the catalog,'
         f' {FEWEST_SOURCES} are needed: make a deeper one (starcal catalog) and state it (--set'
         f' catalog=FILE); if the field is wrong, give {GIVEN}'
     )

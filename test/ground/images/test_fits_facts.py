@@ -435,6 +435,7 @@ PLACE = ((31.31, 46.77),)
 DEPTHS: Mapping[str, tuple[tuple[float, ...], Sequence[tuple[float, float]], bool]] = {
     'half a degree': ((0.5,), (), False),
     'half a degree at a place': ((0.5,), PLACE, False),
+    'half a degree, or one of other pixels': ((0.5, 1.0), (), False),
     'nine tenths at a place': ((0.9,), PLACE, False),
     'two degrees': ((2.0,), (), True),
     'two degrees at a place': ((2.0,), PLACE, True),
@@ -453,5 +454,7 @@ def test_a_field_without_stars_of_the_catalog_is_known_by_its_header(name: str) 
     }
     words = too_few_stars(hints, load_catalog(), False, places)
     assert bool(words) != is_enough
+    first = too_few_stars(dict([*hints.items()][:1]), load_catalog(), False, places)
+    assert is_enough or words == first  # the field named has the stars named
     assert is_enough or (words.startswith('a field of ') and '(PIXSCALE0)' in words)
     assert is_enough or 'make a deeper one (starcal catalog)' in words
