@@ -3,8 +3,8 @@
 Write the tables of the documents from the code: ``python -m docs.make_tables [--check]``.
 
 Parameters come from options dataclasses, refusal reasons and needed fields from records, export
-formats from their rows.  With --check nothing is written; the exit status is 1 if a table is
-out of date.
+formats and FITS keywords from their rows.  With --check nothing is written; the exit status is 1
+if a table is out of date.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ground.mission.export.export_formats import FORMATS
+from starcal_ros.formats.fits_keywords import FACTS
 from starcal_ros.pipeline.setup import (
     CalibratorOptions,
     NODE_OPTION_CLASSES,
@@ -66,6 +67,15 @@ def format_table() -> str:
     return '\n'.join(['| `--to` | files | left out |', '|---|---|---|', *rows])
 
 
+def fact_table() -> str:
+    """Table of the facts that FITS headers state."""
+    rows = ['| fact | keywords, of which the first counts | unit | check |', '|---|---|---|---|']
+    for name, row in FACTS.items():
+        keywords = ', '.join(f'`{key}`' for key in row.keywords)
+        rows.append(f'| {name} | {keywords} | {row.unit or "text"} | {row.check} |')
+    return '\n'.join(rows)
+
+
 TABLES = {
     'icd.md': {
         'needed fields of observations': needed_fields(),
@@ -77,7 +87,7 @@ TABLES = {
         'reasons to refuse an image': reason_table(IMAGE_REFUSALS),
         'reasons to leave out a star': reason_table(STAR_REFUSALS),
     },
-    'mission.md': {'export formats': format_table()},
+    'mission.md': {'export formats': format_table(), 'facts of FITS headers': fact_table()},
 }
 
 

@@ -34,6 +34,7 @@ from starcal_ros.records import (
     CameraGeometry,
     check_drawable,
     OF_THE_STARS,
+    PIXELS_OF,
     StarObservations,
 )
 
@@ -58,17 +59,26 @@ def write_products(
     """Write a calibration, its camera and residuals, if given; raises ProductError."""
     product_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
     name = calibration.provenance.get('camera_name', camera_yaml.DEFAULT_CAMERA_NAME)
-    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
+    pixels_of = calibration.provenance.get(PIXELS_OF, '')
+    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name, pixels_of)
     if residuals is not None:
         write_residuals(residuals, folder / RESIDUALS_FILE)
     (folder / NOT_CALIBRATED_FILE).unlink(missing_ok=True)
 
 
 def write_camera_info(
-    camera: CameraModel, path: Path, camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
+    camera: CameraModel,
+    path: Path,
+    camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME,
+    pixels_of: str = '',
 ) -> None:
-    """Write `camera_info_text`; raises ProductError when the file cannot be written."""
-    product_files.write_atomically(path, camera_info_text(camera, camera_name))
+    """
+    Write `camera_info_text`; raises ProductError when the file cannot be written.
+
+    ``pixels_of`` says which pixels of image files are those of the camera, as a comment.
+    """
+    comment = f'# {PIXELS_OF}: {pixels_of}\n' if pixels_of else ''
+    product_files.write_atomically(path, comment + camera_info_text(camera, camera_name))
 
 
 def camera_info_text(camera: CameraModel, camera_name: str) -> str:

@@ -52,5 +52,5 @@ def identified(campaign: Campaign) -> tuple[int, int]:
     """Number of frames found by the patterns of their stars, and 0: none is measured."""
     camera = campaign.scenario.truth.camera
     hint = ideal_camera((camera.width, camera.height), float(camera.parameters[0]))
-    found = from_stars([image for image, _ in campaign.frames], campaign.setup.catalog, hint)
+    found = from_stars([image for image, _ in campaign.frames], campaign.setup.catalog, [hint])
     return len(found.icrf_from_camera), 0

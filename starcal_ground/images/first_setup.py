@@ -154,7 +154,9 @@ class FirstSetup:
     def write(self, folder: Path, topics: Topics) -> None:
         """Write ``params.yaml`` and ``camera.yaml``, which repeat the calibration."""
         make_folder(folder)
-        write_camera_info(self.source.setup.prior.camera, folder / CAMERA_FILE)
+        setup = self.source.setup
+        path = folder / CAMERA_FILE
+        write_camera_info(setup.prior.camera, path, pixels_of=setup.pixels_of)
         write_atomically(folder / PARAMETER_FILE, self._parameter_file(topics))
 
     def _parameter_file(self, topics: Topics) -> str:

@@ -17,6 +17,7 @@ from pathlib import Path
 import tempfile
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
@@ -26,6 +27,7 @@ from starcal_ground.campaign import calibrate, chosen, observe, Source
 from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.images import from_stars as by_stars
 from starcal_ground.images import photographs as image_files
+from starcal_ground.images import stated as stated_facts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import NotFromStars
@@ -156,35 +158,77 @@ def from_photographs(
     """
     from starcal_ground.bag_writer import BagWriter  # bags with attitudes are read without mcap
 
-    first, damaged = photographs[0], image_files.Refusals()
-    focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
-    hint = by_stars.ideal_camera((first.width, first.height), focal_px) if focal_px < 1e9 else None
+    damaged, channel = image_files.Refusals(), str(values.get('image_channel', ''))
+    size = photographs[0].width, photographs[0].height
+    hints = {
+        one.keywords: by_stars.ideal_camera(size, one.focal_px)
+        for one in stated_facts.focal_lengths_of(photographs)
+    }
+    places = [one.pointing for one in photographs if one.pointing]
     try:
-        stars = _found(_images(photographs, damaged), values, hint)
+        stars = _found(_images(photographs, damaged, channel), values, hints, places)
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
+    # A FITS file whose rows have no stated order is mirrored by that order.
+    by_rows = stars.mirrored and not any(one.is_upright for one in photographs)
+    stars = _half_turned(stars) if by_rows else stars
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
-        for image in _images(photographs, image_files.Refusals()):
+        for image in _images(photographs, image_files.Refusals(), channel):
             if stars.mirrored:
-                image = Image(image.time_ns, image.pixels[:, ::-1].copy())
+                side = image.pixels[::-1] if by_rows else image.pixels[:, ::-1]
+                image = Image(image.time_ns, side.copy())
             writer.write_image('/camera/image_raw', image, 'camera')
-    stated = {**({} if 'observer' in values else site_of(photographs)), **values}
+    site, words_of_site = (
+        ({}, '') if 'observer' in values else stated_facts.site_of(photographs, stars)
+    )
+    stated = {**site, **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
-    undated = sum(not one.dated for one in photographs)
-    times_of = f'of the file: {undated} of {len(photographs)} images state none' * bool(undated)
-    return _set_up(stars, [bag], stated, folder, is_located, Topics(), damaged.lines(), times_of)
+    mirrored = (
+        'mirrored top to bottom: the stars show that the rows of the files are last to first'
+        if by_rows
+        else 'mirrored left to right: the stars show a mirror image'
+    )
+    pixels_of = [*dict.fromkeys(one.pixels_of for one in photographs), mirrored * stars.mirrored]
+    notes = [
+        *damaged.lines(),
+        words_of_site,
+        stated_facts.doubt_of_times(photographs),
+        stated_facts.half_turns(stars),
+    ]
+    source = _set_up(stars, [bag], stated, folder, is_located, Topics(), [*filter(None, notes)])
+    setup = dataclasses.replace(
+        source.setup,
+        times_of=stated_facts.times_of(photographs),
+        pixels_of='; '.join(filter(None, pixels_of)),
+    )
+    notes = [f'the time is that {setup.times_of}' * bool(setup.times_of)]
+    notes += [f'pixels of the camera: {setup.pixels_of}' * bool(setup.pixels_of)]
+    return dataclasses.replace(source, setup=setup, notes=(*source.notes, *filter(None, notes)))
+
+
+def _half_turned(stars: by_stars.FromStars) -> by_stars.FromStars:
+    """The same of images mirrored top to bottom: those mirrored left to right, turned by 180."""
+    camera = stars.camera
+    values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+    changes = {'cx': camera.width - 1 - values['cx'], 'cy': camera.height - 1 - values['cy']}
+    changes |= {name: -values[name] for name in ('p1', 'p2') if name in values}
+    turn = Rotation.from_euler('z', math.pi)
+    rotations = {time_ns: one * turn for time_ns, one in stars.icrf_from_camera.items()}
+    return dataclasses.replace(stars, camera=camera.replace(**changes), icrf_from_camera=rotations)
 
 
 def _images(
-    photographs: Sequence[image_files.Photograph], refusals: image_files.Refusals
+    photographs: Sequence[image_files.Photograph],
+    refusals: image_files.Refusals,
+    channel: str = '',
 ) -> Iterator[Image]:
     """Images of the files that can be decoded."""
     for one in photographs:
         with refusals.of(one.path):
-            yield Image(one.time_ns, image_files.pixels_of_photograph(one.path))
+            yield Image(one.time_ns, image_files.pixels_of_photograph(one.path, channel))
 
 
 def from_bags(
@@ -222,12 +266,13 @@ def camera_of_bags(
     read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
     refused: list[StarObservations] = []
     images = itertools.islice(_of_one_size(read, refused), most)
-    first, hint = next(images, None), None
+    first, hints = next(images, None), {}
     if first is not None and all(lens):
         height, width = first.pixels.shape
-        hint = by_stars.ideal_camera((width, height), 1000.0 * lens[0] / lens[1])
+        focal_px = 1000.0 * lens[0] / lens[1]
+        hints = {image_files.GIVEN: by_stars.ideal_camera((width, height), focal_px)}
     try:
-        stars = _found(itertools.chain([first] if first else [], images), values, hint)
+        stars = _found(itertools.chain([first] if first else [], images), values, hints)
     except NotFromStars as error:
         if not refused:
             raise
@@ -252,15 +297,24 @@ def _of_one_size(
 
 
 def _found(
-    images: Iterator[Image], values: Mapping[str, object], hint: CameraModel | None
+    images: Iterator[Image],
+    values: Mapping[str, object],
+    hints: Mapping[str, CameraModel],
+    places: Sequence[tuple[float, float]] = (),
 ) -> by_stars.FromStars:
-    """Camera and rotations; the camera file of the options has priority over a hint."""
+    """
+    Camera and rotations; the camera file of the options has priority over the hints.
+
+    ``hints`` are cameras by what states them, ``places`` the right ascensions and declinations
+    (degrees) that images state.
+    """
     if url := str(values.get('camera_info_url', '')):
-        hint = read_camera_info(url)
+        hints = {url: read_camera_info(url)}
     path = str(values.get('catalog', ''))
     catalog = load_catalog(Path(path) if path else None)
+    too_few = stated_facts.too_few_stars(hints, catalog, bool(path), places)
     least = option_groups(values)['calibration'].min_images
-    return by_stars.from_stars(images, catalog, hint, least)
+    return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
 
 
 def _set_up(
@@ -271,7 +325,6 @@ def _set_up(
     is_located: bool,
     given: Topics,
     notes: Sequence[str] = (),
-    times_of: str = '',
 ) -> Source:
     from starcal_ground.bag_writer import BagWriter  # as above
 
@@ -284,29 +337,13 @@ def _set_up(
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **by_stars.options_of(values)}, prior=prior)
-    setup = dataclasses.replace(setup, times_of=times_of)
     notes = [*notes, stars.in_a_sentence()]
-    notes += [f'the time is that {times_of}'] if times_of else []
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')
     topics = dataclasses.replace(given, attitude=_ATTITUDE_TOPIC)
     is_located = is_located and (setup.site.observer == 'space' or setup.site.is_known)
     through_air = functools.partial(_through_air, stars, setup.site, is_located)
     return Source((*bags, attitudes), topics, setup, through_air, tuple(notes))
-
-
-def site_of(photographs: Sequence[image_files.Photograph]) -> dict[str, object]:
-    """Options of the site, if all files have a position and a date."""
-    sites = [one.site for one in photographs if one.site is not None and one.dated and one.utc]
-    if len(sites) < len(photographs):
-        return {}
-    latitude, longitude, height_m = sites[0]
-    return {
-        'observer': 'ground',
-        'latitude_deg': latitude,
-        'longitude_deg': longitude,
-        'height_m': height_m,
-    }
 
 
 def calibrate_images(

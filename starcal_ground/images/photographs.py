@@ -23,6 +23,7 @@ import re
 from typing import Any
 import warnings
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,21 +34,26 @@ from starcal_ground.file_kinds import (
     JPEG,
     kind_of,
     matching,
+    PNG,
     RAW,
     UNKNOWN,
 )
-from starcal_ground.images.time_systems import middle_of_exposure, number
+from starcal_ground.images import fits_facts
+from starcal_ground.images.fits_facts import FocalLength, Moment
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
+from starcal_ros.formats.fits_keywords import Card, FACTS, number_of, value_of
 from starcal_ros.formats.image_files import (
-    Card,
     content_of,
     decoded,
+    FileImage,
+    in_rgb,
     MOST_VALUES,
     read_fits,
     read_image,
 )
+from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic
 from starcal_ros.text import counted
 
 # Of files whose content says nothing, as of damaged ones; HEIC, of telephones, is not read.
@@ -55,14 +61,15 @@ _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '
 _DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
 _EXIF, _GPS = 0x8769, 0x8825
-_FOCAL_LENGTH = 0x920A
-_GREEN = 1
+_FOCAL_LENGTH, _BITS = 0x920A, 0x0102
+_BITS_OF_PNG = 24  # place in the file
 _SAME_STAMP_NS = NANOSECONDS_PER_SECOND  # file times are often equal; stamps must differ
 # Outside of it a clock was not set, or a file is damaged; stamps of ROS end in 2038.
 _DATES = datetime(1990, 1, 1, tzinfo=timezone.utc), datetime(2037, 1, 1, tzinfo=timezone.utc)
 _FIRST_NS, _LAST_NS = (round(date.timestamp()) * NANOSECONDS_PER_SECOND for date in _DATES)
 _NAMES_SHOWN, _MOST_REASONS = 3, 8
 _LONGEST_EXPOSURE_S = 86400.0
+GIVEN = '--focal-length-mm and --pixel-size-um'
 # Focal length over the diagonal: fields of 160 degrees to 0.1 degrees.
 _SHORTEST, _LONGEST = 0.08, 600.0
 # Tags before the pixels: Pillow would look through all of a damaged file for them, byte by byte.
@@ -75,9 +82,12 @@ class Photograph:
     Facts that a file states about its image.
 
     ``time_ns`` middle of the exposure; ``dated`` False where it is the time of the file, and
-    ``utc`` False where its time zone is not known.  ``focal_px`` NaN where it is not stated.
-    ``site`` latitude, longitude (degrees) and height (m), or None.  ``camera`` names camera, lens
-    and focal length, empty where the file does not.
+    ``utc`` False where its time zone is not known.  ``focal_lengths`` are those stated, the
+    likeliest first.  ``site`` latitude, longitude (degrees) and height (m), or None;
+    ``pointing`` right ascension and declination (degrees), or None.  ``camera`` names camera, lens
+    and focal length, empty where the file does not; ``bits`` is the depth of a pixel.
+    ``pixels_of`` and ``doubt`` say which pixels of the file are the image, and why a time is in
+    doubt; ``is_upright`` is True if the file states the order of its rows.
     """
 
     path: Path
@@ -86,10 +96,20 @@ class Photograph:
     utc: bool
     width: int
     height: int
-    focal_px: float = math.nan
+    focal_lengths: tuple[FocalLength, ...] = ()
     site: tuple[float, float, float] | None = None
     camera: str = ''
     file_bytes: int = 0
+    bits: int = 8
+    pointing: tuple[float, float] | None = None
+    pixels_of: str = ''
+    doubt: str = ''
+    is_upright: bool = True
+
+    @property
+    def focal_px(self) -> float:
+        """Likeliest focal length; NaN where none is stated."""
+        return self.focal_lengths[0].focal_px if self.focal_lengths else math.nan
 
 
 def image_paths(paths: Iterable[Path]) -> list[Path]:
@@ -180,27 +200,32 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
     """Facts of a file; a given length or pixel size replaces its own.  Raises IngestError."""
     kind = _readable(path)
     if kind is FITS:
-        values, header = read_fits(path, '')
-        stated = _of_fits(path, values, header)
-        stated_mm, stated_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
+        stated, stated_mm, stated_um = _of_fits(path, read_fits(path))
     else:
         tags, gps, width, height = (
             _facts_of_raw(path) if kind is RAW else _facts_of_picture(path, kind)
         )
         stated = _of_tags(path, tags, gps, width, height)
         stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
-    given_px = math.nan
+    diagonal_px = math.hypot(stated.width, stated.height)
     if focal_length_mm or pixel_um:
         given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
-    focal_px = stated.focal_px if math.isnan(given_px) else given_px
-    if _SHORTEST < focal_px / math.hypot(stated.width, stated.height) < _LONGEST:
-        return replace(stated, focal_px=focal_px)
-    if focal_px == given_px:
-        raise IngestError(
-            f'{path}: --focal-length-mm and --pixel-size-um give a focal length of {given_px:.3g}'
-            f' px for {stated.width} x {stated.height} pixels'
-        )
-    return replace(stated, focal_px=math.nan)  # no camera has it
+        if _SHORTEST < given_px / diagonal_px < _LONGEST:
+            return replace(stated, focal_lengths=(FocalLength(given_px, GIVEN),))
+        if not math.isnan(given_px):
+            raise IngestError(
+                f'{path}: {GIVEN} give a focal length of {given_px:.3g} px for'
+                f' {stated.width} x {stated.height} pixels'
+            )
+    # No camera has others.
+    return replace(
+        stated,
+        focal_lengths=tuple(
+            one
+            for one in stated.focal_lengths
+            if _SHORTEST < one.focal_px / diagonal_px < _LONGEST
+        ),
+    )
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
@@ -215,49 +240,79 @@ def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
 
 
 def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
-    """Photographs of one camera; of those with the same time of exposure, the largest file."""
+    """Photographs of one camera; of those with one time of exposure, the deepest, largest file."""
     kept: dict[object, Photograph] = {}
-    for one in sorted(photographs, key=lambda one: (-one.file_bytes, one.path.name)):
+    for one in sorted(photographs, key=lambda one: (-one.bits, -one.file_bytes, one.path.name)):
         if kept.setdefault(one.time_ns if one.dated else one.path, one) is not one:
             refusals.add(one.path, 'a copy: another file has its time of exposure')
     return list(kept.values())
 
 
-def by_camera(photographs: Sequence[Photograph]) -> dict[str, list[Photograph]]:
-    """Photographs of each camera and image size, the largest group first."""
+def by_camera(photographs: Sequence[Photograph], fewest: int = 3) -> dict[str, list[Photograph]]:
+    """
+    Photographs of each camera and image size.
+
+    First are groups that suffice; of those the deepest, since previews of the same exposures may
+    outnumber them, then dated ones, then the largest.
+    """
     groups: dict[str, list[Photograph]] = {}
     for one in photographs:
         groups.setdefault(f'{one.camera} {one.width} x {one.height}'.strip(), []).append(one)
-    return dict(sorted(groups.items(), key=lambda group: -len(group[1])))
+
+    def rank(item: tuple[str, list[Photograph]]) -> tuple[bool, int, int, int]:
+        group = item[1]
+        bits, dated = min(one.bits for one in group), sum(one.dated for one in group)
+        return len(group) < fewest, -min(bits, 16), -dated // len(group), -len(group)
+
+    return dict(sorted(groups.items(), key=rank))
 
 
-def pixels_of_photograph(path: Path) -> Pixels:
+def pixels_of_photograph(path: Path, channel: str = '') -> Pixels:
     """
     Light of each pixel (height, width), as the sensor has it: not turned by the EXIF orientation.
 
-    Green of a colour image, interpolated in one of camera raw.  The sRGB curve of 8-bit colour is
-    undone into 16 bit.
+    A channel of a colour image, by default green, interpolated in a mosaic.  The sRGB curve of
+    8-bit colour is undone into 16 bit.
     """
-    kind = _readable(path)
+    kind, channel = _readable(path), channel or 'green'
     if kind is RAW:
         values = _linear(path)
     elif kind is FITS:
-        values = read_fits(path, '')[0]
+        image = read_fits(path)
+        values = image.values
+        if image.mosaic:
+            values = _interpolated(values, image.mosaic, channel)
     else:
         content = content_of(path)
         with _quiet():
             if kind is JPEG:
                 _check_whole(path, content)
-            values = decoded(path, content)  # the EXIF orientation is not applied
+            values = in_rgb(decoded(path, content))  # the EXIF orientation is not applied
     if values.ndim == 3:
         is_rendered = values.dtype == np.uint8
-        values = np.ascontiguousarray(values[:, :, _GREEN])
+        values = np.ascontiguousarray(values[:, :, CHANNELS.index(channel)])
         values = _SRGB_TO_LIGHT[values] if is_rendered else values
     if values.dtype in (np.uint8, np.uint16):
-        return values
+        return np.ascontiguousarray(values)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     scale = _scale([values.dtype], low, high)
     return scale.to_dn(values) if scale.step > 0 else np.zeros(values.shape, np.uint16)
+
+
+def _interpolated(values: NDArray[Any], mosaic: str, channel: str) -> NDArray[Any]:
+    """A colour of a mosaic at each pixel, linear as that of camera raw (`_linear`)."""
+    has = np.array([letter == channel[0] for letter in mosaic]).reshape(2, 2)
+    height, width = values.shape
+    is_of = np.tile(has, (height // 2 + 1, width // 2 + 1))[:height, :width]
+    kernel = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])
+    # A border mirrored about the last pixel has the colours of the mosaic.
+    sums, weights = (
+        cv2.filter2D(part, cv2.CV_64F, kernel, borderType=cv2.BORDER_REFLECT_101)
+        for part in (np.where(is_of, values, 0).astype(np.float64), is_of.astype(np.float64))
+    )
+    everywhere = np.where(is_of, values, sums / weights)
+    whole = values.dtype.kind in 'ui'
+    return (np.rint(everywhere) if whole else everywhere).astype(values.dtype)
 
 
 def _check_whole(path: Path, content: bytes) -> None:
@@ -311,6 +366,8 @@ def _facts_of_picture(path: Path, kind: FileKind) -> tuple[_Tags, _Tags, int, in
             exif = image.getexif()
             tags = {**dict(exif), **dict(exif.get_ifd(_EXIF))}
             gps = dict(exif.get_ifd(_GPS))
+            if kind is PNG:  # Pillow has no mode for colours of 16 bit
+                tags[_BITS] = start[_BITS_OF_PNG]
     except IngestError:
         raise
     except Exception as error:  # a damaged file makes Pillow raise anything
@@ -333,6 +390,7 @@ def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
         _FOCAL_LENGTH: stated.focal_length,
         0x9003: f'{taken:%Y:%m:%d %H:%M:%S}' if taken else '',
         0xA434: f'{lens.make} {lens.model}'.strip(),
+        _BITS: 16,
     }
     _check_size(path, sizes.width, sizes.height)
     return tags, {}, sizes.width, sizes.height
@@ -381,15 +439,18 @@ def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Ph
     names = (tags.get(tag) for tag in (0x010F, 0x0110, 0xA431, 0xA434))
     words = [str(name).strip('\0 ') for name in names if name]
     focal_mm, pixel_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+    by_tags = 'focal length and pixel size of EXIF'
     if words and focal_mm > 0:
         words.append(f'{focal_mm:g} mm')
     focal_px = _focal_px(focal_mm, pixel_um)
     equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
     if math.isnan(focal_px) and equivalent_mm > 0:
         focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
+        by_tags = 'FocalLengthIn35mmFilm of EXIF'
+    scales = () if math.isnan(focal_px) else (FocalLength(focal_px, by_tags),)
     site, camera = _exif_site(gps), ' '.join(words)
-    size = path.stat().st_size
-    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera, size)
+    size, bits = path.stat().st_size, int(np.max(tags.get(_BITS, 8)))
+    return Photograph(path, time_ns, dated, utc, width, height, scales, site, camera, size, bits)
 
 
 def _real(value: object) -> float:
@@ -452,25 +513,41 @@ def _exif_site(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     return degrees[0], degrees[1], height_m if -500 < height_m < 1e5 else 0.0
 
 
-def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Photograph:
-    for key in ('IMAGETYP', 'OBSTYPE', 'FRAME'):
+def _of_fits(path: Path, image: FileImage) -> tuple[Photograph, float, float]:
+    """Facts of a FITS file, its focal length (mm) and the size of its pixels (um)."""
+    header = image.header
+    for key in FACTS['kind of the frame'].keywords:
         kind = str(header[key].value).strip().lower() if key in header else ''
         if re.search('dark|flat|bias', kind):
             raise IngestError(f'{path}: no image of the sky: {key} is {kind[:40]!r}')
-    time_ns, dated = _time_of_file(path), False
-    with contextlib.suppress(ValueError, OverflowError):
-        stated_ns = middle_of_exposure(header, '')
-        if _FIRST_NS <= stated_ns < _LAST_NS:
-            time_ns, dated = stated_ns, True
-    focal_mm, pixel_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
-    matrix = (number(header, key) for key in ('CD1_1', 'CD2_1'))
-    step_deg = math.hypot(*(value for value in matrix if not math.isnan(value)))
-    if not step_deg > 0:
-        step_deg = abs(number(header, 'CDELT1'))
-    focal_px = math.degrees(1.0 / step_deg) if step_deg > 0 else _focal_px(focal_mm, pixel_um)
-    words = [str(header[key].value) for key in ('TELESCOP', 'INSTRUME') if key in header]
-    height, width = values.shape[:2]
-    return Photograph(path, time_ns, dated, dated, width, height, focal_px, None, ' '.join(words))
+    moment, dated, doubt = Moment(_time_of_file(path), is_utc=False), False, ''
+    try:
+        found = fits_facts.moment_of(header)
+        if _FIRST_NS <= found.time_ns < _LAST_NS:
+            moment, dated = found, True
+            doubt = '' if found.is_utc else found.doubt
+    except (ValueError, OverflowError) as error:
+        doubt = str(error).partition(': give --')[0]
+    names = (str(header[key].value) for key in FACTS['camera'].keywords if key in header)
+    height, width = image.values.shape[:2]
+    stated = Photograph(
+        path,
+        moment.time_ns,
+        dated,
+        dated and moment.is_utc,
+        width,
+        height,
+        tuple(fits_facts.focal_lengths_of(header)),
+        fits_facts.site_of(header),
+        ' '.join(names),
+        path.stat().st_size,
+        8 * image.values.dtype.itemsize,
+        fits_facts.pointing_of(header),
+        image.pixels_of,
+        doubt,
+        'ROWORDER' in header,
+    )
+    return stated, number_of(header, 'focal length'), number_of(header, 'pixel size')
 
 
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
@@ -503,6 +580,7 @@ class ImageFile:
     An image file: stamp of the middle of the exposure, size, range and noise of its pixels.
 
     ``saturation`` is the FITS keyword SATURATE, NaN without one; ``temperature_degc`` likewise.
+    ``pixels_of`` says which pixels of the file they are, empty for all.
     """
 
     path: Path
@@ -515,6 +593,7 @@ class ImageFile:
     noise: float
     saturation: float
     temperature_degc: float
+    pixels_of: str = ''
 
 
 @dataclass(frozen=True)
@@ -548,7 +627,8 @@ class Scale:
 
 def look(path: Path, options: ImageOptions) -> ImageFile:
     """Stamp, size and range of an image file; raises IngestError with the remedy."""
-    values, header = _of_options(path, options)
+    image = _of_options(path, options)
+    values, header = image.values, image.header
     finite = np.isfinite(values)
     if not finite.any():
         raise IngestError(f'{path}: no pixel is a finite number')
@@ -565,14 +645,15 @@ def look(path: Path, options: ImageOptions) -> ImageFile:
         float(values.max(where=finite, initial=some)),
         # The median step between neighbours is 0.954 sigma for white noise.
         float(np.nanmedian(steps)) / 0.954,
-        number(header, 'SATURATE'),
-        number(header, options.temperature_key),
+        number_of(header, 'saturation'),
+        value_of(header, options.temperature_key.upper()),
+        image.pixels_of,
     )
 
 
 def pixels_of(path: Path, options: ImageOptions, scale: Scale) -> Pixels:
     """Pixels (height, width) of an image file, in 8 or 16 bit."""
-    pixels = scale.to_dn(_of_options(path, options)[0])
+    pixels = scale.to_dn(_of_options(path, options).values)
     pixels.setflags(write=False)
     return pixels
 
@@ -616,8 +697,17 @@ def check_alike(files: Sequence[ImageFile]) -> None:
             raise IngestError(f'{after.path}: has the time of {before.path}')
 
 
-def _of_options(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str, Card]]:
-    return read_image(path, options.hdu, options.channel, options.bayer)
+def _of_options(path: Path, options: ImageOptions) -> FileImage:
+    image = read_image(path, options.hdu, options.channel, options.bayer)
+    if not (image.mosaic and not options.bayer):
+        return image
+    if not options.channel:
+        raise IngestError(
+            f'{path}: a mosaic, {image.mosaic.upper()} by its header: choose --channel red, green'
+            ' or blue'
+        )
+    values = of_mosaic(image.values, image.mosaic, options.channel)
+    return image._replace(values=values)
 
 
 def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
@@ -628,6 +718,6 @@ def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> i
     if not header:
         raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
     try:
-        return middle_of_exposure(header, options.time_key)
+        return fits_facts.middle_of_exposure(header, options.time_key)
     except (ValueError, OverflowError) as error:
         raise IngestError(f'{path}: {error}') from error

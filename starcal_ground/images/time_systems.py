@@ -3,22 +3,18 @@
 Times of any time system as UTC stamps of ROS: nanoseconds since 1970 without leap seconds.
 
 UTC from 1972 on.  A stamp inside a leap second is that of the second after it, as in POSIX.
-Headers of FITS files (FITS standard 4.0) give the middle of the exposure.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping
 from datetime import date, datetime
 import functools
-import math
 import re
 
 import erfa
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.image_files import Card
 
 _DAY_S = 86400
 _UNIX_DAY = date(1970, 1, 1).toordinal()
@@ -120,108 +116,3 @@ def _leap_seconds() -> tuple[tuple[int, int], ...]:
             seconds = round(float(row['tai_utc']))
             rows.append((days * _DAY_S * NANOSECONDS_PER_SECOND, seconds * NANOSECONDS_PER_SECOND))
     return tuple(rows)
-
-
-_EXPOSURE_KEYS = ('XPOSURE', 'EXPTIME', 'EXPOSURE')  # the first is that of the standard
-# Keywords with the time of day of a date alone: a custom older than the standard.
-_CLOCKS = {
-    'DATE-OBS': ('TIME-OBS', 'UTC-OBS', 'UT-OBS', 'UTSTART', 'UT-START', 'UTCSTART', 'UT', 'UTC'),
-    'DATE-BEG': ('TIME-BEG',),
-    'DATE-END': ('TIME-END', 'UTC-END', 'UT-END', 'UTEND', 'UTSTOP'),
-}
-_UNITS_S = {
-    's': 1.0, 'sec': 1.0, 'second': 1.0,
-    'ms': 1e-3, 'msec': 1e-3, 'millisecond': 1e-3,
-    'us': 1e-6, 'usec': 1e-6, 'microsecond': 1e-6,
-    'min': 60.0, 'minute': 60.0, 'h': 3600.0, 'hr': 3600.0, 'hour': 3600.0, 'd': 86400.0,
-}  # fmt: skip
-_BRACKETS = re.compile(r'\s*\[([^]]*)\]')  # unit at the start of a comment: section 4.3.2
-# Words for another unit than seconds, in a comment without brackets.
-_OTHER_UNIT = re.compile(
-    r'\b(m|u|milli|micro)s(ec(ond)?s?)?\b|\bminutes?\b|\bhours?\b', re.IGNORECASE
-)
-_INSTEAD = 'give --time-key or --times'
-
-
-def middle_of_exposure(header: Mapping[str, Card], key: str) -> int:
-    """
-    Stamp of the middle of the exposure; that of ``key`` unless it is empty.
-
-    Raises ValueError when there is none, or a keyword is ambiguous; the text names the remedy.
-    """
-    if key:
-        if key not in header:
-            raise ValueError(f'no keyword {key} (see --time-key)')
-        return _stamp(header, key)
-    for name in ('DATE-AVG', 'MJD-AVG'):
-        if name in header:
-            return _stamp(header, name)
-    for start, end in (('DATE-BEG', 'DATE-END'), ('MJD-BEG', 'MJD-END')):
-        if start in header and end in header:
-            first_ns, last_ns = _stamp(header, start), _stamp(header, end)
-            if last_ns < first_ns:
-                raise ValueError(f'{end} is before {start}: {_INSTEAD}')
-            return (first_ns + last_ns) // 2
-    exposure_s = _exposure_s(header)
-    for name in ('DATE-BEG', 'DATE-OBS', 'MJD-OBS'):
-        if name in header:
-            if exposure_s is None:
-                raise ValueError(
-                    f'{name} is the start, and no exposure time is given: --time-key {name} '
-                    'takes it as the middle'
-                )
-            return _stamp(header, name) + round(exposure_s * NANOSECONDS_PER_SECOND / 2)
-    raise ValueError(f'no time (DATE-AVG, DATE-BEG, DATE-OBS): {_INSTEAD}')
-
-
-def _stamp(header: Mapping[str, Card], name: str) -> int:
-    system = system_of(str(header['TIMESYS'].value if 'TIMESYS' in header else 'UTC'))
-    value = header[name].value
-    if isinstance(value, (int, float)):
-        return from_mjd(float(value), system)
-    text = str(value).strip()
-    if ':' in text:
-        return from_text(text, system)
-    clocks = [key for key in _CLOCKS.get(name, ()) if key in header]
-    # UT is UTC, also where TIMESYS is not.
-    stamps = {
-        from_text(f'{text}T{header[key].value}', 'UTC' if key.startswith('UT') else system)
-        for key in clocks
-    }
-    if len(stamps) != 1:
-        clocks_found = f'{", ".join(clocks)} differ' if clocks else 'no keyword has one'
-        raise ValueError(f'{name} = {text!r} has no time of day, and {clocks_found}: {_INSTEAD}')
-    return stamps.pop()
-
-
-def _exposure_s(header: Mapping[str, Card]) -> float | None:
-    key = next((key for key in _EXPOSURE_KEYS if key in header), None)
-    if key is None:
-        return None
-    value, comment = header[key]
-    brackets = _BRACKETS.match(comment)
-    unit = 's'
-    if brackets:
-        unit = brackets[1]
-    elif _OTHER_UNIT.search(comment):
-        unit = comment
-    elif key == 'XPOSURE' and 'TIMEUNIT' in header:
-        unit = str(header['TIMEUNIT'].value)
-    scale_s = _UNITS_S.get(unit.strip()) or _UNITS_S.get(unit.strip().lower().removesuffix('s'))
-    if scale_s is None:
-        raise ValueError(
-            f'{key} is in {unit.strip()!r}, expected a unit as [s] or [ms]: {_INSTEAD}'
-        )
-    try:
-        exposure_s = float(value) * scale_s
-    except (TypeError, ValueError):
-        exposure_s = math.nan
-    if not 0.0 < exposure_s < math.inf:
-        raise ValueError(f'{key} = {value} is not the duration of an exposure: {_INSTEAD}')
-    return exposure_s
-
-
-def number(header: Mapping[str, Card], *keys: str) -> float:
-    """Value of the first keyword with a number; NaN if there is none."""
-    values = (header[key].value for key in keys if key in header)
-    return next((float(one) for one in values if isinstance(one, (int, float))), math.nan)

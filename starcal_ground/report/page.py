@@ -31,7 +31,14 @@ from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import annotation, solve
 from starcal_ros.record_fields import nearest
-from starcal_ros.records import Calibration, IMAGE_REFUSALS, STAR_REFUSALS, StarObservations, TOTAL
+from starcal_ros.records import (
+    Calibration,
+    IMAGE_REFUSALS,
+    PIXELS_OF,
+    STAR_REFUSALS,
+    StarObservations,
+    TOTAL,
+)
 from starcal_ros.text import significant
 from starcal_ros.untrusted import json_value
 
@@ -245,6 +252,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
         'times_of': calibration.provenance.get(solve.TIMES, ''),
+        'pixels_of': calibration.provenance.get(PIXELS_OF, ''),
         'active_since': utc_text(calibration.active_since_ns),
         'parameters': verdict.parameter_rows(calibration, prior),
         'alignment': verdict.alignment_rows(calibration, prior),

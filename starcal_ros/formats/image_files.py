@@ -1,14 +1,20 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Images in FITS, TIFF and PNG files: kind and size before they are decoded, values, cards."""
+"""
+Images in FITS, TIFF and PNG files: kind and size before they are decoded, values, cards.
+
+The pixels of FITS are those of the largest image of the file, its overscan cut off, its first row
+at the top; what is known of this is stated by the keywords of `fits_keywords`.
+"""
 
 from __future__ import annotations
 
 import bz2
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import math
 import os
 from pathlib import Path
+import re
 import struct
 from typing import Any, NamedTuple
 import warnings
@@ -18,6 +24,7 @@ import numpy as np
 
 from starcal_ros.arrays import AnyArray
 from starcal_ros.errors import errors_as, IngestError, needing
+from starcal_ros.formats.fits_keywords import Card, FACTS, stated, text_of, value_of
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.untrusted import regular_file
 
@@ -30,31 +37,43 @@ _WIDTH, _HEIGHT, _CHANNELS = 256, 257, 277  # tags of TIFF 6.0
 _TIFF_TYPES = {3: 'H', 4: 'I'}
 _TIFF_MOST_ENTRIES = 1000
 
+# Extensions that are of the image and no image of the sky, by their names.
+_OF_ANOTHER = re.compile(r'BPM|MASK|DQ|ERR|VAR|WHT|WEIGHT|IVAR|UNC|NOISE|BACK|BKG|FLAG|THUMB')
+_SECTION = re.compile(r'\[(\d+):(\d+),(\d+):(\d+)\]')
+_PATTERN = re.compile('[RGBCMYW]{4}')  # of a mosaic of 2 x 2 colours
+_OTHER_GREENS = 0.05
+_PATTERNS = ('RGGB', 'BGGR', 'GBRG', 'GRBG')
 
-class Card(NamedTuple):
-    """Value and comment of a FITS keyword."""
 
-    value: Any
-    comment: str = ''
-
-
-def read_image(
-    path: Path, hdu: str = '', channel: str = '', bayer: str = ''
-) -> tuple[AnyArray, Mapping[str, Card]]:
+class FileImage(NamedTuple):
     """
-    Unscaled values (height, width) of an image file and its FITS cards; raises IngestError.
+    Unscaled values (height, width), or with three channels, of an image file.
 
-    ``hdu`` is the number or name of a FITS extension, empty for the first image; ``channel`` is
-    red, green or blue of a colour image, ``bayer`` the pattern of a mosaic.
+    ``header`` are its FITS cards, ``mosaic`` its Bayer pattern, empty for none; ``pixels_of`` says
+    which pixels of the file the values are, empty for all of them, in order.
+    """
+
+    values: AnyArray
+    header: Mapping[str, Card]
+    mosaic: str = ''
+    pixels_of: str = ''
+
+
+def read_image(path: Path, hdu: str = '', channel: str = '', bayer: str = '') -> FileImage:
+    """
+    Values (height, width) of an image file; raises IngestError.
+
+    ``hdu`` is the number or name of a FITS extension, empty for the largest image; ``channel`` is
+    red, green or blue of a colour image, ``bayer`` the pattern of a mosaic to take it from.
     """
     if is_fits(path):
-        values, header = read_fits(path, hdu)
+        image = read_fits(path, hdu)
     else:
         content = content_of(path)
         if not (sensor_messages.png_header(content) or tiff_header(content)):
             raise IngestError(f'{path}: not an image in FITS, TIFF or PNG')
-        values, header = decoded(path, content), {}
-        values = values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
+        image = FileImage(in_rgb(decoded(path, content)), {})
+    values = image.values
     is_colour = values.ndim == _RGB and values.shape[2] == _RGB
     if (is_colour or bayer) and channel not in sensor_messages.CHANNELS:
         raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
@@ -63,7 +82,12 @@ def read_image(
     elif bayer:
         values = sensor_messages.of_mosaic(values, bayer.lower(), channel)
     _check_shape(path, values.shape)
-    return values, header
+    return image._replace(values=values)
+
+
+def in_rgb(values: AnyArray) -> AnyArray:
+    """Values of `decoded` with the channels red, green and blue."""
+    return values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
 
 
 def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
@@ -110,8 +134,8 @@ def is_fits(path: Path) -> bool:
     return start.startswith(b'SIMPLE  =')
 
 
-def read_fits(path: Path, hdu: str) -> tuple[AnyArray, Mapping[str, Card]]:
-    """Values and cards of the image ``hdu``, or the first, of a FITS file; raises IngestError."""
+def read_fits(path: Path, hdu: str = '') -> FileImage:
+    """Image ``hdu`` of a FITS file, or the largest one; raises IngestError."""
     with needing('mission', IngestError, path):
         from astropy.io import fits
     try:
@@ -122,11 +146,9 @@ def read_fits(path: Path, hdu: str) -> tuple[AnyArray, Mapping[str, Card]]:
             fits.open(file, memmap=False, uint=True) as units,
         ):
             if hdu:
-                unit = units[int(hdu) if hdu.lstrip('-').isdigit() else hdu]
+                unit, words = units[int(hdu) if hdu.lstrip('-').isdigit() else hdu], ''
             else:
-                unit = next(
-                    (u for u in units if u.is_image and u.header.get('NAXIS', 0) >= 2), None
-                )
+                unit, words = _largest(units)
             if unit is None or not unit.is_image:
                 raise IngestError(f'{path}: no image in the FITS file')
             sides = [unit.header.get(f'NAXIS{k + 1}', 0) for k in range(unit.header['NAXIS'])]
@@ -139,13 +161,124 @@ def read_fits(path: Path, hdu: str) -> tuple[AnyArray, Mapping[str, Card]]:
     except (IngestError, MemoryError):
         raise
     except Exception as error:  # astropy raises any exception on a damaged file
-        words = ' '.join(str(error).split())[:160]
-        raise IngestError(f'{path}: not readable as FITS: {words}') from error
+        text = ' '.join(str(error).split())[:160]
+        raise IngestError(f'{path}: not readable as FITS: {text}') from error
     values = values.squeeze()
     if values.ndim == _RGB and values.shape[0] == _RGB:
         values = np.moveaxis(values, 0, -1)  # a cube of three planes
     _check_shape(path, values.shape)
-    return values.astype(values.dtype.newbyteorder('=')), header
+    values, mosaic, region = _upright(path, values, header)
+    pixels_of = ', '.join(filter(None, [words, region]))
+    return FileImage(values.astype(values.dtype.newbyteorder('=')), header, mosaic, pixels_of)
+
+
+def _largest(units: Any) -> tuple[Any, str]:
+    """The largest image of a file, the first of equal ones, and words where there are several."""
+    images = [
+        (k, unit)
+        for k, unit in enumerate(units)
+        if unit.is_image and unit.header.get('NAXIS', 0) >= _GREY
+    ]
+    of_sky = [one for one in images if not _OF_ANOTHER.search(str(one[1].name).upper())] or images
+    if not of_sky:
+        return None, ''
+    sides = [(unit.header['NAXIS1'], unit.header['NAXIS2']) for _, unit in of_sky]
+    most = max(sides, key=math.prod)
+    number, unit = of_sky[sides.index(most)]
+    count = sides.count(most)
+    return unit, f'HDU {number} of {count} images of one size' * (count > 1)
+
+
+def _upright(
+    path: Path, values: AnyArray, header: Mapping[str, Card]
+) -> tuple[AnyArray, str, str]:
+    """Values without overscan, first row at the top; the pattern of a mosaic; words on both."""
+    height, width = values.shape[:2]
+    (left, right), (low, high), words = _region(header, width, height)
+    values = values[low:high, left:right]
+    top = low
+    if text_of(header, 'order of the rows').upper().startswith('BOTTOM'):
+        values, top = values[::-1], height - high
+        words = ', '.join(filter(None, [words, 'rows last to first (ROWORDER)']))
+    pattern = text_of(header, 'mosaic').upper()
+    if values.ndim != _GREY or not _PATTERN.fullmatch(pattern):
+        return values, '', words
+    if pattern not in _PATTERNS:
+        key = stated(header, 'mosaic')
+        raise IngestError(
+            f'{path}: {key} {pattern}: of mosaics {", ".join(_PATTERNS)} are read: write one'
+            ' colour of it to a file'
+        )
+    x, y = (
+        int(value_of(header, key)) if (key := stated(header, f'first {side} in the mosaic')) else 0
+        for side in ('column', 'row')
+    )
+    rows = [pattern[:2], pattern[2:]]
+    shifted = [rows[(j + y + top) % 2][(i + x + left) % 2] for j in (0, 1) for i in (0, 1)]
+    if _has_other_greens(values, shifted):
+        shifted = shifted[2:] + shifted[:2]
+    found = ''.join(shifted)
+    of_mosaic = f'mosaic {found} ({stated(header, "mosaic")})'
+    return values, found.lower(), ', '.join(filter(None, [words, of_mosaic]))
+
+
+def _has_other_greens(values: AnyArray, letters: Sequence[str]) -> bool:
+    """
+    True if the two sites without green of a mosaic have one level, and those of green have not.
+
+    A program that turns an image over, or counts rows from the other end, leaves the keyword as
+    it is.  The greens of a detector differ by a percent or two.
+    """
+    levels = [float(np.nanmedian(values[j::2, i::2])) for j in (0, 1) for i in (0, 1)]
+    greens = [level for level, letter in zip(levels, letters, strict=True) if letter == 'G']
+    others = [level for level, letter in zip(levels, letters, strict=True) if letter != 'G']
+    green, other = float(np.ptp(greens)), float(np.ptp(others))
+    return green > _OTHER_GREENS * abs(float(np.mean(levels))) and other < green / 3.0
+
+
+def _region(
+    header: Mapping[str, Card], width: int, height: int
+) -> tuple[tuple[int, int], tuple[int, int], str]:
+    """
+    First and end column, and row, of the light in an image, counted from 0, and words on it.
+
+    A region of the size of the image was cut by the program that wrote it.
+    """
+    whole = (0, width), (0, height)
+    stating = [key for key in FACTS['region of the image'].keywords if key in header]
+    for key in stating:
+        section = _section(str(header[key].value), width, height)
+        if section is not None:
+            return *section, _in_words(*section, key) * (section != whole)
+    if stating:
+        return *whole, f'{stating[0]} is not in the image: nothing cut off'
+    strip = _section(text_of(header, 'region without light'), width, height)
+    if strip is None:
+        return *whole, ''
+    (left, right), (low, high) = strip
+    kept = whole
+    if (low, high) == whole[1] and (left == 0) != (right == width):
+        kept = ((right, width) if left == 0 else (0, left)), (0, height)
+    elif (left, right) == whole[0] and (low == 0) != (high == height):
+        kept = (0, width), ((high, height) if low == 0 else (0, low))
+    return *kept, _in_words(*kept, stated(header, 'region without light')) * (kept != whole)
+
+
+def _section(text: str, width: int, height: int) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Columns and rows of a section, from 0, without the end; None if it is not in the image."""
+    match = _SECTION.fullmatch(text.replace(' ', ''))
+    if not match:
+        return None
+    x, y = (sorted(map(int, match.groups()[k : k + 2])) for k in (0, 2))
+    if (x[1] - x[0] + 1, y[1] - y[0] + 1) == (width, height):
+        return (0, width), (0, height)
+    if x[0] < 1 or y[0] < 1 or x[1] > width or y[1] > height or x[0] == x[1] or y[0] == y[1]:
+        return None
+    return (x[0] - 1, x[1]), (y[0] - 1, y[1])
+
+
+def _in_words(columns: tuple[int, int], rows: tuple[int, int], key: str) -> str:
+    return f'columns {columns[0] + 1} to {columns[1]}, rows {rows[0] + 1} to {rows[1]} ({key})'
 
 
 def _cards(header: Any) -> dict[str, Card]:
@@ -156,7 +289,7 @@ def _cards(header: Any) -> dict[str, Card]:
             value = Card(card.value, card.comment)
         except Exception:  # astropy cannot parse it: keep the text, fail only where it is used
             value = Card(str(card.image)[10:].strip())
-        cards.setdefault(card.keyword, value)
+        cards.setdefault(str(card.keyword).upper(), value)
     return cards
 
 

@@ -171,8 +171,9 @@ class SetupOptions:
     )
     image_channel: str = option(
         '',
-        'channel of rgb, bgr and bayer images to use (bayer: at half the width and height);'
-        ' empty: colour images are refused',
+        'channel of rgb, bgr and bayer images to use (bayer: at half the width and height; in'
+        ' image files at their size); empty: colour images are refused, of image files green is'
+        ' used',
         choices=('', *CHANNELS),
     )
     catalog: str = option('', 'star catalog file; empty: the bundled catalog', is_path=True)
@@ -201,7 +202,8 @@ class Setup:
     Options of every stage, with prior camera, catalog and detector frames loaded.
 
     Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
-    alignment is determined.  ``times_of`` says where stamps are from that are not of the images.
+    alignment is determined.  ``times_of`` says where stamps are from that are not of the images,
+    ``pixels_of`` which pixels of image files the images are, if they are not all, in order.
     """
 
     frames: SetupOptions
@@ -222,6 +224,7 @@ class Setup:
     flat: Floats | None = None
     mountings: tuple[Mounting, ...] = ()
     times_of: str = ''
+    pixels_of: str = ''
 
     @property
     def has_tracker(self) -> bool:
@@ -586,7 +589,7 @@ def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPix
 def _read(name: str, path: str, width: int, height: int) -> AnyArray:
     expected = f'expected one channel of {width} x {height}'
     try:
-        values, _ = read_image(Path(path.removeprefix('file://')))
+        values = read_image(Path(path.removeprefix('file://'))).values
     except IngestError as error:
         raise OptionError(f'{name}: {error}; {expected}') from error
     if values.shape != (height, width):

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 TOTAL = 'total'
+PIXELS_OF = 'image pixels'
+"""Key of the provenance: which pixels of image files are those of the camera, if not all."""
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 

@@ -43,17 +43,17 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
     what = 'name or NAIF ID of the spacecraft in the SPK'
     add('--spacecraft', default='', metavar='BODY', help=what)
-    what = 'FITS keyword of the middle of the exposure (default: DATE-AVG, else from DATE-BEG)'
+    what = 'FITS keyword of the middle of the exposure (default: by the standard keywords)'
     add('--time-key', default='', metavar='KEY', help=what)
     what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
     add('--times', type=Path, metavar='FILE', help=what)
     what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
     add('--temperature-key', default='', metavar='KEY', help=what)
-    what = 'FITS extension by number or name (default: the first image)'
+    what = 'FITS extension by number or name (default: the largest image)'
     add('--hdu', default='', metavar='N', help=what)
     what = 'colour to take from an RGB image or a mosaic'
     add('--channel', default='', choices=('red', 'green', 'blue'), help=what)
-    what = 'Bayer pattern of a mosaic; the image then has half the width and height'
+    what = 'Bayer pattern of a mosaic (default: by the header), read at half the width and height'
     add('--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what)
     what = 'range of pixel values that is mapped to 16 bit (default: the range of all images)'
     add('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)

@@ -141,6 +141,8 @@ def write_bag(
     notes += _coverage_notes(files, attitudes, covered)
     scale = photographs.common_scale(files, options)
     notes += _scale_notes(files, scale)
+    pixels_of = list(dict.fromkeys(file.pixels_of for file in files if file.pixels_of))
+    notes += [f'pixels of the images: {words}' for words in pixels_of]
     writer = BagWriter(bag)
     record, params, copied = _files_beside(bag)
     content = {

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from astropy.io import fits
 import cv2
-from mission_files import frames_of, TINY, write_pngs  # type: ignore[import-not-found]
+from mission_files import date, frames_of, TINY, write_fits, write_pngs  # type: ignore[import-not-found]
 from mission_files import images as tiny_images
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Image, refused_image
+from starcal_ros.records import Image, PIXELS_OF, refused_image
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog
 
@@ -91,6 +91,41 @@ def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_cl
     assert not calibration.has_alignment
     assert difference < 2 * sigma
     assert calibration.provenance[TIMES] == 'of the file: 10 of 10 images state none'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('kind', 'words'),
+    [
+        ('bottom-up', 'rows last to first (ROWORDER)'),
+        ('rows of unknown order', 'mirrored top to bottom: the stars show that the rows'),
+        ('mirrored PNG', 'mirrored left to right'),
+    ],
+)
+def test_the_axis_of_a_mirror_image_is_that_of_the_file_and_is_in_the_products(
+    tmp_path: Path, kind: str, words: str
+) -> None:
+    """The principal point, 60 and 50 px off the middle, is that of the pixels named."""
+    folder, out = tmp_path / 'night', tmp_path / 'out'
+    cut = [image.pixels[:-50, 60:] for image in tiny_images()[:6]]
+    if kind == 'mirrored PNG':
+        write_pngs(folder, [pixels[:, ::-1] for pixels in cut])
+    else:
+        folder.mkdir()
+        header = {'ROWORDER': 'BOTTOM-UP'} if kind == 'bottom-up' else {}
+        for image, pixels in zip(tiny_images(), cut, strict=False):
+            upside_down = Image(image.time_ns, pixels[::-1].copy())
+            path = folder / f'{image.time_ns}.fits'
+            write_fits(path, upside_down, **{'DATE-AVG': date(image.time_ns), **header})
+    main(['calibrate', str(folder), *LENS, '-o', str(out), '--quiet'])
+    calibration = read_calibration(out / 'calibration.json')
+    truth = np.array(json.loads((TINY / 'truth.json').read_text())['k_true'])[3:5] - [60.0, 0.0]
+    off = (calibration.geometry.camera.parameters[3:5] - truth) / calibration.sigma[3:5]
+    assert np.abs(off).max() < 4.0  # one in 8,000 good ones is beyond
+    assert calibration.provenance[PIXELS_OF].startswith(words)
+    assert (out / 'camera_info.yaml').read_text().startswith(f'# {PIXELS_OF}: {words}')
+    assert (out / 'camera.yaml').read_text().startswith(f'# {PIXELS_OF}: {words}')
+    assert words in (out / 'report.html').read_text()
 
 
 @pytest.mark.slow
@@ -155,7 +190,7 @@ def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
     """As a picture of a planetarium on a screen among images of the sky."""
     frames = [*tiny_images()]
     frames[4] = Image(frames[4].time_ns, zoomed(frames[4].pixels, 1.1))
-    found = from_stars(frames, load_catalog(), ideal_camera((640, 512), 1800.0))
+    found = from_stars(frames, load_catalog(), [ideal_camera((640, 512), 1800.0)])
     assert found.icrf_from_camera.keys() == {one.time_ns for one in frames} - {frames[4].time_ns}
     (focal_px,) = found.other_focal_px
     assert focal_px == pytest.approx(1.1 * found.camera.parameters[0], rel=5e-3)

@@ -124,39 +124,6 @@ def test_a_colour_of_a_mosaic_has_half_the_size(tmp_path: Path) -> None:
 MIDDLE = '2026-05-15T07:20:00.5'
 
 
-@pytest.mark.parametrize(
-    'header',
-    [
-        {'DATE-AVG': MIDDLE},
-        {'DATE-BEG': '2026-05-15T07:20:00', 'DATE-END': '2026-05-15T07:20:01'},
-        {'DATE-OBS': '2026-05-15T07:20:00', 'EXPTIME': 1.0},
-        {'DATE-OBS': '2026-05-15', 'TIME-OBS': '07:20:00', 'XPOSURE': 1.0},
-        {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'EXPTIME': 1.0},
-        {'DATE-OBS': '2026-05-15', 'UTSTART': '07:20:00', 'UT': '07:20:00.0', 'EXPTIME': 1.0},
-        {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'EXPTIME': 1.0, 'TIMESYS': 'TAI'},
-        {
-            'DATE-BEG': '2026-05-15',
-            'TIME-BEG': '07:20',
-            'DATE-END': '2026-05-15',
-            'TIME-END': '07:20:01',
-        },
-        {'DATE-OBS': '2026-05-15T07:20:00.375', 'EXPOSURE': (250, '[ms]')},
-        {'DATE-OBS': '2026-05-15T07:19:00.5', 'EXPTIME': (2, '[min] of the shutter')},
-        {'DATE-OBS': '2026-05-15T07:20:00', 'EXPTIME': (1.0, 'Exposure time in seconds')},
-        {'DATE-BEG': '2026-05-15T07:19:00.5', 'XPOSURE': 2, 'TIMEUNIT': 'min'},
-        {'DATE-BEG': '2026-05-15T07:20:37', 'XPOSURE': 1.0, 'TIMESYS': 'TAI'},
-        {'DATE-AVG': '2026-05-15T07:21:09.684', 'TIMESYS': 'TT'},
-        {'DATE-AVG': '2026-05-15T07:20:18.5', 'TIMESYS': 'GPS'},
-        {'MJD-AVG': 61175 + (7 * 3600 + 20 * 60 + 0.5) / 86400},
-    ],
-)
-def test_the_middle_of_the_exposure_is_found(tmp_path: Path, header: dict[str, object]) -> None:
-    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
-    expected = look(write_fits(tmp_path / 'b.fits', IMAGE, **{'DATE-AVG': MIDDLE}), PLAIN).time_ns
-    # A Julian date in a double resolves 0.6 us.
-    assert abs(look(path, PLAIN).time_ns - expected) <= (1000 if 'MJD-AVG' in header else 0)
-
-
 START = {'DATE-OBS': '2026-05-15T07:20:00'}
 
 

@@ -10,6 +10,7 @@ import shutil
 from astropy.io import fits
 from mission_files import (  # type: ignore[import-not-found]
     attitudes,
+    date,
     FRAME_ID,
     images,
     TINY,
@@ -251,6 +252,22 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> N
     first, second = capsys.readouterr().err.splitlines()
     assert 'cut.fits: not an image in FITS, TIFF or PNG' in first
     assert 'huge.fits: needs more than 1 GB of memory to be read' in second
+
+
+def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, capsys) -> None:
+    for number, image in enumerate(images()[:3]):
+        upside_down = Image(image.time_ns, image.pixels[::-1].copy())
+        header = {'DATE-AVG': date(image.time_ns), 'ROWORDER': 'BOTTOM-UP'}
+        write_fits(tmp_path / f'{number}.fits', upside_down, **header)
+    aem = write_aem(tmp_path / 'a.aem')
+    line = 'import --images {t}/*.fits --attitude {a} -o {t}/bag'
+    assert main(words(line, t=tmp_path, a=aem)) == 0
+    note = 'pixels of the images: rows last to first (ROWORDER)'
+    assert note in capsys.readouterr().out
+    assert note in json.loads((tmp_path / 'bag/import.json').read_text())['notes']
+    read = list(reader.read_images([tmp_path / 'bag'], '/camera/image_raw'))
+    for one, image in zip(read, images(), strict=False):
+        assert isinstance(one, Image) and (one.pixels == image.pixels).all()
 
 
 def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:
