@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ros import errors, records
-from starcal_ros.assessment.gate import judge, reasons_of, REMEDIES, requirement_answers
+from starcal_ros.assessment.gate import (
+    judge,
+    reasons_of,
+    REMEDIES,
+    requirement_answers,
+    REQUIREMENTS,
+)
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method
@@ -270,7 +276,7 @@ class CalibratorState:
             wanted = self._active.before
             earlier, refused = self._accepted_from(wanted)
             if earlier is None:
-                kept = ' on record' * any(record.event < wanted for record in self._history)
+                kept = ' on record' if wanted else ''
                 missing = f'there is no calibration before the active one{kept}'
                 return Answer(False, '; '.join(refused) or missing)
             answer = self._activate(
@@ -357,8 +363,13 @@ def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str,
         return (f'the gate cannot judge it: {type(error).__name__}: {error}',)
     overridden = set()
     if calibration.forced:
-        overridden = {check.name for check in calibration.gate if check.passed is False}
-    return reasons_of(check for check in checks if check.name not in overridden)
+        overridden = {_limit_of(check) for check in calibration.gate if check.passed is False}
+    return reasons_of(check for check in checks if _limit_of(check) not in overridden)
+
+
+def _limit_of(check: records.GateCheck) -> str:
+    """Name of the limit: a change from the active calibration then is one from the prior now."""
+    return check.name if check.option in ('', REQUIREMENTS) else check.option
 
 
 def summary(calibration: records.Calibration) -> str:
