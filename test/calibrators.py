@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import contextlib
 import dataclasses
 import itertools
@@ -25,7 +26,8 @@ class Calibrators:
     """Processes with a calibrator each, which share a disk and a clock; methods are steps."""
 
     def __init__(self, disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.disk, self._times = disk, itertools.count(1)
+        self.disk = disk
+        self._times: Iterator[int] = itertools.count(1)
         self.states: dict[str, CalibratorState] = {}
         self.is_full = contextlib.ExitStack()
         self.setup = dataclasses.replace(setup(), prior=calibration().geometry)
@@ -90,8 +92,10 @@ class Calibrators:
         self._candidate = dataclasses.replace(first, geometry=geometry, weakest_direction=name)
         k = options.index('while') if 'while' in options else len(options)
         self._meanwhile = options[k + 1 :]
-        asked = dict.fromkeys(options[:k], True)
-        self.answer = self.states[process].solve(**asked)
+        asked = options[:k]
+        self.answer = self.states[process].solve(
+            dry_run='dry_run' in asked, force='force' in asked
+        )
         self._meanwhile = ()
 
     def activate(self, process: str, *words: str) -> None:

@@ -58,7 +58,9 @@ class Kept:
 
     def __str__(self) -> str:
         """Return the numbers of images and activations in words."""
-        return f'{len(self.ensemble.images)} images and {len(self.history)} activations'
+        images, events = len(self.ensemble.images), len(self.history)
+        ends = ['s' * (count != 1) for count in (images, events)]
+        return f'{images} image{ends[0]} and {events} activation{ends[1]}'
 
 
 def joined(folder: Kept, memory: Kept, last_event: int) -> Kept:

@@ -198,7 +198,7 @@ UNJOINED: dict[str, tuple[str, str, str, str]] = {
         'open -; images 0 1; activate m',
         'navcam_2',
         'A',
-        r'2 images and 1 activations are of a camera of .* in camera, and not on disk: configure',
+        r'2 images and 1 activation are of a camera of .* in camera, and not on disk: configure',
     ),
     'not saved of another camera': (
         'open A; images 0; full; images 1; activate m; close; room',
@@ -210,7 +210,7 @@ UNJOINED: dict[str, tuple[str, str, str, str]] = {
         'P2 open A; P2 images 2; P2 close; open -; images 0 1; activate m',
         'navcam_1',
         'A',
-        r'A is of the camera navcam_1, 2 images and 1 activations in memory are of .*: choose',
+        r'A is of the camera navcam_1, 2 images and 1 activation in memory are of .*: choose',
     ),
     'in use': (
         'P2 open A; open -; images 0 1; activate m',
