@@ -111,16 +111,13 @@ def _joined_history(
     """
     All events in order of time, the last of which is active.
 
-    Files of the folder keep their numbers where the order allows it.  Other events, and their
-    calibrations, get numbers that no file of the folder has had, unless the folder has the
-    calibration already.
+    Events of the folder keep their numbers where the order allows it.  Others keep theirs where no
+    file of the folder has had them, and get the next free ones elsewhere; so do calibrations.
     """
     written = {record.origin: record for record in folder}
     common = [(record, written[record.origin]) for record in memory if record.origin in written]
-    # Up to this event both places count alike; an empty folder has no numbers of its own.
-    alike = [record.event for record, other in common if record.event == other.event]
-    shared = max(alike, default=0 if last_event else memory[-1].event if memory else 0)
     numbers = {one.calibration.number: other.calibration.number for one, other in common}
+    taken = {record.calibration.number for record in folder}
     origin_of = [{record.event: record.origin for record in place} for place in (memory, folder)]
     starts = {place[0].origin for place in (memory, folder) if place and not common}
     before_start = [0, 0]  # the event that the first one of memory, and of the folder, comes after
@@ -134,13 +131,15 @@ def _joined_history(
         free = max(last_event, floor) + 1
         is_kept = record.event > floor if is_written else record.event >= free
         event = events[record.origin] = record.event if is_kept else free
-        number, before = record.calibration.number, record.before
+        number = record.calibration.number
         if not is_written:
-            number = numbers.setdefault(number, number if number <= shared else event)
-            before = before if before <= shared else 0  # an event that is not on record
+            number = numbers.setdefault(number, event if number in taken else number)
+            taken.add(number)
+        # An event that is not on record in its place: its number may be that of another here.
+        before = record.before if is_written else 0
         before = events.get(origin_of[is_written].get(record.before, ''), before)
-        calibration = replace(record.calibration, number=number)
         before = before or before_start[is_written]
+        calibration = replace(record.calibration, number=number)
         result.append(replace(record, event=event, before=before, calibration=calibration))
     return tuple(result[-HISTORY:])
 

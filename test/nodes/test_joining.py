@@ -7,14 +7,18 @@ from collections.abc import Iterator
 import dataclasses
 import itertools
 from pathlib import Path
+from random import Random
 from typing import Any
 
 from attacks import observations  # type: ignore[import-not-found]
 from calibrators import Calibrators, kept  # type: ignore[import-not-found]
+from kept_state import activation  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ros.errors import StarcalError
 from starcal_ros.files import replacing
+from starcal_ros.records import Activation
+from starcal_ros.ros.joining import joined, Kept
 
 pytestmark = pytest.mark.slow
 
@@ -297,3 +301,52 @@ def test_a_disk_that_fails_at_any_write_of_a_join(
             assert history == ['a', 'm', 'c']
             break
     assert writes >= 3  # two events, the collections and an image
+
+
+def grown(
+    history: tuple[Activation, ...], random: Random, clock: list[int]
+) -> tuple[Activation, ...]:
+    """A history with some more activations and roll-backs, by a clock that may be set back."""
+    for _ in range(random.randrange(5)):
+        clock[0] = max(0, clock[0] + random.choice([1, 1, 1, 0, -3]))
+        event = history[-1].event + 1 if history else 1
+        number, before = event, history[-1].event if history else 0
+        back = [record for record in history if record.event == history[-1].before]
+        if back and random.random() < 0.3:
+            number, before = back[0].calibration.number, back[0].before
+        record = activation(event, before, number)
+        timed = dataclasses.replace(record.calibration, active_since_ns=clock[0])
+        named = dataclasses.replace(timed, weakest_direction=f'{random.random()}')
+        if number != event:
+            named = dataclasses.replace(back[0].calibration, active_since_ns=clock[0])
+        history = (*history, dataclasses.replace(record, calibration=named))
+    return history
+
+
+def test_any_histories_are_joined() -> None:
+    """
+    Of three places with common and different events, in any order and joined again.
+
+    Each event is there once, in order, a number names one calibration, and no file of the folder
+    changes under the same event.
+    """
+    for seed in range(300):
+        random, clock = Random(seed), [0]
+        common = grown((), random, clock)
+        folder, memory = grown(common, random, clock), grown(common, random, clock)
+        for _ in range(3):
+            last_event = max((record.event for record in folder), default=0)
+            both = joined(Kept(history=folder), Kept(history=memory), last_event).history
+            events = [record.event for record in both]
+            assert events == sorted(set(events))
+            assert all(record.before < record.event for record in both)
+            origins = [record.origin for record in both]
+            assert sorted(origins) == sorted({record.origin for record in (*folder, *memory)})
+            names = {(r.calibration.number, r.calibration.weakest_direction) for r in both}
+            assert len(names) == len(dict(names))
+            of_event = {record.event: record for record in both}
+            for record in folder:
+                found = of_event.get(record.event)
+                assert found is None or found == record or found.origin != record.origin
+            start = random.choice([(), memory, folder])
+            folder, memory = grown(start, random, clock), both
