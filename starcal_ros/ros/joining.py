@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-What a calibrator keeps in memory and what a state folder holds, joined: nothing is lost.
+Records of a calibrator in memory joined with those of a state folder, so that none is lost.
 
 Images are a set by stamp.  A collection of images begins with a folder, a move or a reset, and a
 reset ends the collections before it, so that their images do not come back from another place.
