@@ -73,7 +73,7 @@ class Monitor(Node):
 
     def _on_calibration(self, message: Any) -> None:
         active = record_messages.active_from_message(message)
-        why_none = '; '.join(message.reasons) if active is None else ''
+        why_none = record_messages.why_none_is_active(message) if active is None else ''
         # An earlier candidate has been replaced by this decision.
         self._set(active=active, why_none=why_none, candidate=None)
 

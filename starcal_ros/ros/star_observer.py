@@ -265,7 +265,7 @@ class StarObserver(StarcalNode):
     def _withdraw(self, message: Any) -> None:
         """Predict with the prior, and send a camera that is not calibrated with each image."""
         was_calibrated = self._camera_info is not None and self._camera_info.k[0] != 0
-        if reasons := '; '.join(message.reasons):
+        if reasons := record_messages.why_none_is_active(message):
             self._withdrawn = f'no calibration is active, the prior predicts the stars: {reasons}'
         elif was_calibrated:
             self._withdrawn = 'the calibration was withdrawn, the prior predicts the stars'

@@ -327,7 +327,7 @@ class CalibratorState:
             product_files.check_readable(active)
         except errors.ProductError as error:
             why = f'not activated, nobody could read it: {error}; check the ROS clock'
-            return Answer(False, why, calibration)
+            return Answer(False, why)
         record = records.Activation(self._next_event(), before, active)
         with self._records:
             self._history = (*self._history, record)[-HISTORY:]

@@ -209,6 +209,11 @@ def none_active_to_messages(
     )
 
 
+def why_none_is_active(message: codec.Message) -> str:
+    """The reasons of a message that no calibration is active, in one line; empty without any."""
+    return '; '.join(message.reasons)[:_LONGEST_DETAIL]
+
+
 def active_from_message(message: codec.Message) -> Calibration | None:
     """The calibration of a message on ``calibration``; None where it says that none is active."""
     is_none = message.number == 0 and message.camera.width == 0
