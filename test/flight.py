@@ -148,6 +148,9 @@ class Flight:
             self._solving = None
         self.reported = max([self.reported, *(message.images_saved for message in self._status)])
         for message in self._latched:
+            if not message.number:  # none is active: only before the first
+                self.wrong['calibrator'] += bool(self._known)
+                continue
             content = [*message.camera.parameters, *message.covariance]
             self.wrong['calibrator'] += not message.accepted
             self.wrong['calibrator'] += self._known.setdefault(message.number, content) != content

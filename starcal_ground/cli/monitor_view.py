@@ -37,6 +37,7 @@ class Received:
     last: StarObservations | None = None
     status: EnsembleStatus | None = None
     active: Calibration | None = None
+    why_none: str = ''  # why a calibration was withdrawn
     candidate: Calibration | None = None
     health: Mapping[str, tuple[int, str]] = field(default_factory=dict)
 
@@ -147,7 +148,9 @@ def _sigmas(calibration: Calibration | None) -> dict[str, float]:
 def _calibration(received: Received) -> Group | Text:
     parts: list[Text | Table] = []
     if received.active is None:
-        parts.append(Line('none active: the prior is in use', 'dim'))
+        why_none = f': {received.why_none}' if received.why_none else ''
+        style = 'yellow' if why_none else 'dim'
+        parts.append(Line(f'none active: the prior is in use{why_none}', style))
     else:
         active = received.active
         style = 'green' if active.accepted else 'bold red'

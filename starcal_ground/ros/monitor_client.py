@@ -73,8 +73,10 @@ class Monitor(Node):
         self._set(status=message_codec.record_from_message(records.EnsembleStatus, message))
 
     def _on_calibration(self, message: Any) -> None:
+        active = record_messages.active_from_message(message)
+        why_none = record_messages.why_none_is_active(message) if active is None else ''
         # An earlier candidate has been replaced by this decision.
-        self._set(active=record_messages.calibration_from_message(message), candidate=None)
+        self._set(active=active, why_none=why_none, candidate=None)
 
     def _on_candidate(self, message: Any) -> None:
         candidate, active = record_messages.calibration_from_message(message), self.received.active

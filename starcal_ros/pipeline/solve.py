@@ -168,13 +168,20 @@ def solve_with_residuals(
     result = estimated(ensemble, setup)
     provenance = provenance_of(setup, ensemble, inputs or {})
     calibration = _not_judged(result, ensemble, setup, provenance)
-    checks = judge(calibration, setup.prior, active, setup.gate, setup.calibration)
-    reasons = reasons_of(checks)
-    calibration = dataclasses.replace(
-        calibration, gate=checks, reasons=reasons, accepted=not reasons
-    )
+    calibration = judged(calibration, ensemble, setup, active)
     colour_bp_rp = setup.catalog.colours_bp_rp(result.table.catalog_id)
     return calibration, residuals_of(result, ensemble, colour_bp_rp)
+
+
+@one_blas_thread()
+def judged(
+    calibration: Calibration, ensemble: Ensemble, setup: Setup, active: Calibration | None
+) -> Calibration:
+    """A calibration of an ensemble with the checks and the verdict of the gate."""
+    prior = aligned_by(ensemble, setup).prior
+    checks = judge(calibration, prior, active, setup.gate, setup.calibration)
+    reasons = reasons_of(checks)
+    return dataclasses.replace(calibration, gate=checks, reasons=reasons, accepted=not reasons)
 
 
 def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:

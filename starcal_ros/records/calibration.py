@@ -9,9 +9,10 @@ detector in addition to the lens model, with the covariance of lines of sight.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import functools
 import math
+import secrets
 from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
@@ -714,12 +715,14 @@ class Activation:
     A calibration was activated, for the first time or by a roll-back.
 
     ``event`` counts activations; ``before`` is the event that a roll-back of this one returns to,
-    0 for none.  The calibration is active until the next event.
+    0 for none.  The calibration is active until the next event.  ``origin`` is a unique name of
+    the event, which it keeps where two histories are joined and it gets another number.
     """
 
     event: int
     before: int
     calibration: Calibration
+    origin: str = field(default_factory=lambda: secrets.token_hex(8))
 
 
 _MOST = 1e15  # largest camera parameter: its cube must be finite

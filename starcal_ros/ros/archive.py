@@ -3,12 +3,14 @@
 State on disk: the ensemble, and the activated calibrations, safe from a crash.
 
 ``ensemble/00000012.mcap`` is one image, numbered in order of arrival: a whole bag that any reader
-of MCAP opens.  ``ensemble/refused.json`` counts the refused images.
+of MCAP opens.  ``ensemble/refused.json`` counts the refused images and names the `Collections`.
 ``calibrations/00000007_calibration_00000003.json`` records that event 7 activated calibration 3
 (here by a roll-back): a ``calibration.json`` with two more keys.
 
 A file is written beside its place, synced, renamed, and the folder synced; it is never changed
 afterwards.  So at any instant each file is complete or absent.
+
+A writer passes its content through the reader, which so accepts each file of this module.
 
 The folder is untrusted input.  Only regular files of limited size are opened.  A file with a wrong
 seal (`Seal`), or with content that is no image or no calibration, is renamed to ``….damaged``
@@ -18,9 +20,9 @@ of an image carries its HMAC: ``00000012_<64 digits>.mcap``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import fcntl
 import hashlib
 import hmac
@@ -42,6 +44,7 @@ from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMB
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import Count, json_object, read_record
 from starcal_ros.records import Activation, counted_refusal, Ensemble, StarObservations
+from starcal_ros.ros.joining import Collections
 from starcal_ros.untrusted import json_value, read_bytes
 
 ARCHIVE_SCHEMA = 1
@@ -60,6 +63,10 @@ _MOST_BYTES = 64 << 20  # of a file: an image of 10,000 stars has 1 MB
 _MOST_COUNT = 2**32 - 1  # of refused images: that of the message
 _LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
 _CHECKSUM, _HMAC = 'sha256', 'hmac_sha256'
+
+
+class _WrongKey(ValueError):
+    """A file is sound, but for its HMAC."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +120,9 @@ class Seal:
         if not self.key:
             return
         if not seal:
-            raise ValueError('the HMAC is missing (state_key_file)')
+            raise _WrongKey('the HMAC is missing (state_key_file)')
         if not hmac.compare_digest(str(seal).encode(), self._hmac(text).encode()):
-            raise ValueError('the HMAC is wrong (state_key_file)')
+            raise _WrongKey('the HMAC is wrong (state_key_file)')
 
     def _hmac(self, text: bytes) -> str:
         return hmac.new(self.key, text, 'sha256').hexdigest()
@@ -159,21 +166,33 @@ class _ActivationKeys:
     schema: int
     event: Count
     before: Count
+    origin: str = ''
 
 
 @dataclass(frozen=True)
 class _RefusedFile:
-    """The file of the counts of refused images, by reason."""
+    """The file of the counts of refused images by reason, of collections and of the camera."""
 
     schema: int
     refused: Mapping[str, Count] = field(default_factory=dict)
+    current: tuple[str, ...] = ()
+    ended: tuple[str, ...] = ()
+    camera_frame: str = ''
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _KeptImage:
     """An image on disk, and its file."""
 
     image: StarObservations
+    path: Path
+
+
+@dataclass(frozen=True)
+class _KeptEvent:
+    """The origin of an event on disk, and its file."""
+
+    origin: str
     path: Path
 
 
@@ -191,6 +210,10 @@ class Archive:
         A sentence for each file that was set aside or skipped.
     last_event : int
         The highest number given to any file.
+    collections : Collections
+        Those of the images on disk.
+    camera_frame : str
+        The camera that the images on disk are of; empty if not recorded.
     """
 
     def __init__(self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS) -> None:
@@ -199,10 +222,10 @@ class Archive:
         self.damage: list[str] = []
         self.last_event = 0
         self._frame_id = frame_id
-        self._images: dict[int, _Kept] = {}  # by stamp: those on disk
+        self._images: dict[int, _KeptImage] = {}  # by stamp: those on disk
         self._next_image = 1
-        self._refused: dict[str, int] = {}
-        self._events: dict[int, Path] = {}  # those on disk
+        self._counts = _RefusedFile(ARCHIVE_SCHEMA)  # on disk
+        self._events: dict[int, _KeptEvent] = {}  # those on disk
         self._lock = _locked(folder)
         self._finish_emptying()
         parts = [part for own in _OWN for part in (folder / own).glob(f'.*{PART}')]
@@ -233,18 +256,60 @@ class Archive:
         except OSError:
             return 0
 
+    @property
+    def collections(self) -> Collections:
+        """The collections of the images on disk."""
+        return Collections(self._counts.current, self._counts.ended)
+
+    @property
+    def camera_frame(self) -> str:
+        """The camera of the images on disk; empty if it is not recorded."""
+        return self._counts.camera_frame
+
     def read_ensemble(self) -> Ensemble:
         """The ensemble on disk, in order of arrival; damaged images are set aside."""
-        images: dict[int, _Kept] = {}
+        self._check_key()
+        images: dict[int, _KeptImage] = {}
         for path, name in self._files(_ENSEMBLE, _IMAGE_NAME):
             image = self._read_image(path, name)
             if image is not None and image.time_ns not in images:
-                images[image.time_ns] = _Kept(image, path)
+                images[image.time_ns] = _KeptImage(image, path)
                 self._next_image = max(self._next_image, int(name[1]) + 1)
         for path, _ in self._files(_ENSEMBLE, re.compile(re.escape(_REFUSED))):
-            self._refused = self._read_refused(path)
+            self._counts = self._read_counts(path)
         self._images = images
-        return Ensemble(tuple(kept.image for kept in images.values()), dict(self._refused))
+        refused = dict(self._counts.refused)
+        return Ensemble(tuple(kept.image for kept in images.values()), refused)
+
+    def _check_key(self) -> None:
+        """Raise ArchiveError where files are sound, but none of them has a seal of the key."""
+        unsealed = 0
+        for own, pattern in ((_ENSEMBLE, _IMAGE_NAME), (_CALIBRATIONS, _EVENT_NAME)):
+            for path in sorted((self.folder / own).glob('*')):
+                name = pattern.fullmatch(path.name)
+                if name is None or not stat.S_ISREG(path.lstat().st_mode):
+                    continue
+                try:
+                    self._check_seal(path, name)
+                    return
+                except _WrongKey:
+                    unsealed += 1
+                except ValueError:  # damaged: it is set aside when it is read
+                    continue
+        if unsealed:
+            raise ArchiveError(
+                f'state_dir: no file of {self.folder} has an HMAC of state_key_file, but '
+                f'{unsealed} are sound: give the key that they were written with, or another '
+                'state_dir'
+            )
+
+    def _check_seal(self, path: Path, name: re.Match[str]) -> None:
+        data = _content(path)
+        if path.suffix == '.json':
+            self._seal.opened(data)
+        elif self._seal.key:
+            _image_of(data)
+            self._seal.check_mark(name[2] or '', int(name[1]), data)
 
     def set_aside_image(self, time_ns: int, why: str) -> None:
         """Rename the file of an image that cannot be used, so that it is not read again."""
@@ -258,41 +323,50 @@ class Archive:
         Where the last is damaged, another file of the same calibration replaces it, else the event
         before.
         """
-        history: list[Activation] = []
+        history: dict[str, Activation] = {}
         last_number = 0
         for path, name in self._files(_CALIBRATIONS, _EVENT_NAME):
             event, last_number = int(name[1]), int(name[2])
             record = self._read_event(path, event, last_number)
             if record is not None:
-                history.append(record)
-                self._events[event] = path
+                # A kill while a joined history was written leaves an event with two numbers.
+                history.pop(record.origin, None)
+                history[record.origin] = record
+                self._events[event] = _KeptEvent(record.origin, path)
                 self.last_event = max(self.last_event, event)
-        same = [record for record in history if record.calibration.number == last_number]
-        if same and history[-1].calibration.number != last_number:
-            history.append(Activation(self.last_event, same[-1].before, same[-1].calibration))
-        return tuple(history)
+        records = list(history.values())
+        same = [record for record in records if record.calibration.number == last_number]
+        if same and records[-1].calibration.number != last_number:
+            records.append(Activation(self.last_event, same[-1].before, same[-1].calibration))
+        return tuple(records)
 
-    def keep(self, ensemble: Ensemble, history: tuple[Activation, ...]) -> None:
+    def keep(
+        self,
+        ensemble: Ensemble,
+        history: tuple[Activation, ...],
+        collections: Collections | None = None,
+    ) -> None:
         """
         Make the folder hold these; returns at once where it holds them already.
 
-        A new image costs one file.  Where the ensemble has no image in common with the one on
-        disk, that one is removed first, in one step.  Raises ArchiveError when writing fails; the
-        files on disk stay intact, and the next call continues.
+        A new image costs one file.  Where all collections on disk have ended, their images are
+        removed first, in one step.  Without ``collections`` those on disk stay.  Raises
+        ArchiveError when writing fails; the files on disk are intact then, and the next call
+        continues.
         """
-        current = {image.time_ns for image in ensemble.images}
+        stamps = {image.time_ns for image in ensemble.images}
+        collections = collections or self.collections
         try:
-            for record in history:
+            # The last one is active, also after a kill between two of them.
+            for record in reversed(history):
                 self._keep_event(record)
-            if self._images and not current & self._images.keys():
+            if not self.collections.survives(collections):
                 self._empty()
+            # Before the images: a reset of some collections must not drop images of others.
+            self._keep_counts(ensemble, collections)
             for image in ensemble.images:
                 if not self._holds(image):
                     self._keep_image(image)
-            if dict(ensemble.refused) != self._refused:
-                content = _RefusedFile(ARCHIVE_SCHEMA, dict(ensemble.refused))
-                self._write(_ENSEMBLE, _REFUSED, self._seal.sealed(json_object(content)))
-                self._refused = dict(ensemble.refused)
         except ProductError as error:
             raise ArchiveError(f'state_dir: {error}') from error
         except OSError as error:
@@ -300,20 +374,38 @@ class Archive:
                 f'state_dir: {error.filename or self.folder}: {error.strerror}'
             ) from error
         finally:  # on a full disk, removed files make room for the next call
-            self._drop(current, {record.event for record in history})
+            self._drop(stamps, history)
 
     def _keep_event(self, record: Activation) -> None:
         if record.event in self._events:
             return
         _check_number(record.event)
+        keys = _ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before, record.origin)
         content = {
             **product_files.calibration_content(record.calibration),
-            'archive': json_object(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
+            'archive': json_object(keys),
         }
-        name = f'{record.event:08d}_calibration_{record.calibration.number:08d}.json'
-        path = self._write(_CALIBRATIONS, name, self._seal.sealed(content))
-        self._events[record.event] = path
+        number = record.calibration.number
+        name = f'{record.event:08d}_calibration_{number:08d}.json'
+        path = self._write(
+            _CALIBRATIONS, name, content, lambda read: _activation(read, record.event, number)
+        )
+        self._events[record.event] = _KeptEvent(record.origin, path)
         self.last_event = max(self.last_event, record.event)
+
+    def _keep_counts(self, ensemble: Ensemble, collections: Collections) -> None:
+        counts = _RefusedFile(
+            ARCHIVE_SCHEMA,
+            dict(ensemble.refused),
+            collections.current,
+            collections.ended,
+            self._frame_id,
+        )
+        is_needed = ensemble.images or ensemble.refused or collections.ended
+        if counts == self._counts or not is_needed:
+            return
+        self._write(_ENSEMBLE, _REFUSED, json_object(counts), _counts)
+        self._counts = counts
 
     def _keep_image(self, image: StarObservations) -> None:
         number = self._next_image
@@ -325,39 +417,64 @@ class Archive:
         except BagError as error:
             raise ArchiveError(f'state_dir: image of {image.time_ns} ns: {error}') from error
         if stale is not None and is_same:  # read anew since it was written
-            self._images[image.time_ns] = _Kept(image, stale.path)
+            self._images[image.time_ns] = _KeptImage(image, stale.path)
             return
         mark = self._seal.mark(number, data)
         name = f'{number:08d}_{mark}.mcap' if mark else f'{number:08d}.mcap'
-        path = self._write(_ENSEMBLE, name, data)
-        self._images[image.time_ns] = _Kept(image, path)
+        path = self._write_file(_ENSEMBLE, name, data)
+        self._images[image.time_ns] = _KeptImage(image, path)
         self._next_image += 1
         if stale is not None:
             stale.path.unlink(missing_ok=True)
 
-    def _write(self, folder: str, name: str, content: str | bytes) -> Path:
+    def _write(
+        self,
+        folder: str,
+        name: str,
+        content: Mapping[str, object],
+        read: Callable[[Mapping[str, Any]], object],
+    ) -> Path:
+        """Write a sealed object that its reader takes; raises ArchiveError if it would not."""
+        text = self._seal.sealed(content)
+        try:
+            read(self._seal.opened(text.encode()))
+        except (ProductError, ValueError) as error:
+            words = f'state_dir: {name} not written, no start would read it: {error}'
+            raise ArchiveError(words) from error
+        return self._write_file(folder, name, text.encode())
+
+    def _write_file(self, folder: str, name: str, data: bytes) -> Path:
+        if len(data) > _MOST_BYTES:
+            raise ArchiveError(
+                f'state_dir: {name} not written, its {len(data)} bytes are more than a start '
+                f'reads, {_MOST_BYTES}; drop the images with ~/reset'
+            )
         path = self.folder / folder / name
         if not path.parent.is_dir():
             path.parent.mkdir()
             sync_folder(self.folder)
-        write_atomically(path, content)
+        write_atomically(path, data)
         return path
 
-    def _drop(self, images: set[int], events: set[int]) -> None:
-        for stamp in self._images.keys() - images:
+    def _drop(self, stamps: set[int], history: tuple[Activation, ...]) -> None:
+        for stamp in self._images.keys() - stamps:
             with contextlib.suppress(OSError):
                 self._images[stamp].path.unlink(missing_ok=True)
                 del self._images[stamp]
-        for event in self._events.keys() - events:
+        # An event whose file with another number is not written yet stays in the old file.
+        unwritten = {record.origin for record in history if record.event not in self._events}
+        for event in self._events.keys() - {record.event for record in history}:
+            if self._events[event].origin in unwritten:
+                continue
             with contextlib.suppress(OSError):
-                self._events[event].unlink(missing_ok=True)
+                self._events[event].path.unlink(missing_ok=True)
                 del self._events[event]
 
     def _empty(self) -> None:
         self._finish_emptying()
         (self.folder / _ENSEMBLE).rename(self.folder / _EMPTIED)
         self._images.clear()
-        self._refused = {}
+        self._counts = _RefusedFile(ARCHIVE_SCHEMA)
         sync_folder(self.folder)
         self._finish_emptying()
 
@@ -410,14 +527,10 @@ class Archive:
         try:
             data = _content(path)
             self._seal.check_mark(name[2] or '', int(name[1]), data)
-            image = observations_in_bag(data)
-        except (BagError, ValueError) as error:
+            return _image_of(data)
+        except ValueError as error:
             self._set_aside(path, str(error))
             return None
-        if image.refusal:
-            self._set_aside(path, f'{image.refusal}: {image.detail}')
-            return None
-        return image
 
     def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
         content = self._unsealed(path, product_files.SCHEMA)
@@ -428,32 +541,18 @@ class Archive:
             self.damage.append(f'{path}: of another version, skipped')
             return None
         try:
-            keys = read_record(_ActivationKeys, archive, 'archive')
-            calibration = product_files.calibration_from_content(path, content)
-            if (keys.event, calibration.number) != (event, number):
-                raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
-            if keys.before >= event:
-                raise ValueError(f'archive.before: {keys.before} is not before {event}')
+            return _activation(content, event, number)
         except (ProductError, ValueError) as error:
             self._set_aside(path, str(error))
             return None
-        return Activation(event, keys.before, calibration)
 
-    def _read_refused(self, path: Path) -> dict[str, int]:
+    def _read_counts(self, path: Path) -> _RefusedFile:
         content = self._unsealed(path, ARCHIVE_SCHEMA)
-        if content is None:
-            return {}
-        refused: dict[str, int] = {}
         try:
-            for name, count in read_record(_RefusedFile, content).refused.items():
-                reason = counted_refusal(name)
-                refused[reason] = refused.get(reason, 0) + count
-            if sum(refused.values()) > _MOST_COUNT:
-                raise ValueError(f'refused: more than {_MOST_COUNT} images')
+            return _RefusedFile(ARCHIVE_SCHEMA) if content is None else _counts(content)
         except ValueError as error:
             self._set_aside(path, str(error))
-            return {}
-        return refused
+            return _RefusedFile(ARCHIVE_SCHEMA)
 
     def _unsealed(self, path: Path, schema: int) -> Mapping[str, Any] | None:
         """The JSON object of a file with the right seals and this schema; else None."""
@@ -472,6 +571,42 @@ class Archive:
         with contextlib.suppress(OSError):  # on a read-only disk it is skipped where it is
             path.rename(aside)
         self.damage.append(f'{aside}: damaged, set aside: {" ".join(why.split())}')
+
+
+def _activation(content: Mapping[str, Any], event: int, number: int) -> Activation:
+    """The activation in the JSON object of its file; raises ProductError or ValueError."""
+    keys = read_record(_ActivationKeys, content['archive'], 'archive')
+    calibration = product_files.calibration_from_content(Path(_CALIBRATIONS), content)
+    if (keys.event, calibration.number) != (event, number):
+        raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
+    if keys.before >= event:
+        raise ValueError(f'archive.before: {keys.before} is not before {event}')
+    # A file of a version without origins: two events have a time in common only by chance.
+    origin = keys.origin or f'{event} at {calibration.active_since_ns}'
+    return Activation(event, keys.before, calibration, origin)
+
+
+def _counts(content: Mapping[str, Any]) -> _RefusedFile:
+    """The counts in the JSON object of their file, of reasons of this version."""
+    read = read_record(_RefusedFile, content)
+    refused: dict[str, int] = {}
+    for name, count in read.refused.items():
+        reason = counted_refusal(name)
+        refused[reason] = refused.get(reason, 0) + count
+    if sum(refused.values()) > _MOST_COUNT:
+        raise ValueError(f'refused: more than {_MOST_COUNT} images')
+    return replace(read, refused=refused)
+
+
+def _image_of(data: bytes) -> StarObservations:
+    """The image in the bytes of a file; raises ValueError for damage."""
+    try:
+        image = observations_in_bag(data)
+    except BagError as error:
+        raise ValueError(str(error)) from error
+    if image.refusal:
+        raise ValueError(f'{image.refusal}: {image.detail}')
+    return image
 
 
 def _content(path: Path) -> bytes:

@@ -33,6 +33,7 @@ from starcal_ros.formats.messages.record_messages import (
     camera_info_to_message,
     checked_observations,
     mountings_to_messages,
+    none_active_to_messages,
     status_to_message,
 )
 from starcal_ros.options import from_mapping
@@ -92,10 +93,17 @@ class Calibrator(node.StarcalNode):
         self._setup = load_setup(values)
         check_site(self._setup.site)
         self._state.open(self._setup, self._own)
+        if self._state.moved:
+            self.get_logger().info(self._state.moved)
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)
+        # Answers and verdicts are of today's parameters: the gate has judged what is stored anew.
+        self._last_answer, active = Answer(True, ''), self._state.active
+        self._last_gate = 'none'
         if self._state.withheld:
             self._last_gate = f'refused: {self._state.withheld[0]}'
+        elif active is not None:
+            self._note_gate(Answer(True, '', active))
         self._camera_info = self.publisher(CameraInfo, 'camera_info', LATCHED)
         self._alignment = self.publisher(TransformStamped, 'alignment', LATCHED)
         self._calibration = self.publisher(CalibrationMessage, 'calibration', LATCHED)
@@ -264,7 +272,7 @@ class Calibrator(node.StarcalNode):
         return self._publish_and_answer(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
-        return self._publish_and_answer(self._state.rollback(), response)
+        return self._publish_and_answer(self._note_gate(self._state.rollback()), response)
 
     def _on_lookup(self, request: Any, response: Any) -> Any:
         active = self._state.active
@@ -313,11 +321,21 @@ class Calibrator(node.StarcalNode):
         return response
 
     def _publish_active(self) -> None:
-        """Publish the active calibration."""
+        """Publish the active calibration, or that none is: an earlier one is withdrawn."""
         # Two requests may activate one each: of all publishers the last is of the later one.
         with self._publishing:
             calibration = self._state.active_on_disk
             if calibration is None:
+                frames = self._setup.frames
+                none, camera_info, alignment = none_active_to_messages(
+                    self._setup.prior.camera,
+                    (frames.star_tracker_frame, frames.camera_frame),
+                    self._state.withheld,
+                    node.make_message,
+                )
+                self._camera_info.publish(camera_info)
+                self._alignment.publish(alignment)
+                self._calibration.publish(none)
                 return
             camera_info = camera_info_to_message(calibration, node.make_message)
             alignment = alignment_to_message(calibration, node.make_message)

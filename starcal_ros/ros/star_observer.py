@@ -80,11 +80,12 @@ class StarObserver(StarcalNode):
             )
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
+        self._withdrawn = ''  # why the prior predicts the stars where a calibration did
         self._observations = self.publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
         self._annotated = self.publisher(ImageMessage, 'annotated_image', QoSProfile(depth=2))
-        self._camera_info: Any = None  # of the active calibration, header of the last image
+        self._camera_info: Any = None  # the latched one, header of the last image
         self._camera_infos = self.publisher(
             CameraInfo, 'image_camera_info', QoSProfile(depth=_IMAGES)
         )
@@ -169,6 +170,8 @@ class StarObserver(StarcalNode):
             'listeners': self._observations.get_subscription_count(),
             **{f'refused_{reason}': counts.get(reason, 0) for reason in sorted(IMAGE_REFUSALS)},
         }
+        if self._withdrawn:
+            return WARN, self._withdrawn, numbers
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
         if why_not := [tracker.why for tracker in unfit.values() if tracker.why]:
@@ -203,7 +206,7 @@ class StarObserver(StarcalNode):
         self._queue.put(time_ns, width, height, raw)
 
     def _publish_camera_info(self, message: Any) -> None:
-        """Publish the active calibration with the header of an image message."""
+        """Publish the latched camera, once there is one, with the header of an image message."""
         camera_info = self._camera_info
         if camera_info is None:
             return
@@ -245,7 +248,10 @@ class StarObserver(StarcalNode):
         self._temperatures.append(sensor_messages.temperature_from_message(message))
 
     def _on_calibration(self, message: Any) -> None:
-        calibration = record_messages.calibration_from_message(message)
+        calibration = record_messages.active_from_message(message)
+        if calibration is None:
+            self._withdraw(message)
+            return
         if not (calibration.accepted or calibration.forced):
             raise ValueError('calibration: refused by the gate')
         geometry = calibration.geometry
@@ -253,11 +259,33 @@ class StarObserver(StarcalNode):
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: image size differs from the prior camera')
         self._camera_info = record_messages.camera_info_to_message(calibration, make_message)
+        self._withdrawn = ''
         self._in_worker(self._predict_with, geometry, calibration.number)
 
-    def _predict_with(self, geometry: CameraGeometry, number: int) -> None:
-        self._geometry, self._calibration_number = geometry, number
-        self.get_logger().info('predicting stars with the active calibration')
+    def _withdraw(self, message: Any) -> None:
+        """Predict with the prior, and send a camera that is not calibrated with each image."""
+        was_calibrated = self._camera_info is not None and self._camera_info.k[0] != 0
+        if reasons := record_messages.why_none_is_active(message):
+            self._withdrawn = f'no calibration is active, the prior predicts the stars: {reasons}'
+        elif was_calibrated:
+            self._withdrawn = 'the calibration was withdrawn, the prior predicts the stars'
+        frames = self._setup.frames
+        _, self._camera_info, _ = record_messages.none_active_to_messages(
+            self._setup.prior.camera,
+            (frames.star_tracker_frame, frames.camera_frame),
+            (),
+            make_message,
+        )
+        if was_calibrated:
+            self._in_worker(self._predict_with, None, 0)
+
+    def _predict_with(self, geometry: CameraGeometry | None, number: int) -> None:
+        """Predict with a calibration; None: with the prior."""
+        self._geometry, self._calibration_number = geometry or self._setup.prior, number
+        if self._withdrawn:
+            self.get_logger().warning(self._withdrawn)
+        else:
+            self.get_logger().info('predicting stars with the active calibration')
         self._measure_again()
 
     def _in_worker(self, function: Callable[..., None], *arguments: Any) -> None:

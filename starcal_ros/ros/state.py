@@ -12,14 +12,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ros import errors, records
-from starcal_ros.assessment.gate import judge, reasons_of, REMEDIES, requirement_answers
+from starcal_ros.assessment.gate import (
+    judge,
+    reasons_of,
+    REMEDIES,
+    requirement_answers,
+    REQUIREMENTS,
+)
+from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method
+from starcal_ros.ros.joining import Collections, HISTORY, joined, Kept
 
 if TYPE_CHECKING:
     from starcal_ros.ros.archive import Archive
-
-_HISTORY = 20  # activations kept for roll-back, under 1 MB each
 
 
 @dataclass(frozen=True)
@@ -54,68 +60,100 @@ class CalibratorState:
         self._now_ns = now_ns
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
-        self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibration
+        self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibrations
+        self.moved = ''  # what became of the records in memory when the folder was opened
         # Guards the fields below; never held during a solve.  Activations change only with both
         # locks held, `_disk` first.
         self._records = threading.Lock()
         self._ensemble = records.Ensemble()
+        self._collections = Collections()
         self._details: dict[str, str] = {}  # of the last image refused for each reason
         self._history: tuple[records.Activation, ...] = ()
         self._active: records.Activation | None = None  # of the history
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
-        self._on_disk: tuple[object, ...] = ()  # ensemble and history last written
+        self._camera: tuple[int, int, str] = (0, 0, '')  # that the records in memory are of
+        self._on_disk = Kept()  # last written
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:
         """
-        Read the state folder; without one, continue with the records in memory.
+        Join the records in memory with those of the state folder; without one, continue with them.
 
-        So too where they are not on disk: activations, resets and images since the folder was last
-        written.  Images of another size are set aside and counted.
+        The later activation is active, and nothing is dropped but by `reset`: images of another
+        size in the folder are set aside and counted. Records in memory of another camera stay in
+        their folder; where they are in none, they raise OptionError, as does a folder of another
+        camera. Raises ArchiveError when the folder, or its key, cannot be used. Memory and folder
+        are then as before.
 
         The last calibration is judged by the gate with the present setup before it is active.
         Where it is refused, the one that a roll-back would return to is judged, and so on; refused
-        ones stay on record. Raises ArchiveError when the folder cannot be used. Raises OptionError
-        when all its records are of another camera, or the key cannot be read.
+        ones stay on record.
         """
         archive = _archive_of(setup, options) if options.state_dir else None
         with self._disk, self._records:
-            ensemble, history = self._ensemble, self._history
-            is_on_disk = self._on_disk == (ensemble, history)  # the same records
             try:
+                memory, moved = self._memory_of(setup)
+                kept = memory
                 if archive is not None:
-                    read = archive.read_ensemble(), archive.read_history()
-                    if is_on_disk or self._folder != options.state_dir:
-                        ensemble, history = read
-                    _check_size(options.state_dir, ensemble, history, setup)
-                ensemble = _of_size(ensemble, archive, setup)
-                ensemble = solving.within_limit(ensemble, setup)
+                    folder = Kept(
+                        archive.read_ensemble(), archive.read_history(), archive.collections
+                    )
+                    _check_camera(options.state_dir, folder, archive, memory, setup)
+                    folder = replace(folder, ensemble=_of_size(folder.ensemble, archive, setup))
+                    kept = joined(folder, memory, archive.last_event)
+                    if memory:
+                        moved = f'{memory} in memory joined {folder} of {options.state_dir}'
+                if not kept.collections.current or (memory and self._folder != options.state_dir):
+                    kept = replace(kept, collections=kept.collections.begun())
+                ensemble = solving.within_limit(kept.ensemble, setup)
             except Exception:
                 if archive is not None:
                     archive.close()
                 raise
             self._setup, self._folder, self._archive = setup, options.state_dir, archive
-            self._ensemble, self._history = ensemble, history
-            self._choose_active()
+            self._camera = _camera_of(setup)
+            self._ensemble, self._history = ensemble, kept.history
+            self._collections, self.moved = kept.collections, moved
+            self._active, self.withheld = self._accepted_from(
+                self._history[-1].event if self._history else 0
+            )
             self.damage = tuple(archive.damage) if archive else ()
         self.save()
 
-    def _choose_active(self) -> None:
-        """Take the last calibration that the gate of today accepts, and record why not others."""
+    def _memory_of(self, setup: Setup) -> tuple[Kept, str]:
+        """Return the records in memory that are of the camera of a setup, and where others are."""
+        memory = Kept(self._ensemble, self._history, self._collections)
+        if self._camera == _camera_of(setup):
+            return memory, ''
+        nothing = Kept(collections=replace(self._collections, current=()))
+        if not memory:
+            return nothing, ''
+        width, height, frame = self._camera
+        of_camera = f'{memory} are of a camera of {width} x {height} in {frame}'
+        if self._folder and memory == self._on_disk:
+            return nothing, f'{of_camera}: they stay in {self._folder}'
+        raise errors.OptionError(
+            f'camera_info_url, camera_frame: {of_camera}, and not on disk: configure with that '
+            'camera and a state_dir that can be written, or start the node again without them'
+        )
+
+    def _accepted_from(self, event: int) -> tuple[records.Activation | None, tuple[str, ...]]:
+        """
+        The last activation at or before an event that the gate of today accepts.
+
+        With a sentence for each that it refuses.
+        """
         by_event = {record.event: record for record in self._history}
-        record = self._history[-1] if self._history else None
-        withheld = []
-        while record is not None:
-            refusals = refusals_today(record.calibration, self._setup)
-            if not refusals:
-                break
-            withheld.append(
-                f'calibration {record.calibration.number} is not active, the gate refuses it '
-                f'now: {"; ".join(refusals)}'
+        record = by_event.get(event)
+        refused = []
+        while record is not None and (why := refusals_today(record.calibration, self._setup)):
+            number = record.calibration.number
+            refused.append(
+                f'calibration {number} is not active, the gate refuses it now: {"; ".join(why)}'
             )
             record = by_event.get(record.before) if record.before < record.event else None
-        self._active, self.withheld = record, tuple(withheld)
+        return record, tuple(refused)
 
     def close(self) -> None:
         """Write what is not on disk, release the state folder; safe to call twice."""
@@ -164,7 +202,7 @@ class CalibratorState:
         """Empty the ensemble."""
         with self._records:
             images = len(self._ensemble.images)
-            self._ensemble = records.Ensemble()
+            self._ensemble, self._collections = records.Ensemble(), self._collections.reset()
             self._details.clear()
         self.save()
         return self._answer(f'{images} images dropped; the active calibration stays')
@@ -184,7 +222,12 @@ class CalibratorState:
         dry_run: bool = False,
         force: bool = False,
     ) -> Answer:
-        """Solve, and activate a calibration that the gate accepts, or any with ``force``."""
+        """
+        Solve, and activate a calibration that the gate accepts, or any with ``force``.
+
+        It is judged against the calibration that is active then, which another request may have
+        changed during the solve.
+        """
         with self._records:
             ensemble, setup = self._ensemble, self._setup
         try:
@@ -194,22 +237,21 @@ class CalibratorState:
             return Answer(False, f'{error}{self._why_refused(ensemble.refused)}')
         except errors.StarcalError as error:
             return Answer(False, str(error))
-        if not calibration.accepted and not force:
-            refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
-            return Answer(False, refused, calibration)
-        if not calibration.accepted:
-            why = (*calibration.reasons, 'activated by request despite the gate')
-            calibration = replace(calibration, reasons=why, forced=True)
-        if dry_run:
-            return Answer(True, f'would be activated: {summary(calibration)}', calibration)
         with self._disk:
-            # The gate has judged it with that setup, and with no other.
-            if self._setup is not setup or (self._folder and self._archive is None):
+            # Its images and limits are of that setup, and of no other.
+            if self._setup is not setup or self._is_cleaned_up:
                 return Answer(False, 'not activated: the node was cleaned up meanwhile')
-            before = self._active.event if self._active else 0
-            calibration = self._activate(self._next_event(), before, calibration)
-        message = self._answer(f'activated: {summary(calibration)}').message
-        return Answer(True, message, calibration, True)
+            calibration = solving.judged(calibration, ensemble, asked, self.active)
+            if not calibration.accepted and not force:
+                refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
+                return Answer(False, refused, calibration)
+            if not calibration.accepted:
+                why = (*calibration.reasons, 'activated by request despite the gate')
+                calibration = replace(calibration, reasons=why, forced=True)
+            if dry_run:
+                return Answer(True, f'would be activated: {summary(calibration)}', calibration)
+            before = self._history[-1].event if self._history else 0
+            return self._activate(self._next_event(), before, calibration, 'activated')
 
     def _why_refused(self, refused: Mapping[str, int]) -> str:
         """Return the most frequent refusal, its last detail and the remedy; empty if none."""
@@ -225,27 +267,25 @@ class CalibratorState:
         return f'; {refused[reason]} images refused as {reason}: {"; ".join(filter(None, words))}'
 
     def rollback(self) -> Answer:
-        """Activate the calibration before the active one again."""
+        """Activate the last calibration before the active one that the gate of today accepts."""
         with self._disk:
-            if self._folder and self._archive is None:
+            if self._is_cleaned_up:
                 return Answer(False, 'not activated: the node was cleaned up meanwhile')
             if self._active is None:
                 return Answer(False, 'no calibration is active')
             wanted = self._active.before
-            earlier = [record for record in self._history if record.event == wanted]
-            if not earlier:
+            earlier, refused = self._accepted_from(wanted)
+            if earlier is None:
                 kept = ' on record' if wanted else ''
-                return Answer(False, f'there is no calibration before the active one{kept}')
-            before = earlier[0].calibration
-            refusals = refusals_today(before, self._setup)
-            if refusals:
-                return Answer(
-                    False,
-                    f'calibration {before.number} is refused by the gate: {"; ".join(refusals)}',
-                )
-            calibration = self._activate(before.number, earlier[0].before, before)
-        answer = self._answer(f'activated again: {summary(calibration)}')
-        return replace(answer, calibration=calibration, active=True)
+                missing = f'there is no calibration before the active one{kept}'
+                return Answer(False, '; '.join(refused) or missing)
+            answer = self._activate(
+                earlier.calibration.number,
+                earlier.before,
+                earlier.calibration,
+                'activated again',
+            )
+        return replace(answer, message='; '.join((answer.message, *refused)))
 
     def save(self) -> None:
         """Write the records to disk; returns at once where they are there."""
@@ -256,10 +296,10 @@ class CalibratorState:
         if self._archive is None:
             return
         with self._records:
-            ensemble, history = self._ensemble, self._history
+            kept = Kept(self._ensemble, self._history, self._collections)
         try:
-            self._archive.keep(ensemble, history)
-            self._on_disk, self.trouble = (ensemble, history), ''
+            self._archive.keep(kept.ensemble, kept.history, kept.collections)
+            self._on_disk, self.trouble = kept, ''
         except errors.ArchiveError as error:
             self.trouble = str(error)
         except Exception as error:  # whatever it is, the records are not on disk
@@ -274,17 +314,27 @@ class CalibratorState:
         last = self._history[-1].event if self._history else 0
         return 1 + max(last, self._archive.last_event if self._archive else 0)
 
+    @property
+    def _is_cleaned_up(self) -> bool:
+        return bool(self._folder) and self._archive is None
+
     def _activate(
-        self, number: int, before: int, calibration: records.Calibration
-    ) -> records.Calibration:
+        self, number: int, before: int, calibration: records.Calibration, done: str
+    ) -> Answer:
         """Activate a calibration from now on, and save it before anyone else can activate one."""
         active = replace(calibration, number=number, active_since_ns=self._now_ns())
+        try:
+            product_files.check_readable(active)
+        except errors.ProductError as error:
+            why = f'not activated, nobody could read it: {error}; check the ROS clock'
+            return Answer(False, why)
         record = records.Activation(self._next_event(), before, active)
         with self._records:
-            self._history = (*self._history, record)[-_HISTORY:]
+            self._history = (*self._history, record)[-HISTORY:]
             self._active, self.withheld = record, ()
         self._save()
-        return active
+        answer = self._answer(f'{done}: {summary(active)}')
+        return replace(answer, calibration=active, active=True)
 
     def _answer(self, message: str) -> Answer:
         unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''
@@ -313,8 +363,13 @@ def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str,
         return (f'the gate cannot judge it: {type(error).__name__}: {error}',)
     overridden = set()
     if calibration.forced:
-        overridden = {check.name for check in calibration.gate if check.passed is False}
-    return reasons_of(check for check in checks if check.name not in overridden)
+        overridden = {_limit_of(check) for check in calibration.gate if check.passed is False}
+    return reasons_of(check for check in checks if _limit_of(check) not in overridden)
+
+
+def _limit_of(check: records.GateCheck) -> str:
+    """Name of the limit: a change from the active calibration then is one from the prior now."""
+    return check.name if check.option in ('', REQUIREMENTS) else check.option
 
 
 def summary(calibration: records.Calibration) -> str:
@@ -326,19 +381,33 @@ def summary(calibration: records.Calibration) -> str:
     return '; '.join([fit, *requirement_answers(calibration)])
 
 
-def _check_size(
-    folder: str, ensemble: records.Ensemble, history: tuple[records.Activation, ...], setup: Setup
+def _camera_of(setup: Setup) -> tuple[int, int, str]:
+    """Size and frame: cameras with one sensor differ by their frame."""
+    camera = setup.prior.camera
+    return camera.width, camera.height, setup.frames.camera_frame
+
+
+def _check_camera(
+    state_dir: str, folder: Kept, archive: Archive, memory: Kept, setup: Setup
 ) -> None:
-    """Raise OptionError where every record of a folder is of another camera."""
+    """Raise OptionError where a folder is of another camera than the setup or the memory."""
     prior = setup.prior.camera
-    cameras = [record.calibration.geometry.camera for record in history]
+    cameras = [record.calibration.geometry.camera for record in folder.history]
     sizes = {(one.width, one.height) for one in cameras}
-    sizes |= {(one.width, one.height) for one in ensemble.images}
+    sizes |= {(one.width, one.height) for one in folder.ensemble.images}
     if sizes and (prior.width, prior.height) not in sizes:
         width, height = min(sizes)
         raise errors.OptionError(
-            f'state_dir: {folder} is of a camera of {width} x {height}, '
-            f'the prior camera has {prior.width} x {prior.height}'
+            f'state_dir: {state_dir} is of a camera of {width} x {height}, '
+            f'the prior camera has {prior.width} x {prior.height}: choose another folder'
+        )
+    # A folder alone may be of a frame that has another name since.
+    frame, known = setup.frames.camera_frame, set(folder.collections.current)
+    is_related = not known.isdisjoint(memory.collections.current)
+    if memory and folder and archive.camera_frame not in ('', frame) and not is_related:
+        raise errors.OptionError(
+            f'state_dir: {state_dir} is of the camera {archive.camera_frame}, {memory} in memory '
+            f'are of {frame}: choose another folder'
         )
 
 

@@ -22,6 +22,7 @@ from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline.setup import CalibratorOptions
 from starcal_ros.records import Activation, Ensemble
 from starcal_ros.ros.archive import Archive, CHECKSUMS, Seal
+from starcal_ros.ros.joining import Collections
 from starcal_ros.ros.state import CalibratorState
 
 pytestmark = pytest.mark.slow
@@ -35,7 +36,8 @@ def write_state(folder: Path, seal: Seal) -> Path:
     first = dataclasses.replace(calibration(), number=1, active_since_ns=10**9)
     history = (Activation(1, 0, first), Activation(2, 1, dataclasses.replace(first, number=2)))
     with contextlib.closing(Archive(folder, 'camera', seal)) as archive:
-        archive.keep(Ensemble(observations()[:2], {'no_stars': 1}), history)
+        ensemble = Ensemble(observations()[:2], {'no_stars': 1})
+        archive.keep(ensemble, history, Collections().begun())
     return folder
 
 

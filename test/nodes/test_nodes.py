@@ -237,15 +237,15 @@ def test_gate_refusal_and_force(
     assert not solved.success and solved.calibration.stars_used > 0
     assert solved.calibration.reasons and not solved.calibration.accepted
     client.until(lambda: 'refused by the gate' in client.health('calibrator')[1])
-    assert not found
+    assert [one.number for one in found] == [0]  # that none is active
     candidate = client.latched(Calibration, 'candidate_calibration')
     client.until(lambda: candidate)
     assert candidate[0].reasons and candidate[0].number == 0
     forced = client.call(Calibrate, '/calibrator/solve', force=True)
     assert forced.success and not forced.calibration.accepted
-    client.until(lambda: found)
-    assert found[0].reasons[-1] == 'activated by request despite the gate'
-    assert found[0].forced and found[0].number == 1
+    client.until(lambda: found[1:])
+    assert found[1].reasons[-1] == 'activated by request despite the gate'
+    assert found[1].forced and found[1].number == 1
     client.until(lambda: 'active despite the gate' in client.health('calibrator')[1])
     assert calibrator.process.poll() is None
 
@@ -507,7 +507,11 @@ def test_without_images_nothing_is_active_and_a_bad_message_ends_nothing(
     assert str(client.until_images(0).min_images) in answer.message
     rollback = client.call(Trigger, '/calibrator/rollback')
     assert not rollback.success and rollback.message == 'no calibration is active'
-    assert latched == [[], [], []]
+    client.until(lambda: all(latched))
+    ((info,), (alignment,), (none,)) = latched
+    rotation = alignment.transform.rotation
+    assert not info.k.any() and (rotation.x, rotation.w) == (0.0, 0.0)
+    assert (none.number, none.camera.width, none.reasons) == (0, 0, [])
     observations = client.publisher(StarObservations, 'observations')
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
     refused = refused_image(5, 8, 8, 'no_stars', '')

@@ -117,7 +117,7 @@ def test_history_is_bounded(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr('starcal_ros.ros.state._HISTORY', 2)
+    monkeypatch.setattr('starcal_ros.ros.state.HISTORY', 2)
     state = started(setup, tmp_path)
     for image in shown:
         state.add(image)
@@ -374,15 +374,6 @@ def test_an_image_that_comes_with_a_restart_is_added_to_those_on_disk(
     state.close()
 
 
-def test_images_of_another_camera_do_not_stay_in_memory(
-    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
-    state = filled(setup, shown[:3])
-    state.close()
-    state.open(load(tmp_path, 'small'), CalibratorOptions())
-    assert state.ensemble.images == () and dict(state.ensemble.refused) == {'wrong_size': 3}
-
-
 def test_a_folder_of_another_camera_is_refused(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
@@ -506,7 +497,7 @@ def test_a_reset_keeps_what_was_set_aside(
     state.reset()
     state.close()
     left = sorted(path.name for path in (tmp_path / 'ensemble').iterdir())
-    assert left == ['00000002.mcap.damaged', 'notes.txt']
+    assert left == ['00000002.mcap.damaged', 'notes.txt', 'refused.json']
 
 
 def test_one_image_of_another_size_is_set_aside(
@@ -529,12 +520,15 @@ def test_without_the_key_nothing_is_believed(
     filled(setup, shown[:2], tmp_path / 'state').close()
     options = CalibratorOptions(state_dir=str(tmp_path / 'state'), state_key_file=str(key))
     state = CalibratorState(itertools.count(1).__next__)
-    state.open(setup, options)
-    assert len(state.ensemble.images) == 0
-    assert all('the HMAC is missing' in text for text in state.damage) and len(state.damage) == 2
-    state.add(shown[0])
+    with pytest.raises(ArchiveError, match='2 are sound: give the key that they were written'):
+        state.open(setup, options)
+    state = filled(setup, shown[2:3])
+    state.open(setup, CalibratorOptions(str(tmp_path / 'other'), state_key_file=str(key)))
     state.close()
+    for path in (tmp_path / 'state' / 'ensemble').glob('*.mcap'):
+        path.rename(tmp_path / 'other' / 'ensemble' / f'0000000{int(path.stem) + 1}.mcap')
     state = CalibratorState(itertools.count(1).__next__)
-    state.open(setup, options)
-    assert len(state.ensemble.images) == 1 and state.damage == ()
+    state.open(setup, CalibratorOptions(str(tmp_path / 'other'), state_key_file=str(key)))
+    assert [image.time_ns for image in state.ensemble.images] == [shown[2].time_ns]
+    assert all('the HMAC is missing' in text for text in state.damage) and len(state.damage) == 2
     state.close()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Annotated, Any
@@ -183,6 +184,43 @@ def calibration_from_message(message: codec.Message) -> Calibration:
     calibration = read_record(Calibration, {**values, **nested})
     check_calibration(calibration)
     return calibration
+
+
+def none_active_to_messages(
+    prior: CameraModel, frames: tuple[str, str], reasons: Sequence[str], make: codec.Make
+) -> tuple[codec.Message, codec.Message, codec.Message]:
+    """
+    The messages that withdraw a calibration: starcal/Calibration, CameraInfo, TransformStamped.
+
+    The first has ``reasons`` and no camera, the second K of zeros, ROS's word for a camera that is
+    not calibrated, the third a rotation of zeros. ``frames`` are star tracker and camera.
+    """
+    parent_frame, child_frame = frames
+    header = codec.make_header(0, child_frame, make)
+    return (
+        make(codec.CALIBRATION_TYPE, header=header, reasons=list(reasons)),
+        make(codec.CAMERA_INFO_TYPE, header=header, height=prior.height, width=prior.width),
+        make(
+            codec.ALIGNMENT_TYPE,
+            header=codec.make_header(0, parent_frame, make),
+            child_frame_id=child_frame,
+            transform=make(
+                'geometry_msgs/msg/Transform',
+                rotation=codec.quaternion_to_message(np.zeros(4), make),
+            ),
+        ),
+    )
+
+
+def why_none_is_active(message: codec.Message) -> str:
+    """The reasons of a message that no calibration is active, in one line; empty without any."""
+    return '; '.join(message.reasons)[:_LONGEST_DETAIL]
+
+
+def active_from_message(message: codec.Message) -> Calibration | None:
+    """The calibration of a message on ``calibration``; None where it says that none is active."""
+    is_none = message.number == 0 and message.camera.width == 0
+    return None if is_none else calibration_from_message(message)
 
 
 def camera_info_fields(camera: CameraModel) -> dict[str, Any]:

@@ -114,6 +114,12 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
     write_atomically(path, calibration_text(calibration))
 
 
+def check_readable(calibration: Calibration) -> None:
+    """Raise ProductError where `read_calibration` would refuse the file of a calibration."""
+    content = untrusted.json_value(calibration_text(calibration))
+    calibration_from_content(Path(CALIBRATION_FILE), content)
+
+
 def calibration_text(calibration: Calibration) -> str:
     """Content of ``calibration.json``."""
     return f'{_text(calibration_content(calibration))}\n'

@@ -32,6 +32,10 @@ def test_nothing_received_is_said() -> None:
     text = shown(Received())
     for words in ('no image since', 'no status received', 'none active', 'no diagnostics'):
         assert words in text
+    why_none = 'calibration 1 is not active, the gate refuses it now'
+    assert f'none active: the prior is in use: {why_none}'[:60] in shown(
+        Received(why_none=why_none)
+    )
 
 
 def test_images_are_counted_by_reason() -> None:

@@ -1,0 +1,137 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A calibration that is not active any more: what is latched, and what its consumers do."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+    from starcal_ros.records import Ensemble
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from geometry_msgs.msg import TransformStamped
+from node_inputs import IMAGES, in_this_process, parameters, REMAPS  # type: ignore[import-not-found]
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration
+from starcal_ground.bags import reader
+from starcal_ground.ros.monitor_client import Monitor
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
+from starcal_ros.records import Activation
+from starcal_ros.records import Ensemble as EnsembleRecord
+from starcal_ros.ros.archive import Archive
+from starcal_ros.ros.calibrator import Calibrator
+
+pytestmark = pytest.mark.nodes
+
+# How the heir of a calibrator differs, and why it has no active calibration.
+HEIRS = {
+    'stricter limits': (
+        ('max_change_px:=1e-6',),
+        'state',
+        'calibration 1 is not active, the gate',
+    ),
+    'an empty folder': ((), 'empty', ''),
+    'memory alone': ((), '', ''),
+}
+
+
+@pytest.mark.parametrize('name', HEIRS)
+def test_consumers_return_to_the_prior(
+    name: str, client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """The star observer, the camera of each image, and the monitor; and back to a calibration."""
+    values, folder, why = HEIRS[name]
+    stored = read_calibration(tiny_products / CALIBRATION_FILE)
+    stored = dataclasses.replace(stored, number=1, active_since_ns=1)
+    with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
+        archive.keep(EnsembleRecord(), (Activation(1, 0, stored),))
+    start_node('star_observer', ros=(*parameters(tiny_bag, 'attitude_timeout_s:=0.0'), *REMAPS))
+    ros = parameters(tiny_bag, f'state_dir:={tmp_path}/state')
+    first = start_node('calibrator', ros=ros)
+    client.until_value('calibration', '1')
+    infos: list[Any] = client.collect(CameraInfo, 'image_camera_info')
+    images = client.publisher(Image, IMAGES)
+    image = next(reader.read_raw([tiny_bag], [IMAGES])).data
+    client.until(lambda: (images.publish(image), infos)[1])
+    assert infos[-1].k[0] > 0
+
+    monitor = Monitor(client._context)
+    client._executor.add_node(monitor)
+    client.until(lambda: monitor.received.active is not None)
+    first.stop()
+    place = f'state_dir:={tmp_path}/{folder}' if folder else 'state_dir:=""'
+    heir = start_node(
+        'calibrator', ros=(*parameters(tiny_bag, place, *values), '-r', '__node:=heir')
+    )
+    client.until_value('calibration', 'prior')
+    client.until(lambda: client.health()[0] == b'\x01')
+    assert 'the prior predicts the stars' in client.health()[1] and why in client.health()[1]
+    client.until(lambda: monitor.received.active is None)
+    assert why in monitor.received.why_none
+    client._executor.remove_node(monitor)
+    monitor.destroy_node()
+    client.until(lambda: (images.publish(image), infos[-1].k[0] == 0)[1])
+    assert not infos[-1].k.any() and infos[-1].width == stored.geometry.camera.width
+    assert infos[-1].header.frame_id != ''
+
+    # A late subscriber is told so too.
+    calibrations = client.latched(Calibration, 'calibration')
+    cameras = client.latched(CameraInfo, 'camera_info')
+    alignments = client.latched(TransformStamped, 'alignment')
+    client.until(lambda: calibrations and cameras and alignments)
+    (none,) = calibrations
+    assert (none.number, none.accepted, none.camera.width) == (0, False, 0)
+    assert [why in reason for reason in none.reasons] == [True] * bool(why)
+    assert not cameras[0].k.any() and not cameras[0].d
+    rotation = alignments[0].transform.rotation
+    assert (rotation.x, rotation.y, rotation.z, rotation.w) == (0.0, 0.0, 0.0, 0.0)
+
+    heir.stop()
+    start_node('calibrator', ros=(*ros, '-r', '__node:=third'))
+    client.until_value('calibration', '1')
+    client.until(lambda: 'the prior predicts the stars' not in client.health()[1])
+
+
+def test_diagnostics_are_of_the_limits_of_today(
+    client: Client, tiny_bag: Path, tiny_observations: Ensemble
+) -> None:
+    """Cleaned up, configured with a tighter limit, and back, in one process."""
+    with in_this_process(Calibrator, tiny_bag) as node:
+        for image in tiny_observations.images:
+            node._state.add(image)
+        assert node._on_calibrate(None, Trigger.Response()).success
+        latched: list[Any] = client.latched(CameraInfo, 'camera_info')
+
+        def configure(max_change_px: float) -> dict[str, object]:
+            node.trigger_deactivate()
+            node.trigger_cleanup()
+            parameter = Parameter('max_change_px', Parameter.Type.DOUBLE, max_change_px)
+            assert node.set_parameters([parameter])[0].successful
+            node.trigger_configure()
+            node.trigger_activate()
+            return dict(node.health()[2])
+
+        strict = configure(1e-6)
+        assert strict['active'] == 'none' and str(strict['last_gate']).startswith('refused: calib')
+        client.until(lambda: latched and latched[-1].k[0] == 0)
+        assert not node._on_calibrate(None, Trigger.Response()).success
+        relaxed = configure(10.0)
+        assert (relaxed['active'], relaxed['last_gate'], relaxed['last_answer']) == (
+            1,
+            'accepted',
+            '',
+        )
+        client.until(lambda: latched[-1].k[0] > 0)

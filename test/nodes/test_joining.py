@@ -1,0 +1,352 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Memory and state folders joined: what is kept, what is active, and what cannot be joined."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import dataclasses
+import itertools
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from attacks import observations  # type: ignore[import-not-found]
+from calibrators import Calibrators, kept  # type: ignore[import-not-found]
+from kept_state import activation  # type: ignore[import-not-found]
+import pytest
+
+from starcal_ros.errors import StarcalError
+from starcal_ros.files import replacing
+from starcal_ros.records import Activation
+from starcal_ros.ros.joining import joined, Kept
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calibrators]:
+    made = Calibrators(tmp_path, monkeypatch)
+    with made.is_full:
+        yield made
+    made.close_all()
+
+
+# What P1 holds after the steps: images, and calibrations from the active one back in time.
+JOINS = {
+    # A disk fails, and another one takes its place.
+    'full A, B': ('open A; full; images 0 1 2; activate a; close; room; open B', '0 1 2', 'a'),
+    'full A, full B': ('open A; full; images 0 1; activate a; open B; room', '0 1', 'a'),
+    'A, full A, A': (
+        'open A; images 0; activate a; full; images 1; activate b; close; room; open A',
+        '0 1',
+        'b a',
+    ),
+    'A, full A, B': (
+        'open A; images 0; activate a; full; images 1; activate b; close; room; open B',
+        '0 1',
+        'b a',
+    ),
+    'A, full A, memory, B': (
+        'open A; images 0; full; images 1; activate a; open -; images 2; room; open B',
+        '0 1 2',
+        'a',
+    ),
+    # With and without a folder.
+    'memory, A': ('open -; images 0 1; activate m; open A', '0 1', 'm'),
+    'A, memory, A': (
+        'open A; images 0; activate a; open -; images 1; activate m; open A',
+        '0 1',
+        'm a',
+    ),
+    'A, B, A': (
+        'open A; images 0; activate a; open B; images 1; activate b; open A; images 2',
+        '0 1 2',
+        'b a',
+    ),
+    'A, memory, B, A': (
+        'open A; images 0; open -; images 1; activate m; open B; activate b; open A',
+        '0 1',
+        'b m',
+    ),
+    # A folder with records of its own: the later activation is active.
+    'earlier A and memory': (
+        ('P2 open A; P2 images 0 1; P2 activate a; P2 close; '
+         'open -; images 1 2; activate m; open A'),
+        '0 1 2',
+        'm a',
+    ),
+    'later A and memory': (
+        ('open -; images 0 1; activate m; '
+         'P2 open A; P2 images 1 2; P2 activate a; P2 close; open A'),
+        '1 2 0',
+        'a m',
+    ),
+    'between the events of A': (
+        ('P2 open A; P2 activate a; open -; activate m; P2 activate b; P2 rollback; P2 close; '
+         'open A'),
+        '',
+        'a',
+    ),
+    'A between the events of memory': (
+        'open -; activate m; P2 open A; P2 activate a; P2 close; activate n; open A',
+        '',
+        'n m',
+    ),
+    'a copy of A': (
+        'open A; images 0 1; activate a; activate b; close; copy A B; open B; images 2; open A',
+        '0 1 2',
+        'b a',
+    ),
+    'A and its copy went on': (
+        ('P2 open A; P2 images 0; P2 activate a; P2 close; copy A B; '
+         'P2 open A; P2 images 1; P2 activate b; P2 close; open B; images 2; activate c; open A'),
+        '0 1 2',
+        'c a',
+    ),
+    # Files of the folder are gone or damaged: the memory has their records.
+    'damaged image': ('open A; images 0 1; close; cut A/ensemble/*1.mcap; open A', '1 0', ''),
+    'damaged event': (
+        'open A; activate a; activate b; close; cut A/calibrations/*2.json; open A',
+        '',
+        'b a',
+    ),
+    'removed folder': ('open A; images 0 1; activate a; close; remove A; open A', '0 1', 'a'),
+    # A reset is an event of the images: they do not come back from anywhere.
+    'reset on full A, A': (
+        'open A; images 0 1; activate a; full; reset; images 2; close; room; open A',
+        '2',
+        'a',
+    ),
+    'reset on full A, B': ('open A; images 0 1; full; reset; images 2; room; open B', '2', ''),
+    'reset on full A, B, A': (
+        'open A; images 0 1; full; reset; images 2; close; room; open B; open A',
+        '2',
+        '',
+    ),
+    'reset in memory, A': ('open A; images 0 1; open -; reset; images 2; open A', '2', ''),
+    'reset in B, A': ('open A; images 0 1; open B; reset; open A', '', ''),
+    'reset in B, restart, B, A': (
+        'open A; images 0 1; open B; reset; kill; open B; open A',
+        '',
+        '',
+    ),
+    'reset in memory, B of another': (
+        'P2 open B; P2 images 0 1; P2 close; open -; images 2; reset; images 3; open B',
+        '0 1 3',
+        '',
+    ),
+    'reset of A by another': (
+        'open A; images 0 1; close; P2 open A; P2 reset; P2 images 2; P2 close; open A',
+        '2',
+        '',
+    ),
+    'images of a reset come again': (
+        'open A; images 0 1; full; reset; images 1 0 2; close; room; open A',
+        '1 0 2',
+        '',
+    ),
+    'images of a reset come again to A': (
+        'open A; images 0 1; open B; reset; P2 open A; P2 reset; P2 images 0; P2 close; open A',
+        '0',
+        '',
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', JOINS)
+def test_nothing_is_dropped_but_by_a_reset(name: str, calibrators: Calibrators) -> None:
+    """It is so in memory, and after a restart from the folder alone."""
+    steps, images, names = JOINS[name]
+    state = calibrators.run(steps)
+    folder = steps.split('open ')[-1].split(';')[0]
+    state.save()
+    assert state.trouble == ''
+    calibrators.run(f'kill; open {folder}')
+    assert kept(calibrators.states['P1']) == (images, names)
+    numbers = [record.calibration.number for record in calibrators.states['P1']._history]
+    of_name = {r.calibration.weakest_direction: r.calibration.number for r in state._history}
+    assert set(numbers) == set(of_name.values())  # two calibrations never have one number
+
+
+def test_another_image_of_a_stamp_is_counted(calibrators: Calibrators) -> None:
+    """The image of the folder stays, as the first of a stamp does, and counts of both are kept."""
+    state = calibrators.run('P2 open A; P2 images 0 1; P2 close; open -; images 2')
+    first = observations()[0]
+    state.add(dataclasses.replace(first, measured_px=first.measured_px + 0.25))
+    for refusal in ('glare', 'no_stars'):
+        state.add(dataclasses.replace(first, refusal=refusal))
+    calibrators.run('P2 open A')
+    calibrators.states['P2'].add(dataclasses.replace(first, refusal='glare'))
+    calibrators.run('P2 close; open A; open -; open A')
+    assert kept(state) == ('0 1 2', '')
+    assert state.ensemble.images[0].measured_px.tolist() == first.measured_px.tolist()
+    assert dict(state.ensemble.refused) == {'duplicate': 1, 'glare': 2, 'no_stars': 1}
+
+
+def test_the_limit_of_images_holds(calibrators: Calibrators) -> None:
+    few = dataclasses.replace(calibrators.setup.calibration, max_images=4)
+    calibrators.setup = dataclasses.replace(calibrators.setup, calibration=few)
+    state = calibrators.run('P2 open A; P2 images 0 1 2 3; P2 close; open -; images 4 5 6; open A')
+    assert len(state.ensemble.images) == state.status().images_saved == 4
+
+
+def of_frame(calibrators: Calibrators, frame: str) -> None:
+    """Configure another camera with the same sensor from now on."""
+    frames = dataclasses.replace(calibrators.setup.frames, camera_frame=frame)
+    calibrators.setup = dataclasses.replace(calibrators.setup, frames=frames)
+
+
+# Steps, what is changed then, where P1 opens, what it says, and what P1 and A hold as before.
+UNJOINED: dict[str, tuple[str, str, str, str]] = {
+    'in memory of another camera': (
+        'open -; images 0 1; activate m',
+        'navcam_2',
+        'A',
+        r'2 images and 1 activation are of a camera of .* in camera, and not on disk: configure',
+    ),
+    'not saved of another camera': (
+        'open A; images 0; full; images 1; activate m; close; room',
+        'navcam_2',
+        '-',
+        'and not on disk: configure with that camera and a state_dir that can be written',
+    ),
+    'a folder of another camera': (
+        'P2 open A; P2 images 2; P2 close; open -; images 0 1; activate m',
+        'navcam_1',
+        'A',
+        r'A is of the camera navcam_1, 2 images and 1 activation in memory are of .*: choose',
+    ),
+    'in use': (
+        'P2 open A; open -; images 0 1; activate m',
+        '',
+        'A',
+        'in use by another calibrator',
+    ),
+    'another key': (
+        'P2 open A; P2 images 2; P2 activate a; P2 close; open -; images 0 1; activate m',
+        'key',
+        'A',
+        'no file of .*A has an HMAC of state_key_file, but 2 are sound: give the key',
+    ),
+}
+
+
+@pytest.mark.parametrize('name', UNJOINED)
+def test_what_cannot_be_joined_stops_the_transition(name: str, calibrators: Calibrators) -> None:
+    """One sentence with the remedy; memory and folder are as before."""
+    steps, change, place, words = UNJOINED[name]
+    first = calibrators.setup
+    if change == 'navcam_1':  # it has written the folder
+        of_frame(calibrators, change)
+        calibrators.run(steps.split('; open')[0])
+        calibrators.setup, steps = first, f'open{steps.split("; open")[1]}'
+    state = calibrators.run(steps)
+    files = sorted(path.name for path in calibrators.disk.glob('A/*/*'))
+    options: dict[str, Any] = {}
+    if change == 'key':
+        options['state_key_file'] = str(calibrators.disk / 'key')
+        (calibrators.disk / 'key').write_bytes(b'sixteen bytes...')
+    elif change == 'navcam_2':
+        of_frame(calibrators, change)
+    with pytest.raises(StarcalError, match=words) as error:
+        calibrators.open('P1', place, **options)
+    assert len(str(error.value).replace(str(calibrators.disk), '')) < 300
+    assert sorted(path.name for path in calibrators.disk.glob('A/*/*')) == files
+    calibrators.setup = first
+    calibrators.open('P1', 'B')
+    assert kept(state) == ('0 1', 'm')
+
+
+def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators: Calibrators) -> None:
+    """Its records stay in its folder, and are not mixed with those of the other."""
+    first = calibrators.setup
+    state = calibrators.run('open A; images 0 1; activate a')
+    of_frame(calibrators, 'navcam_2')
+    calibrators.open('P1', 'B')
+    assert state.moved.endswith(f'they stay in {calibrators.disk / "A"}')
+    assert kept(state) == ('', '')
+    calibrators.run('images 2; close')
+    calibrators.setup = first
+    calibrators.open('P1', 'A')
+    assert kept(state) == ('0 1', 'a')
+
+
+def test_a_disk_that_fails_at_any_write_of_a_join(
+    calibrators: Calibrators, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing of the folder is lost, and the later activation of those on disk is active."""
+    calibrators.run('open A; images 0 1; activate a; kill')
+    for writes in itertools.count():
+        left = itertools.chain([None] * writes, itertools.repeat(OSError(5, 'broken')))
+
+        def fails_then(path: Path, data: bytes, left: Iterator[Any] = left) -> None:
+            if error := next(left):
+                raise error
+            with replacing(path) as file:
+                file.write(data)
+
+        place = f'copy{writes}'
+        # The event of the memory comes between those of the folder, and takes their numbers.
+        calibrators.run(f'copy A {place}; open -; images 2; activate m')
+        calibrators.run(f'P2 open {place}; P2 images 3; P2 activate c; P2 kill')
+        with monkeypatch.context() as patch:
+            patch.setattr('starcal_ros.ros.archive.write_atomically', fails_then)
+            is_whole = calibrators.run(f'open {place}').trouble == ''
+            calibrators.run('kill')
+        state = calibrators.run(f'open {place}')
+        history = [record.calibration.weakest_direction for record in state._history]
+        assert kept(state) == ('0 1 3 2' if is_whole else '0 1 3', 'c a')
+        calibrators.run('kill')
+        if is_whole:
+            assert history == ['a', 'm', 'c']
+            break
+    assert writes >= 3  # two events, the collections and an image
+
+
+def grown(
+    history: tuple[Activation, ...], random: Random, clock: list[int]
+) -> tuple[Activation, ...]:
+    """A history with some more activations and roll-backs, by a clock that may be set back."""
+    for _ in range(random.randrange(5)):
+        clock[0] = max(0, clock[0] + random.choice([1, 1, 1, 0, -3]))
+        event = history[-1].event + 1 if history else 1
+        number, before = event, history[-1].event if history else 0
+        back = [record for record in history if record.event == history[-1].before]
+        if back and random.random() < 0.3:
+            number, before = back[0].calibration.number, back[0].before
+        record = activation(event, before, number)
+        timed = dataclasses.replace(record.calibration, active_since_ns=clock[0])
+        named = dataclasses.replace(timed, weakest_direction=f'{random.random()}')
+        if number != event:
+            named = dataclasses.replace(back[0].calibration, active_since_ns=clock[0])
+        history = (*history, dataclasses.replace(record, calibration=named))
+    return history
+
+
+def test_any_histories_are_joined() -> None:
+    """
+    Of three places with common and different events, in any order and joined again.
+
+    Each event is there once, in order, a number names one calibration, and no file of the folder
+    changes under the same event.
+    """
+    for seed in range(300):
+        random, clock = Random(seed), [0]
+        common = grown((), random, clock)
+        folder, memory = grown(common, random, clock), grown(common, random, clock)
+        for _ in range(3):
+            last_event = max((record.event for record in folder), default=0)
+            both = joined(Kept(history=folder), Kept(history=memory), last_event).history
+            events = [record.event for record in both]
+            assert events == sorted(set(events))
+            assert all(record.before < record.event for record in both)
+            origins = [record.origin for record in both]
+            assert sorted(origins) == sorted({record.origin for record in (*folder, *memory)})
+            names = {(r.calibration.number, r.calibration.weakest_direction) for r in both}
+            assert len(names) == len(dict(names))
+            of_event = {record.event: record for record in both}
+            for record in folder:
+                found = of_event.get(record.event)
+                assert found is None or found == record or found.origin != record.origin
+            start = random.choice([(), memory, folder])
+            folder, memory = grown(start, random, clock), both
