@@ -22,6 +22,7 @@ from starcal_ground.images import from_stars as by_stars
 from starcal_ground.images import photographs as image_files
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ros.camera import CameraModel
+from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
@@ -32,7 +33,7 @@ from starcal_ros.pipeline.campaign import calibrate, chosen, observe, Source
 from starcal_ros.pipeline.diagnosis.bags import refusals
 from starcal_ros.pipeline.setup import load_setup, option_groups
 from starcal_ros.pipeline.solve import inputs_of
-from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
+from starcal_ros.pipeline.topics import choose_image_topic, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import re
 
-from starcal_ros.constants import utc_text
+from starcal_ros.constants import CLOCKS_SET_NS, utc_text
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import Frame, read_frames
@@ -21,7 +21,6 @@ _OF_A_STAR_TRACKER = (
     *('prior_alignment', 'star_tracker_sigma_arcsec', 'star_tracker_slow_arcsec'),
     'more_star_trackers',
 )
-CLOCKS_SET_NS = 631_152_000_000_000_000  # 1990-01-01
 _LIKE_ATTITUDES = re.compile('Odometry|Pose|TFMessage|Transform|Quaternion|Attitude|Orientation')
 _CAMERA_ALONE = 'starcal calibrate --camera-alone estimates the camera without an alignment'
 
