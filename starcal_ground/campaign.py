@@ -165,7 +165,7 @@ def _measured_again(
     attempt keeps its first observations.
     """
     source, before = observed.source, observed.measured
-    failed = {check.option for check in calibration.gate if not check.passed}
+    failed = {check.option for check in calibration.gate if check.passed is False}
     lacks_stars = bool(failed) and failed <= _FOR_WANT_OF_STARS
     if not (calibration.accepted or lacks_stars):
         return before, ''

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,6 +27,7 @@ from starcal_ros.records import (
     SigmaPart,
     StarObservations,
     StarTrackerAlignment,
+    StatementCheck,
     TemperatureTerms,
 )
 
@@ -149,7 +151,11 @@ def model_checks() -> ModelChecks:
     return ModelChecks(
         field_rms_px=0.009,
         field_worst_px=0.02,
-        held=(HeldTerm('cx', 647.5, 648.25, 1.5), HeldTerm('k3', 0.01, 0.02, 0.04)),
+        held=(
+            HeldTerm('cx', 647.5, 648.25, 1.5),
+            HeldTerm('k3', 0.01, 0.02, 0.04, evidence=-1.5),
+            HeldTerm('stamp_offset_s', 0.0, math.nan, math.nan),
+        ),
         step=DetectorStep('u', 512.5, 'v', -0.015, 0.7),
         image_variation_px=0.03,
         amplitudes=(
@@ -159,6 +165,10 @@ def model_checks() -> ModelChecks:
         predictions=(
             ResidualBin('radius', 3.5, 320.25, 140, 1.02, 0.04),
             ResidualBin('magnitude', 1.5, 4.5, 137, 0.97, 0.043),
+        ),
+        statements=(
+            StatementCheck('velocity', True, 'the velocity is 7.6 km/s from that of the Earth'),
+            StatementCheck('clock', None, 'a reason'),
         ),
     )
 

@@ -11,7 +11,7 @@ import re
 from starcal_ground.bags import reader
 from starcal_ground.bags.frames import Frame, read_frames
 from starcal_ground.bags.reader import Topics as Topics
-from starcal_ros.constants import utc_text
+from starcal_ros.constants import CLOCKS_SET_NS, utc_text
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
@@ -23,7 +23,6 @@ _OF_A_STAR_TRACKER = (
     *('prior_alignment', 'star_tracker_sigma_arcsec', 'star_tracker_slow_arcsec'),
     'more_star_trackers',
 )
-CLOCKS_SET_NS = 631_152_000_000_000_000  # 1990-01-01
 _LIKE_ATTITUDES = re.compile('Odometry|Pose|TFMessage|Transform|Quaternion|Attitude|Orientation')
 _CAMERA_ALONE = 'starcal calibrate --camera-alone estimates the camera without an alignment'
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
-from starcal_ground.bags.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
+from starcal_ground.bags.topics import choose_image_topic, stated_tracker, Topics
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.images import FEWEST_SOURCES
 from starcal_ground.campaign import calibrate, chosen, observe, Source
@@ -30,6 +30,7 @@ from starcal_ground.images import photographs as image_files
 from starcal_ground.images import stated as stated_facts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ros.camera import CameraModel
+from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info

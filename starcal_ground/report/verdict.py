@@ -76,8 +76,13 @@ def checks_sentence(gate: Sequence[records.GateCheck]) -> str:
         return ''
     counts = [(name, sum(check.passed is key for check in gate)) for key, name in _RESULTS.items()]
     text = ', '.join(f'{count} {name}' for name, count in counts if count or name == 'passed')
-    reasons = dict.fromkeys(check.note for check in gate if check.passed is None and check.note)
-    why = f' ({"; ".join(reasons)})' if reasons else ''
+    reasons: dict[str, list[str]] = {}
+    for check in gate:
+        if check.passed is None and check.note:
+            name = check.name.removesuffix(' as stated').removesuffix(' from its assumed value')
+            reasons.setdefault(check.note, []).append(name.removeprefix('distance of '))
+    texts = [f'{", ".join(names)}: {note}' for note, names in reasons.items()]
+    why = f' ({"; ".join(texts)})' if texts else ''
     return f'Checks: {text}{why}.'
 
 

@@ -43,6 +43,7 @@ _PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX = 5.0, 0.01
 _PRIOR_ROTATION = 13.0  # of the limit on the rotation: 1.5 degrees, and 5 degrees in roll
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
+_NOT_BY_STARS = 'the stars alone do not determine it'
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
 
 
@@ -336,13 +337,21 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     """Contradictions between the stars and the model with its priors, each with the remedy."""
     if found is None:
         return
+    for one in found.statements:
+        name = f'{one.name} as stated'
+        yield GateCheck(name, '', math.nan, math.nan, '', one.passed, one.note)
+    held = [_held_check(term, options) for term in found.held]
+    wrong = [one.name for one in found.statements if one.passed is False]
+    # A distance that the evidence does not decide on may be the cause all the same.
+    wrong += [t.name for t in found.held if t.distance > options.max_held_term_sigma]
+    remedy = REMEDIES['change from image to image']
     yield limit_check(
         options,
         'max_image_variation_px',
         'change of the camera from image to image in a corner',
         found.image_variation_px,
         'px',
-        REMEDIES['change from image to image'],
+        f'a wrong {wrong[0]} looks like it: first correct that' if wrong else remedy,
     )
     step = found.step
     yield _significant(
@@ -355,17 +364,22 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         REMEDIES['detector step'],
         _STEP_P_VALUE,
     )
-    for term in found.held:
-        check = limit_check(
-            options,
-            'max_held_term_sigma',
-            f'distance of {term.name} from its assumed value',
-            term.significance,
-            'sigma',
-        )
-        note, remedy = of_held(term)
-        note = note if check.passed else f'{note}; {remedy}'
-        yield dataclasses.replace(check, note=note)
+    yield from held
+
+
+def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
+    """The distance of an assumed value from that by the stars, if they determine it."""
+    check = limit_check(
+        options,
+        'max_held_term_sigma',
+        f'distance of {term.name} from its assumed value',
+        term.significance,
+        'sigma',
+    )
+    if math.isnan(term.significance):
+        return dataclasses.replace(check, passed=None, note=_NOT_BY_STARS)
+    note, remedy = of_held(term)
+    return dataclasses.replace(check, note=note if check.passed else f'{note}; {remedy}')
 
 
 def of_held(term: HeldTerm) -> tuple[str, str]:

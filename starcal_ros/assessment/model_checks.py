@@ -20,7 +20,7 @@ from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
-from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
+from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 from starcal_ros.sky.astrometry import SIDEREAL_RAD_S
 
 _STATED = ('camera', 'mountings', 'velocity', 'site', 'readout', 'stamps')  # entries with a prior
@@ -28,14 +28,14 @@ _AS_STATED = {  # label -> name and unit of what an operator states
     'latitude_rad': ('latitude_deg', math.degrees(1.0)),
     'sidereal_time_1_rad': ('clock_offset_min', 1.0 / (60.0 * SIDEREAL_RAD_S)),
 }
-_CLEAR_SIGMA = 5.0  # from a prior; as a ratio of evidence e^12.5
+_CLEAR_SIGMA = 5.0  # from a prior, beyond which the evidence is asked: the default of the gate
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for
 _STRIP = 1 / 24  # of the width: a quarter of the shortest wave of the field
 
 
-def model_checks(estimate: Estimate) -> ModelChecks:
-    """Return what the stars of an estimate show of the model that it assumes."""
+def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:
+    """Return what the stars of an estimate show of the model that it assumes, and statements."""
     camera = estimate.geometry.camera
     rms_px, worst_px = _field_px(camera)
     return ModelChecks(
@@ -46,6 +46,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
         step=detector_step(estimate),
         image_variation_px=_image_variation_px(estimate),
         predictions=predictions(estimate),
+        statements=statements,
     )
 
 
@@ -108,7 +109,8 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     A held parameter is tested by its estimate with it free, an unknown with a prior by that
     without the prior: what contradicts it moves other unknowns, first the field and the shapes of
     the images, and hardly its own.  Free unknowns also fit what is of the lens: more than
-    `_CLEAR_SIGMA` counts only where the data are likelier without the prior, too.
+    `_CLEAR_SIGMA` counts where the data are as much likelier without the prior, and otherwise as
+    much as they are.  What the stars alone do not determine is listed too, with NaN.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
@@ -116,10 +118,9 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     for k in np.setdiff1d(camera, found.estimated):
         own = int(k - camera[0])
         means, variances, _ = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
-        if np.isfinite(variances[own]):
-            held = float(estimate.linear.state.parameters[own])
-            sigma = math.sqrt(variances[own])
-            terms.append(HeldTerm(layout.labels[k], held, held + float(means[own]), sigma))
+        held, shown = float(estimate.linear.state.parameters[own]), _or_nan(variances[own])
+        by_stars = held + float(means[own]) + 0.0 * shown
+        terms.append(HeldTerm(layout.labels[k], held, by_stars, math.sqrt(shown)))
     total, working = np.diag(found.covariance), np.diag(found.working)
     first = layout.places['mountings'].start if 'mountings' in layout else layout.count
     for entry in layout.shared:
@@ -131,17 +132,15 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         means, variances, log_evidence = without_prior(
             estimate.sums, estimate.linear, entry.name, found
         )
-        is_clear = log_evidence - found.log_evidence > 0.5 * _CLEAR_SIGMA**2
+        gained = log_evidence - found.log_evidence
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
-            if not np.isfinite(variance):
-                continue
-            off = float(layout.prior_offset[k] + mean)
+            shown = _or_nan(variance)
+            off = float(layout.prior_offset[k] + mean) + 0.0 * shown
             # Errors that observations share are in both variances.
             prior2 = min(1.0 / layout.prior_precision[k], entry.usual**2)
-            apart2 = prior2 + variance * total[k] / working[k]
-            if not is_clear and math.isinf(entry.usual):
-                # Below the default limit by more than rounding.
-                apart2 = max(apart2, (off / (0.99 * _CLEAR_SIGMA)) ** 2)
+            sigma = math.sqrt(prior2 + shown * total[k] / working[k])
+            is_far = math.isinf(entry.usual) and abs(off) > _CLEAR_SIGMA * sigma
+            evidence = gained if is_far and not gained > 0.5 * _CLEAR_SIGMA**2 else math.nan
             # What is not in the state is zero there, so far from its prior mean.
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
             if k in camera:
@@ -151,8 +150,13 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             if 1 <= head < len(estimate.star_trackers):
                 frame = estimate.star_trackers[head].frame
                 name, unit = f'mounting of {frame} {name[-1]}_deg', math.degrees(1.0)
-            terms.append(HeldTerm(name, prior, prior + unit * off, unit * math.sqrt(apart2)))
+            terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma, evidence))
     return tuple(terms)
+
+
+def _or_nan(variance: float) -> float:
+    """Return a variance; NaN where it is infinite."""
+    return float(variance) if math.isfinite(variance) else math.nan
 
 
 def detector_step(estimate: Estimate) -> DetectorStep:

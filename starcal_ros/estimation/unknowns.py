@@ -37,7 +37,12 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
 from starcal_ros.camera.lens import LENSES
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
+from starcal_ros.constants import (
+    ARCSECOND_RAD,
+    FASTEST_M_S,
+    NANOSECONDS_PER_SECOND,
+    SPEED_OF_LIGHT_M_S,
+)
 from starcal_ros.estimation.amplitudes import UNSTATED
 from starcal_ros.estimation.problem import (
     image_alignment,
@@ -71,7 +76,6 @@ _DECENTRING = ('p1', 'p2')  # of the lens models that have them
 _TREND = 1e-4  # of the focal length, rms over the images: a lens that warms by some degrees
 _SCALE_BY_COLOUR = 3e-4  # of the focal length, per mag of BP - RP: 0.5 px in a corner, blue to red
 _NO_TURN_RAD = 1e-8  # within an image: 2 milliarcseconds
-_FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
 FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
 _SHOWN = 1e-2  # least singular value over the largest: none that only a border shows
 
@@ -386,7 +390,7 @@ def unknowns_of(
                 np.full(3, assumed.velocity_m_s),
                 np.zeros(3),
                 turn=functools.partial(_by_velocity, state.camera_from_icrf.as_matrix()),
-                widest=_FASTEST_M_S,
+                widest=FASTEST_M_S,
                 usual=assumed.usual_m_s,
             )
         )

@@ -24,6 +24,7 @@ from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.predictions import Residuals, residuals_of
+from starcal_ros.assessment.stated import check_statements, with_doubts
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert, ros_fit
@@ -185,7 +186,8 @@ def judged(
 
 
 def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
-    """The estimate with the lens model that was asked for."""
+    """The estimate with the lens model that was asked for, with doubts about the velocity."""
+    ensemble = with_doubts(ensemble, setup.catalog)
     is_same = {image.catalog_digest for image in ensemble.images} == {setup.catalog.digest}
     colours_of = setup.catalog.colours_bp_rp if is_same else None
     given = ensemble, setup.prior, setup.calibration, colours_of
@@ -245,7 +247,9 @@ def _not_judged(
             dataclasses.replace(tracker, frame=tracker.frame or setup.frames.star_tracker_frame)
             for tracker in result.star_trackers
         ),
-        model_checks=model_checks(result),
+        model_checks=model_checks(
+            result, check_statements(ensemble, setup.calibration, setup.catalog)
+        ),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=budget,
         statements=statements(budget, result, setup.calibration),

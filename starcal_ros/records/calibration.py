@@ -210,7 +210,10 @@ class HeldTerm:
     An unknown that is held or has a stated prior, with its estimate from the stars.
 
     ``assumed`` is the held or prior value, ``estimated`` that from the stars; ``sigma`` is the
-    1-sigma of their difference if the assumption is true.
+    1-sigma of their difference if the assumption is true.  Both are NaN where the stars alone do
+    not determine it.  ``evidence`` is the log evidence of the data without the prior less that
+    with it: free unknowns also fit errors of the lens, which do not contradict a prior that
+    explains the data nearly as well.  It is NaN where the distance alone counts.
 
     >>> round(HeldTerm('cx', assumed=319.5, estimated=320.1, sigma=0.3).significance, 6)
     2.0
@@ -220,11 +223,40 @@ class HeldTerm:
     assumed: float
     estimated: float
     sigma: float
+    evidence: float = math.nan
+
+    @property
+    def distance(self) -> float:
+        """The difference over its sigma; NaN where it was not checked."""
+        return abs(self.estimated - self.assumed) / self.sigma
 
     @property
     def significance(self) -> float:
-        """The difference in sigmas."""
-        return abs(self.estimated - self.assumed) / self.sigma
+        """
+        The difference in sigmas, as far as the evidence allows; NaN where it was not checked.
+
+        Where the evidence counts, twice its log is the square of as many sigmas.
+        """
+        if math.isnan(self.evidence):
+            return self.distance
+        return min(self.distance, math.sqrt(max(2.0 * self.evidence, 0.0)))
+
+
+@dataclass(frozen=True)
+class StatementCheck:
+    """
+    A check of a statement that needs no stars.
+
+    ``passed`` is None where nothing else shows the stated value; ``note`` has what was compared,
+    or why nothing was, and the remedy.
+
+    >>> StatementCheck('velocity', True, 'the velocity is 7.61 km/s from that of the Earth').passed
+    True
+    """
+
+    name: str
+    passed: bool | None
+    note: str
 
 
 @dataclass(frozen=True)
@@ -288,7 +320,7 @@ class ModelChecks:
     ``field_rms_px`` and ``field_worst_px`` are RMS per axis and largest length of the residual
     field over the detector.  ``image_variation_px`` is the 1-sigma change of the camera between
     images at a corner, included in the covariance.  ``predictions`` are empty with fewer than four
-    images.
+    images; ``statements`` are the checks that need no stars.
 
     >>> import starcal_ros
     >>> checks = starcal_ros.read_calibration('out').model_checks
@@ -305,6 +337,7 @@ class ModelChecks:
     image_variation_px: float
     amplitudes: tuple[Amplitude, ...] = ()
     predictions: tuple[ResidualBin, ...] = ()
+    statements: tuple[StatementCheck, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -15,6 +15,7 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, QuaternionStamped, TransformStamped, TwistStamped
+import numpy as np
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, Temperature
 from sensor_msgs.msg import Image as ImageMessage
@@ -38,6 +39,7 @@ from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waitin
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
 from starcal_ros.sky.attitude import attitude_sample
+from starcal_ros.sky.velocity import doubt_of
 from starcal_ros.text import counted
 
 NAME = 'star_observer'
@@ -46,6 +48,7 @@ _IMAGE_TYPES = (ImageMessage, CompressedImage)
 _IMAGES = 20  # that wait with their pixels: 200 MB of 5 megapixels and 16 bit
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
+_COMPARED = 8  # velocities with that of the Earth: 1 ms, once a second
 _STAMP_NS = operator.itemgetter(0)
 _DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
 _HISTORY_S = 3600.0  # of attitudes: 2 MB at 10 Hz; images come later only from a recorder
@@ -111,7 +114,7 @@ class StarObserver(StarcalNode):
         self._counts: Counter[str] = Counter()
         self._restarts = self._retried = self._retried_used = 0
         self._last_refusal = self._bad_velocity = ''
-        self._velocities_left_out = 0
+        self._velocities_left_out, self._doubts_velocity = 0, False
         self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
             _IMAGES, self._own.attitude_timeout_s, self._star_trackers.has_come
@@ -176,8 +179,8 @@ class StarObserver(StarcalNode):
             return WARN, f'last image refused: {self._last_refusal}', numbers
         if why_not := [tracker.why for tracker in unfit.values() if tracker.why]:
             return WARN, '; '.join(why_not), numbers
-        if self._bad_velocity:
-            return WARN, self._bad_velocity, numbers
+        if bad_velocity := self._bad_velocity or self._doubt_of_velocity():
+            return WARN, bad_velocity, numbers
         if not counts:
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers
@@ -243,6 +246,22 @@ class StarObserver(StarcalNode):
             self._velocities_left_out += 1
             if self._velocities_left_out == 1:  # the diagnostics count the others
                 self.get_logger().warning(self._bad_velocity)
+
+    def _doubt_of_velocity(self) -> str:
+        """Return the mistake that the velocities show, logged once; empty if they show none."""
+        kept = [one for one in list(self._velocities) if one[0] >= 0]  # UTC begins in 1960
+        if not kept or self._setup.site.observer == 'ground':
+            return ''
+        some = kept[:: -(-len(kept) // _COMPARED)]
+        doubt = doubt_of([time_ns for time_ns, _ in some], np.array([one for _, one in some]))
+        is_stated = self._setup.calibration.velocity_sigma_m_s >= 0
+        if doubt is None or (is_stated and not doubt.is_certain):
+            return ''
+        text = f'the velocity {"is" if doubt.is_certain else "may be"} {doubt.mistake}'
+        if not self._doubts_velocity:
+            self._doubts_velocity = True
+            self.get_logger().warning(text)
+        return text
 
     def _on_temperature(self, message: Any) -> None:
         self._temperatures.append(sensor_messages.temperature_from_message(message))

@@ -20,7 +20,13 @@ import erfa
 import numpy as np
 
 from starcal_ros.arrays import Floats, Rows
-from starcal_ros.constants import ARCSECOND_RAD, AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
+from starcal_ros.constants import (
+    ARCSECOND_RAD,
+    AU_M,
+    FASTEST_M_S,
+    NANOSECONDS_PER_SECOND,
+    SPEED_OF_LIGHT_M_S,
+)
 from starcal_ros.options import option
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -65,8 +71,8 @@ class SiteOptions:
         (0.0, 0.0, 0.0),
         'barycentric velocity of the observer along the ICRF axes, m/s, used without a velocity'
         " message; zeros: the Earth's velocity, with the uncertainty of an orbit",
-        low=-1e6,
-        high=1e6,
+        low=-FASTEST_M_S,
+        high=FASTEST_M_S,
         length=3,
     )
     # The air at the site, constant in flight: ten degrees change a refraction of 60 arcsec by
@@ -103,7 +109,7 @@ EARTH = Velocity()
 GIVEN_SIGMA_M_S = 10.0
 # In an orbit about the Earth a velocity is less than this about the Earth, and more about the
 # barycentre.
-_ESCAPE_M_S = 11.2e3
+ESCAPE_M_S = 11.2e3
 
 
 def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
@@ -118,7 +124,7 @@ def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
         measured_m_s = np.array(site.observer_velocity_m_s)
     if measured_m_s is None:
         return EARTH
-    is_slow = np.linalg.norm(measured_m_s) < _ESCAPE_M_S
+    is_slow = np.linalg.norm(measured_m_s) < ESCAPE_M_S
     return Velocity(measured_m_s, math.nan if is_slow else GIVEN_SIGMA_M_S)
 
 

@@ -193,14 +193,25 @@ class StarCatalog:
         sigma_mas = np.hypot(place_mas, motion_mas * (jyear - epoch))
         return np.asarray(1e-3 * ARCSECOND_RAD * sigma_mas)
 
+    @cached_property
+    def _order(self) -> Indices:
+        """Rows (n,) in the order of the identifiers."""
+        return np.argsort(self.id)
+
+    def rows_of(self, identifiers: Indices) -> tuple[Indices, Mask]:
+        """Rows (n,) of stars by identifier, and a mask (n,) of those in the catalog."""
+        if len(self) == 0:
+            return np.zeros(len(identifiers), np.int64), np.zeros(len(identifiers), np.bool_)
+        place = np.searchsorted(self.id, identifiers, sorter=self._order)
+        rows = self._order[np.minimum(place, len(self) - 1)]
+        return rows, np.asarray(self.id[rows] == identifiers)
+
     def colours_bp_rp(self, identifiers: Indices) -> Floats:
         """BP - RP (n,) of stars by identifier; NaN for an unknown star or colour."""
-        if len(self) == 0:
-            return np.full(len(identifiers), np.nan)
-        order = np.argsort(self.id)
-        place = np.searchsorted(self.id, identifiers, sorter=order)
-        row = order[np.minimum(place, len(self) - 1)]
-        return np.where(self.id[row] == identifiers, self.colour_bp_rp[row], np.nan)
+        rows, known = self.rows_of(identifiers)
+        colours = np.full(len(identifiers), np.nan)
+        colours[known] = self.colour_bp_rp[rows[known]]
+        return colours
 
 
 def column_digest(columns: Mapping[str, AnyArray]) -> str:

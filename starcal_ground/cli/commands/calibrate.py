@@ -147,6 +147,7 @@ def answer_of(
     return {
         **{name: getattr(calibration, name) for name in _ANSWERED},
         'requirements': [check for check in calibration.gate if check.option == REQUIREMENTS],
+        'not_checked': [check for check in calibration.gate if check.passed is None],
         'lens_model': calibration.geometry.camera.model,
         'found': made.notes,
         'assumed': dict(first.assumed(source.topics, made.ensemble)),

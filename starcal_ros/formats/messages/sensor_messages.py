@@ -18,6 +18,7 @@ import numpy as np
 
 from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.camera import MAX_SIDE_PX
+from starcal_ros.constants import FASTEST_M_S
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, LEAST_DEGC, MOST_DEGC, refused_image, StarObservations
@@ -47,8 +48,6 @@ _JPEG_MOST_SEGMENTS = 1000
 _PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 T = TypeVar('T')
 _STAMP_NS = operator.itemgetter(0)
-# The Earth moves at 3e4 m/s; a value beyond this limit would displace all stars.
-_MAX_VELOCITY_M_S = 1e6
 
 
 def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Image:
@@ -400,9 +399,10 @@ def velocity_from_message(message: codec.Message) -> tuple[int, Floats]:
     """
     linear = message.twist.linear
     velocity_m_s = np.array([linear.x, linear.y, linear.z], np.float64)
-    if not float(np.abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
+    if not float(np.linalg.norm(velocity_m_s)) < FASTEST_M_S:
         raise ValueError(
-            f'velocity {velocity_m_s.tolist()} m/s is not plausible for a spacecraft: left out'
+            f'velocity {velocity_m_s.tolist()} m/s is faster than any spacecraft: left out; send'
+            ' m/s'
         )
     return codec.stamp_ns(message.header.stamp), velocity_m_s
 

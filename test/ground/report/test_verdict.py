@@ -24,7 +24,7 @@ GATE = (
 
 
 def test_checks_that_were_not_made_did_not_pass() -> None:
-    sentence = 'Checks: 1 failed, 2 passed, 2 not checked (no calibration was active).'
+    sentence = 'Checks: 1 failed, 2 passed, 2 not checked (step, turn: no calibration was active).'
     assert verdict.checks_sentence(GATE) == sentence
     assert verdict.checks_sentence(GATE[:1]) == 'Checks: 1 passed.'
     assert verdict.checks_sentence(()) == ''

@@ -365,8 +365,8 @@ def test_every_limit_has_its_check() -> None:
     """With the limit as the option has it."""
     tracker = dataclasses.replace(GOOD.star_trackers[0], drift_arcsec=1.0, drift_p_value=0.5)
     found = checks(dataclasses.replace(GOOD, star_trackers=(tracker,)), GateOptions())
-    assert all(check.passed for check in found.values())
-    assert len(found) <= 12
+    assert not any(check.passed is False for check in found.values())
+    assert len([name for name in found if not name.endswith(' as stated')]) <= 12
     limited = {name for name in found if found[name].option}
     assert len(limited & {*PAIR}) == 1  # the one with the larger share of its limit is a row
     assert limited | {*PAIR} == names_of(GateOptions) | {'min_images'}

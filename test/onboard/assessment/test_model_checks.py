@@ -220,7 +220,7 @@ def test_a_lens_that_warms_is_no_velocity(sigma_m_s: float) -> None:
     sigma_px = float(covariance[trend, trend][0]) ** 0.5
     true_px = scales.std() * found.geometry.camera.parameters[0]
     assert abs(mean[trend][0] - true_px) < 3.0 * sigma_px < true_px  # shown, and to 3 sigma
-    assert all(term.significance < 4.5 for term in model_checks(found).held)
+    assert not any(term.significance >= 4.5 for term in model_checks(found).held)
 
 
 def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
@@ -233,8 +233,8 @@ def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
     found = estimated(
         given, Ensemble(tuple(images)), method='per_image', velocity_sigma_m_s=8000.0
     )
-    names = {term.name for term in model_checks(found).held if 'velocity' in term.name}
-    assert names == {'velocity_x_m_s', 'velocity_y_m_s'}
+    terms = [term for term in model_checks(found).held if 'velocity' in term.name]
+    assert [np.isfinite(term.significance) for term in terms] == [True, True, False]
 
 
 @pytest.mark.slow

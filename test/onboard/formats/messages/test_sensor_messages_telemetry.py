@@ -46,7 +46,7 @@ def test_attitude_and_velocity_round_trip() -> None:
     np.testing.assert_array_equal(velocity, [1.0, -2.0, 3e4])
 
 
-BAD_SPEEDS_M_S = (np.nan, np.inf, -np.inf, 3e8, -1e6, 1e300)
+BAD_SPEEDS_M_S = (np.nan, np.inf, -np.inf, 3e8, -3.1e5, 1e300)
 
 
 @pytest.mark.parametrize('axis', range(3))
@@ -54,7 +54,7 @@ BAD_SPEEDS_M_S = (np.nan, np.inf, -np.inf, 3e8, -1e6, 1e300)
 def test_a_velocity_of_no_spacecraft_is_refused(axis: int, speed_m_s: float) -> None:
     velocity = np.zeros(3)
     velocity[axis] = speed_m_s
-    with pytest.raises(ValueError, match='is not plausible for a spacecraft: left out'):
+    with pytest.raises(ValueError, match='is faster than any spacecraft: left out'):
         velocity_from_message(velocity_to_message(6, velocity, 'icrf', plain))
 
 
