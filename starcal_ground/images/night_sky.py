@@ -70,8 +70,8 @@ def _through_air(
 
 def _in_words_of_stars(stars: by_stars.FromStars, one: StarObservations) -> StarObservations:
     """Observations of a copy refused, and of an image without stars as such."""
-    if one.time_ns in stars.copies_ns:
-        reason, detail = 'frozen', 'a copy of another image'
+    if one.time_ns in stars.copies:
+        reason, detail = 'duplicate', stars.copies[one.time_ns]
     elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
         reason, detail = 'no_match', 'its stars are no part of the sky'
     else:
@@ -124,15 +124,14 @@ def photographs_of(
         with_stars = {name: _shows_stars(group) for name, group in groups.items()}
         groups = dict(sorted(groups.items(), key=lambda item: not with_stars[item[0]]))
     (name, group), *others = groups.items()
-    chosen = image_files.without_copies(group, refusals)
     notes = refusals.lines()
     if others:
         left = ', '.join(
             f'{len(group)} of {other}{"" if with_stars[other] else ", which show no stars"}'
             for other, group in others
         )
-        notes.append(f'{len(chosen)} images of {name} are used; left out: {left}')
-    return image_files.in_order(chosen), notes
+        notes.append(f'{len(group)} images of {name} are used; left out: {left}')
+    return image_files.in_order(group), notes
 
 
 def _shows_stars(group: Sequence[image_files.Photograph]) -> bool:

@@ -197,23 +197,14 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
-    """By time, then name; equal stamps, as of copied files, a second apart."""
-    ordered = sorted(photographs, key=lambda one: (one.time_ns, one.path.name))
+    """By time, the largest file first; equal stamps, as of copied files, a second apart."""
+    ordered = sorted(photographs, key=lambda one: (one.time_ns, -one.file_bytes, one.path.name))
     distinct: list[Photograph] = []
     for one in ordered:
         if distinct and one.time_ns <= distinct[-1].time_ns:
             one = replace(one, time_ns=distinct[-1].time_ns + _SAME_STAMP_NS)
         distinct.append(one)
     return distinct
-
-
-def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
-    """Photographs of one camera; of those with the same time of exposure, the largest file."""
-    kept: dict[object, Photograph] = {}
-    for one in sorted(photographs, key=lambda one: (-one.file_bytes, one.path.name)):
-        if kept.setdefault(one.time_ns if one.dated else one.path, one) is not one:
-            refusals.add(one.path, 'a copy: another file has its time of exposure')
-    return list(kept.values())
 
 
 def by_camera(photographs: Sequence[Photograph]) -> dict[str, list[Photograph]]:

@@ -174,7 +174,7 @@ def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: Setup) -> Non
 def test_a_recording_that_plays_twice_counts_once(setup: Setup) -> None:
     first, _ = observe.observe_next(image(), attitudes(), setup, observe.Track(setup.prior))
     assert not first.refusal
-    later = dataclasses.replace(first, time_ns=first.time_ns + 1)
+    later = dataclasses.replace(first, time_ns=first.time_ns + 1, pixel_digest='another')
     ensemble = Ensemble().add(first).add(later)
     again = dataclasses.replace(first, attitude_gap_s=0.125)
     ensemble = ensemble.add(again)
