@@ -86,7 +86,9 @@ def encoded_again(exposures: Sequence[Exposure]) -> dict[int, str]:
         if first != i and common[i, first] > _LEAST_COMMON and still(first, i):
             others = [k for k in np.argsort(-common[i]).tolist() if k not in (i, first)]
             unlike = (k for k in others if common[i, k] <= _LEAST_COMMON or not still(i, k))
-            part, limit = _without_pattern(common, i, first, [*itertools.islice(unlike, _MOST_OTHERS)])
+            part, limit = _without_pattern(
+                common, i, first, [*itertools.islice(unlike, _MOST_OTHERS)]
+            )
             if part > limit:
                 found[one.time_ns] = (
                     f'it is the image of {utc_text(exposures[first].time_ns)}, encoded again:'

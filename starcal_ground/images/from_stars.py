@@ -18,11 +18,12 @@ import math
 import time
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images import copies
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
 from starcal_ros.camera.lens import COEFFICIENTS, ideal_points
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
@@ -36,7 +37,7 @@ from starcal_ros.identification.blind.images import FEWEST_SOURCES, ImageSearch
 from starcal_ros.identification.blind.search import SkyMatch
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.sky.catalog import cone, StarCatalog
 
 ADVICE = 'take 20 frames over the whole sky, stars to the corners, 1 to 10 s each'
 FEWEST_IMAGES = 3
@@ -54,6 +55,7 @@ _SEARCH_S = 150.0  # of processor time
 _CENTROID_PX = 0.3  # of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
+_MOST_OF_PEAK, _SAME_STAR_PX = 0.9, 2.0  # of stars whose light is compared with the catalog
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _ONE_LENS = 0.3  # tangent of a half diagonal to which the lenses are the same within a pixel
@@ -73,9 +75,9 @@ class FromStars:
 
     ``camera`` is of the images mirrored left to right where they are ``mirrored``;
     ``icrf_from_camera`` by stamp; ``images`` is the number of different images, ``copies`` has
-    words on each copy of one of them by its stamp; ``stated_px`` is the focal length of the prior camera, NaN
-    without one; ``other_focal_px`` has the focal lengths of images that match the
-    sky with another camera and are left out.
+    words on each copy of one of them by its stamp; ``stated_px`` is the focal length of the prior
+    camera, NaN without one; ``other_focal_px`` has the focal lengths of images that match the sky
+    with another camera and are left out.
     """
 
     camera: CameraModel
@@ -170,9 +172,7 @@ def from_stars(
     camera, rotations = _common_camera(matches, sources, catalog)
     stated_px = math.nan if prior is None else float(prior.parameters[0])
     (mirrored,) = first[0].mirrored
-    return FromStars(
-        camera, mirrored, rotations, len(seen), other_focal_px, found, stated_px
-    )
+    return FromStars(camera, mirrored, rotations, len(seen), other_focal_px, found, stated_px)
 
 
 def _sources(
@@ -216,6 +216,26 @@ def count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
     if not len(brightest) or np.median(brightest) - middle < _LEAST_CONTRAST * (high - low):
         return 0
     return int(np.count_nonzero(sources.wide_px > _HOT_PIXEL_PX))
+
+
+def brightness_errors_mag(image: Image, stars: FromStars, catalog: StarCatalog) -> Floats:
+    """Magnitudes (n,) of the sources of an image less those of the catalog, about their median."""
+    sources = bright_sources(image.pixels)
+    unsaturated = sources.peak_dn < _MOST_OF_PEAK * float(image.pixels.max())
+    xy_px = sources.xy_px[unsaturated]
+    rotation = stars.icrf_from_camera[image.time_ns]
+    axis = rotation.apply([0.0, 0.0, 1.0])
+    rows = cone(catalog, axis, field_radius_rad(stars.camera))
+    seen_px = project(stars.camera, rotation.inv().apply(catalog.direction_icrs[rows]))
+    in_front = np.isfinite(seen_px).all(axis=1)
+    rows, seen_px = rows[in_front], seen_px[in_front]
+    if not (len(xy_px) and len(rows)):
+        return np.empty(0)
+    distance_px, nearest = cKDTree(seen_px).query(xy_px)
+    near = distance_px < _SAME_STAR_PX
+    error = -2.5 * np.log10(sources.flux_dn[unsaturated][near])
+    error -= catalog.magnitude[rows[nearest[near]]]
+    return np.asarray(error - np.median(error) if len(error) else error)
 
 
 def ideal_camera(size: tuple[int, int], focal_px: float, model: str = _PINHOLE) -> CameraModel:

@@ -34,10 +34,13 @@ from starcal_ros.pipeline.setup import load_setup, option_groups
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.pipeline.topics import choose_image_topic, CLOCKS_SET_NS, stated_tracker, Topics
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.robust_statistics import MAD_TO_SIGMA
 from starcal_ros.sky.astrometry import SiteOptions
-from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
-_FEW = 5  # images that are looked at for stars
+_FEW = 5  # images that are looked at for stars, or whose stars show a tone curve
+# The scatter of 15 brightnesses is known to a fifth.
+_FEWEST_BRIGHTNESSES, _CLEARLY_LESS = 15, 0.8
 _ATTITUDE_TOPIC = '/stars/attitude'
 # Of no site: its zenith at a time that is not known is not known either.
 _NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
@@ -162,11 +165,11 @@ def from_photographs(
         stars = _found(_images(photographs, damaged), values, hint)
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
+    is_rendered, curve = _tone_curve(photographs, stars, _catalog_of(values))
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
-        for image in _images(photographs, image_files.Refusals()):
-            if stars.mirrored:
-                image = Image(image.time_ns, image.pixels[:, ::-1].copy())
+        none = image_files.Refusals()
+        for image in _images(photographs, none, is_rendered, stars.mirrored):
             writer.write_image('/camera/image_raw', image, 'camera')
     stated = {**({} if 'observer' in values else site_of(photographs)), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
@@ -174,16 +177,55 @@ def from_photographs(
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
     undated = sum(not one.dated for one in photographs)
     times_of = f'of the file: {undated} of {len(photographs)} images state none' * bool(undated)
-    return _set_up(stars, [bag], stated, folder, is_located, Topics(), damaged.lines(), times_of)
+    notes = [*damaged.lines(), *curve]
+    return _set_up(stars, [bag], stated, folder, is_located, Topics(), notes, times_of)
 
 
 def _images(
-    photographs: Sequence[image_files.Photograph], refusals: image_files.Refusals
+    photographs: Sequence[image_files.Photograph],
+    refusals: image_files.Refusals,
+    is_rendered: bool | None = None,
+    is_mirrored: bool = False,
 ) -> Iterator[Image]:
-    """Images of the files that can be decoded."""
+    """Images of the files that can be decoded, mirrored back if they are mirrored."""
     for one in photographs:
         with refusals.of(one.path):
-            yield Image(one.time_ns, image_files.pixels_of_photograph(one.path))
+            pixels = image_files.pixels_of_photograph(one.path, is_rendered)
+            yield Image(one.time_ns, pixels[:, ::-1].copy() if is_mirrored else pixels)
+
+
+def _tone_curve(
+    photographs: Sequence[image_files.Photograph],
+    stars: by_stars.FromStars,
+    catalog: StarCatalog,
+) -> tuple[bool | None, list[str]]:
+    """
+    Whether images of 8 bit are rendered in sRGB or linear, by the brightnesses of their stars.
+
+    None, without a sentence, unless these contradict what is assumed: colour is rendered.
+    """
+    none = image_files.Refusals()
+    shown = [one for one in photographs if one.time_ns in stars.icrf_from_camera][:_FEW]
+    if any(image.pixels.dtype != np.uint8 for image in _images(shown, none, False)):
+        return None, []
+    assumed = any(image.pixels.dtype != np.uint8 for image in _images(shown, none))
+    scatter_mag = {}
+    for is_rendered in (False, True):
+        images = _images(shown, none, is_rendered, stars.mirrored)
+        errors_mag = np.concatenate(
+            [by_stars.brightness_errors_mag(image, stars, catalog) for image in images]
+        )
+        if len(errors_mag) < _FEWEST_BRIGHTNESSES:
+            return None, []
+        scatter_mag[is_rendered] = MAD_TO_SIGMA * float(np.median(np.abs(errors_mag)))
+    if scatter_mag[not assumed] > _CLEARLY_LESS * scatter_mag[assumed]:
+        return None, []
+    words = 'linear: no sRGB curve is' if assumed else 'rendered: the sRGB curve is'
+    sentence = (
+        f'the images are {words} undone, since the brightnesses of their stars scatter by'
+        f' {scatter_mag[not assumed]:.1f} mag so, and by {scatter_mag[assumed]:.1f} otherwise'
+    )
+    return not assumed, [sentence]
 
 
 def from_bags(
@@ -256,10 +298,13 @@ def _found(
     """Camera and rotations; the camera file of the options has priority over a hint."""
     if url := str(values.get('camera_info_url', '')):
         hint = read_camera_info(url)
-    path = str(values.get('catalog', ''))
-    catalog = load_catalog(Path(path) if path else None)
     least = option_groups(values)['calibration'].min_images
-    return by_stars.from_stars(images, catalog, hint, least)
+    return by_stars.from_stars(images, _catalog_of(values), hint, least)
+
+
+def _catalog_of(values: Mapping[str, object]) -> StarCatalog:
+    path = str(values.get('catalog', ''))
+    return load_catalog(Path(path) if path else None)
 
 
 def _set_up(

@@ -215,12 +215,12 @@ def by_camera(photographs: Sequence[Photograph]) -> dict[str, list[Photograph]]:
     return dict(sorted(groups.items(), key=lambda group: -len(group[1])))
 
 
-def pixels_of_photograph(path: Path) -> Pixels:
+def pixels_of_photograph(path: Path, is_rendered: bool | None = None) -> Pixels:
     """
     Light of each pixel (height, width), as the sensor has it: not turned by the EXIF orientation.
 
-    Green of a colour image, interpolated in one of camera raw.  The sRGB curve of 8-bit colour is
-    undone into 16 bit.
+    Green of a colour image, interpolated in one of camera raw.  Of 8-bit images that are rendered,
+    the sRGB curve is undone into 16 bit; None: those in colour are.
     """
     kind = _readable(path)
     if kind is RAW:
@@ -234,9 +234,10 @@ def pixels_of_photograph(path: Path) -> Pixels:
                 _check_whole(path, content)
             values = decoded(path, content)  # the EXIF orientation is not applied
     if values.ndim == 3:
-        is_rendered = values.dtype == np.uint8
         values = np.ascontiguousarray(values[:, :, _GREEN])
-        values = _SRGB_TO_LIGHT[values] if is_rendered else values
+        is_rendered = True if is_rendered is None else is_rendered
+    if values.dtype == np.uint8 and is_rendered:
+        return _SRGB_TO_LIGHT[values]
     if values.dtype in (np.uint8, np.uint16):
         return values
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
