@@ -55,7 +55,11 @@ _SEARCH_S = 150.0  # of processor time
 _CENTROID_PX = 0.3  # of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
-_MOST_OF_PEAK, _SAME_STAR_PX = 0.9, 2.0  # of stars whose light is compared with the catalog
+_MOST_OF_PEAK, _SAME_STAR_PX, _MOST_BRIGHT = (
+    0.9,
+    2.0,
+    40,
+)  # of stars whose light is compared with the catalog
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _ONE_LENS = 0.3  # tangent of a half diagonal to which the lenses are the same within a pixel
@@ -210,19 +214,26 @@ def _sources(
 
 def count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
     """Number of sources of an image that may be stars; 0 of anything but the night sky."""
-    low, middle, high = np.percentile(pixels[::8, ::8], [10, 50, 90])
-    brightest = sources.peak_dn[:_BRIGHTEST]
-    # By day and by lamps the peaks are hardly above the rest of the picture.
-    if not len(brightest) or np.median(brightest) - middle < _LEAST_CONTRAST * (high - low):
+    height, width = pixels.shape
+    places = np.stack(np.meshgrid(np.arange(0, width, 8), np.arange(0, height, 8)), axis=-1)
+    level_dn = sources.background.level_at(places.reshape(-1, 2))
+    # The sky of a star camera by day is bright and uneven, but smooth.
+    low, high = np.percentile(pixels[::8, ::8].ravel() - level_dn, [10, 90])
+    brightest = np.rint(sources.xy_px[:_BRIGHTEST]).astype(np.int64)
+    peaks_dn = sources.peak_dn[:_BRIGHTEST] - sources.background.level_at(brightest)
+    # In a picture of anything by day or by lamps, peaks are hardly above the rest of its detail.
+    if not len(peaks_dn) or np.median(peaks_dn) < _LEAST_CONTRAST * (high - low):
         return 0
     return int(np.count_nonzero(sources.wide_px > _HOT_PIXEL_PX))
 
 
 def brightness_errors_mag(image: Image, stars: FromStars, catalog: StarCatalog) -> Floats:
-    """Magnitudes (n,) of the sources of an image less those of the catalog, about their median."""
+    """Magnitudes (n,) of the brightest sources less those of the catalog, about their median."""
     sources = bright_sources(image.pixels)
     unsaturated = sources.peak_dn < _MOST_OF_PEAK * float(image.pixels.max())
-    xy_px = sources.xy_px[unsaturated]
+    # Half of the light of faint ones is below the noise, and their neighbours add theirs.
+    bright = np.flatnonzero(unsaturated)[:_MOST_BRIGHT]
+    xy_px = sources.xy_px[bright]
     rotation = stars.icrf_from_camera[image.time_ns]
     axis = rotation.apply([0.0, 0.0, 1.0])
     rows = cone(catalog, axis, field_radius_rad(stars.camera))
@@ -233,7 +244,7 @@ def brightness_errors_mag(image: Image, stars: FromStars, catalog: StarCatalog) 
         return np.empty(0)
     distance_px, nearest = cKDTree(seen_px).query(xy_px)
     near = distance_px < _SAME_STAR_PX
-    error = -2.5 * np.log10(sources.flux_dn[unsaturated][near])
+    error = -2.5 * np.log10(sources.flux_dn[bright][near])
     error -= catalog.magnitude[rows[nearest[near]]]
     return np.asarray(error - np.median(error) if len(error) else error)
 

@@ -606,7 +606,10 @@ REMEDIES: Mapping[str, str] = {
         'raise magnitude_limit, or give starcal catalog a table of this sky (docs/mission.md)'
     ),
     'no_match': 'ask the diagnostics of the star observer, or starcal diagnose, for the cause',
-    'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
+    'too_few_stars': (
+        'expose for longer, or raise magnitude_limit, with a deeper catalog (starcal catalog) in a'
+        ' field of few stars; check bad_pixel_map'
+    ),
     # Checks of the gate, with the section of the report.
     'stars left out as outliers': 'look for smeared or misidentified stars (Residuals)',
     'images whose attitude does not fit': 'check their attitudes and stamps (Alignment)',
