@@ -98,6 +98,23 @@ def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) ->
     assert 0.96 < truth < 1.04
 
 
+@pytest.mark.parametrize('tail_px', [0.0, 1.2, 2.0])
+def test_stars_of_one_shape_are_measured_and_another_shape_is_refused(tail_px: float) -> None:
+    """Comatic stars: a quarter of the light is in a tail, up to 200 sigma from a Gaussian."""
+    rng = np.random.default_rng(4)
+    xy = star_grid(3)
+    flux = 10 ** rng.uniform(4.0, 5.3, len(xy))  # electrons
+    other = rng.choice(len(xy), 8, replace=False)
+    tail = np.tile([tail_px, 0.5 * tail_px], (len(xy), 1))
+    tail[other] = [-1.6, 1.9]  # a companion of a quarter of the light, in another direction
+    bits16 = dataclasses.replace(QUIET, bits=16, electrons_per_dn=10.0, offset_dn=500.0)
+    both = np.concatenate([xy, xy + tail]), np.concatenate([0.75 * flux, 0.25 * flux])
+    found = measured(exposed(5, *both, bits16), xy)
+    elongated = found.refusal == StarRefusal.ELONGATED
+    assert elongated[other].all()
+    assert elongated.sum() < len(other) + 0.05 * len(xy)
+
+
 def test_the_covariance_is_true_where_the_gain_is_given() -> None:
     options = CentroidOptions(gain_e_per_dn=QUIET.electrons_per_dn)
     squared = []
