@@ -237,7 +237,7 @@ def pixels_of_photograph(path: Path, is_rendered: bool | None = None) -> Pixels:
         values = np.ascontiguousarray(values[:, :, _GREEN])
         is_rendered = True if is_rendered is None else is_rendered
     if values.dtype == np.uint8 and is_rendered:
-        return _SRGB_TO_LIGHT[values]
+        return np.asarray(_SRGB_TO_LIGHT[values])
     if values.dtype in (np.uint8, np.uint16):
         return values
     low, high = float(np.nanmin(values)), float(np.nanmax(values))

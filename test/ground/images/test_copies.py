@@ -47,12 +47,14 @@ def exposed(
     level = 200.0 + seen + np.sqrt(pattern) * NOISE_DN * fixed.normal(size=SIZE)
     level += NOISE_DN * fixed.exponential(60.0, SIZE) * (fixed.random(SIZE) < hot)
     noise = rng.normal(size=SIZE) * np.sqrt(NOISE_DN**2 + 0.1 * NOISE_DN * seen)
-    return np.rint(level + noise).clip(0, 65535).astype(np.uint16)
+    pixels: Pixels = np.rint(level + noise).clip(0, 65535).astype(np.uint16)
+    return pixels
 
 
 def eight(pixels: Pixels, noise_dn: float) -> Pixels:
     """An image in 8 bit, its noise of that many digital numbers."""
-    return np.rint((pixels - 200.0) * noise_dn / NOISE_DN + 30.0).clip(0, 255).astype(np.uint8)
+    level = (pixels - 200.0) * noise_dn / NOISE_DN + 30.0
+    return np.asarray(np.rint(level).clip(0, 255), np.uint8)
 
 
 def jpeg(pixels: Pixels, quality: int) -> Pixels:
@@ -80,7 +82,7 @@ def test_exposures_of_one_field_and_camera_are_no_copies(
 COPIES: dict[str, Callable[[Pixels], Pixels]] = {
     'in 8 bit': lambda pixels: eight(pixels, 1.0),
     'in 8 bit, coarse': lambda pixels: eight(pixels, 0.5),
-    'in fewer bits': lambda pixels: pixels >> 3,
+    'in fewer bits': lambda pixels: np.asarray(pixels >> 3, np.uint16),
     'by a curve': lambda pixels: np.sqrt(65535.0 * pixels).astype(np.uint16),
     'JPEG 95': lambda pixels: jpeg(eight(pixels, 2.0), 95),
     'JPEG 85': lambda pixels: jpeg(eight(pixels, 5.0), 85),
