@@ -200,9 +200,10 @@ def _tone_curve(
     catalog: StarCatalog,
 ) -> tuple[bool | None, list[str]]:
     """
-    Whether images of 8 bit are rendered in sRGB or linear, by the brightnesses of their stars.
+    True if images of 8 bit are rendered in sRGB, False if they are linear, and a sentence on it.
 
-    None, without a sentence, unless these contradict what is assumed: colour is rendered.
+    None, without a sentence, unless the brightnesses of their stars contradict what is assumed:
+    that colour is rendered, and other images are linear.
     """
     none = image_files.Refusals()
     shown = [one for one in photographs if one.time_ns in stars.icrf_from_camera][:_FEW]
