@@ -206,11 +206,22 @@ def _measured_again(
 
 
 def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
-    setup = observed.source.setup
-    ensemble = solve.ensemble_of(observed.observations, setup)
+    setup, observations = observed.source.setup, _with_repeats(observed.observations)
+    ensemble = solve.ensemble_of(observations, setup)
     calibration, residuals = solve.solve_with_residuals(ensemble, setup, inputs)
-    notes = (*observed.notes, *_refusals(observed.observations))
-    return Campaign(setup, observed.observations, ensemble, calibration, residuals, notes)
+    notes = (*observed.notes, *_refusals(observations))
+    return Campaign(setup, observations, ensemble, calibration, residuals, notes)
+
+
+def _with_repeats(observations: Sequence[StarObservations]) -> tuple[StarObservations, ...]:
+    """Observations with images that repeat an earlier one refused, so that a sentence says so."""
+    marked, seen = [], Ensemble()
+    for one in observations:
+        if not one.refusal and (words := seen.repeats(one)):
+            one = replace(one, refusal='duplicate', detail=words)
+        seen = seen.add(one)
+        marked.append(one)
+    return tuple(marked)
 
 
 def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:

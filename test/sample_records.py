@@ -60,6 +60,7 @@ def observations(n: int = 5) -> StarObservations:
         velocity_sigma_m_s=10.0,
         zenith_icrf=np.array([0.36, 0.48, 0.8]),
         refraction_arcsec=np.array([54.0, 6.0]),
+        pixel_digest='0123456789abcdef0123456789abcdef',
         refused_catalog_id=np.array([2**62 + 20, -5, 7, 8], np.int64),
         refused_px=random.uniform(0, 1000, (4, 2)).astype(np.float32),
         refused_reason=np.array([0, 1, 0, 0], np.uint8),

@@ -13,19 +13,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
+import hashlib
 import math
 import time
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.blind import search
 from starcal_ground.blind.bright_sources import bright_sources, BrightSources
 from starcal_ground.blind.images import FEWEST_SOURCES, ImageSearch
 from starcal_ground.blind.search import SkyMatch
+from starcal_ground.images import copies
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
 from starcal_ros.camera.lens import ideal_points, LENSES
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
@@ -35,7 +37,7 @@ from starcal_ros.estimation.search import minimise, moved_to_stars, problem_of, 
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.sky.catalog import cone, StarCatalog
 
 ADVICE = 'take 20 frames over the whole sky, stars to the corners, 1 to 10 s each'
 FEWEST_IMAGES = 3
@@ -54,8 +56,11 @@ _BRIEF_S = 4.0  # in which seven of eight simulated cameras of 6 to 117 degrees 
 _CENTROID_PX = 0.3  # of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
-# Of noise: exposures have 0, or 0.3 by what their sensor adds to each.
-_NOISE_SIDE_PX, _SAME_NOISE, _FEWEST_OF_NOISE = 256, 0.5, 1000
+_MOST_OF_PEAK, _SAME_STAR_PX, _MOST_BRIGHT = (
+    0.9,
+    2.0,
+    40,
+)  # of stars whose light is compared with the catalog
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _ONE_LENS = 0.3  # tangent of a half diagonal to which the lenses are the same within a pixel
@@ -74,10 +79,10 @@ class FromStars:
     Camera and rotations of images that were identified by their stars.
 
     ``camera`` is of the images mirrored left to right where they are ``mirrored``;
-    ``icrf_from_camera`` by stamp; ``images`` is the number of different images, ``copies_ns`` has
-    the stamps of copies of them; ``stated_px`` is the focal length of the nearest prior camera,
-    NaN without one; ``other_focal_px`` has the focal lengths of images that match the
-    sky with another camera and are left out.
+    ``icrf_from_camera`` by stamp; ``images`` is the number of different images, ``copies`` has
+    words on each copy of one of them by its stamp; ``stated_px`` is the focal length of the
+    nearest prior camera, NaN without one; ``other_focal_px`` has the focal lengths of images that
+    match the sky with another camera and are left out.
     """
 
     camera: CameraModel
@@ -85,7 +90,7 @@ class FromStars:
     icrf_from_camera: Mapping[int, Rotation]
     images: int
     other_focal_px: tuple[float, ...] = ()
-    copies_ns: frozenset[int] = frozenset()
+    copies: Mapping[int, str] = dataclasses.field(default_factory=dict)
     stated_px: float = math.nan
 
     def in_a_sentence(self) -> str:
@@ -99,13 +104,13 @@ class FromStars:
         field = ' x '.join(f'{deg:.1f}' for deg in across_deg)
         others = ', '.join(f'{focal_px:.0f}' for focal_px in self.other_focal_px)
         left_out = f'; left out, with another focal length: {others} px' if others else ''
-        copies = f'; left out: {len(self.copies_ns)} copies' if self.copies_ns else ''
+        again = f'; left out: {len(self.copies)} copies' if self.copies else ''
         wrong = ''
         if abs(self.stated_px / fx - 1.0) > _SAME_FOCAL:
             wrong = f' (stated: {self.stated_px:.0f} px, which the stars contradict)'
         return (
             f'{len(self.icrf_from_camera)} of {self.images} images identified by their stars:'
-            f' focal length {fx:.1f} px{wrong}, field {field} degrees{left_out}{copies}'
+            f' focal length {fx:.1f} px{wrong}, field {field} degrees{left_out}{again}'
         )
 
 
@@ -138,9 +143,10 @@ def from_stars(
 
     Raises NotFromStars when the images give no camera; the text says what to photograph.
     """
-    seen, size, copies = _sources(images)
+    seen, size, found = _sources(images)
     if len(seen) < min_images:
-        again = f' ({len(copies)} more are copies)' if copies else ''
+        words = next(iter(found.values()), '')
+        again = f' ({len(found)} more are copies, the first since {words})' if found else ''
         plural = 's' * (len(seen) != 1)
         raise NotFromStars(
             f'{len(seen)} different image{plural}{again}, {min_images} are needed: {ADVICE}'
@@ -180,18 +186,18 @@ def from_stars(
         default=math.nan,
     )
     (mirrored,) = first[0].mirrored
-    return FromStars(
-        camera, mirrored, rotations, len(seen), other_focal_px, frozenset(copies), stated_px
-    )
+    return FromStars(camera, mirrored, rotations, len(seen), other_focal_px, found, stated_px)
 
 
-def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], list[int]]:
-    """Sources of the images that differ, their size, and the stamps of copies."""
+def _sources(
+    images: Iterable[Image],
+) -> tuple[list[_Sources], tuple[int, int], dict[int, str]]:
+    """Sources of the images that differ, their size, and words on each copy by its stamp."""
     seen: list[_Sources] = []
     size = (0, 0)
-    sums = set()
-    noises: list[Floats] = []
-    copies = []
+    first_ns: dict[bytes, int] = {}
+    exposures: list[copies.Exposure] = []
+    found: dict[int, str] = {}
     for image in images:
         height, width = image.pixels.shape
         if size == (0, 0):
@@ -201,47 +207,56 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Sources], tuple[int, int], 
                 f'images of {size[0]} x {size[1]} and of {width} x {height}: give those of one'
                 ' camera and mode'
             )
-        noise = _noise(image.pixels)
-        digest = 0 if noise.any() else hash(image.pixels.tobytes())
-        if digest in sums or any(float(noise @ other) > _SAME_NOISE for other in noises):
-            copies.append(image.time_ns)
+        digest = hashlib.blake2b(image.pixels.tobytes()).digest()
+        if digest in first_ns:
+            found[image.time_ns] = copies.equal_to(first_ns[digest])
             continue
-        sums |= {digest} - {0}
-        noises.append(noise)
+        first_ns[digest] = image.time_ns
         sources = bright_sources(image.pixels)
+        is_star = sources.wide_px > _HOT_PIXEL_PX
+        noise = copies.noise_of(image.pixels)
+        exposures.append(copies.Exposure(image.time_ns, sources.xy_px[is_star], noise))
         stars = count_of_stars(image.pixels, sources)
         seen.append(_Sources(image.time_ns, sources.rankings, stars))
-    return seen, size, copies
+    found |= copies.encoded_again(exposures)
+    return [one for one in seen if one.time_ns not in found], size, found
 
 
 def count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
     """Number of sources of an image that may be stars; 0 of anything but the night sky."""
-    low, middle, high = np.percentile(pixels[::8, ::8], [10, 50, 90])
-    brightest = sources.peak_dn[:_BRIGHTEST]
-    # By day and by lamps the peaks are hardly above the rest of the picture.
-    if not len(brightest) or np.median(brightest) - middle < _LEAST_CONTRAST * (high - low):
+    height, width = pixels.shape
+    places = np.stack(np.meshgrid(np.arange(0, width, 8), np.arange(0, height, 8)), axis=-1)
+    level_dn = sources.background.level_at(places.reshape(-1, 2))
+    # The sky of a star camera by day is bright and uneven, but smooth.
+    low, high = np.percentile(pixels[::8, ::8].ravel() - level_dn, [10, 90])
+    brightest = np.rint(sources.xy_px[:_BRIGHTEST]).astype(np.int64)
+    peaks_dn = sources.peak_dn[:_BRIGHTEST] - sources.background.level_at(brightest)
+    # In a picture of anything by day or by lamps, peaks are hardly above the rest of its detail.
+    if not len(peaks_dn) or np.median(peaks_dn) < _LEAST_CONTRAST * (high - low):
         return 0
     return int(np.count_nonzero(sources.wide_px > _HOT_PIXEL_PX))
 
 
-def _noise(pixels: Pixels) -> Floats:
-    """
-    Noise in the middle of an image without its stars, a unit vector; zeros if there is none.
-
-    It differs between exposures, and is still there in a copy that was compressed again.
-    """
-    v, u = (max(0, (side - _NOISE_SIDE_PX) // 2) // 8 * 8 for side in pixels.shape)
-    part = pixels[v : v + _NOISE_SIDE_PX, u : u + _NOISE_SIDE_PX].astype(np.float64)
-    rows, columns = (side // 2 for side in part.shape)
-    # Compression keeps little of the noise of single pixels.
-    part = part[: 2 * rows, : 2 * columns]
-    part = part[::2] + part[1::2]
-    binned = 0.25 * (part[:, ::2] + part[:, 1::2])
-    noise = binned - uniform_filter(binned, 5)
-    sigma = 1.4826 * float(np.median(np.abs(noise)))
-    noise[np.abs(noise) > 3.0 * sigma] = 0.0
-    length = float(np.linalg.norm(noise)) if noise.size > _FEWEST_OF_NOISE else 0.0
-    return np.asarray(noise.ravel() / length if length > 0 else np.zeros(noise.size))
+def brightness_errors_mag(image: Image, stars: FromStars, catalog: StarCatalog) -> Floats:
+    """Magnitudes (n,) of the brightest sources less those of the catalog, about their median."""
+    sources = bright_sources(image.pixels)
+    unsaturated = sources.peak_dn < _MOST_OF_PEAK * float(image.pixels.max())
+    # Half of the light of faint ones is below the noise, and their neighbours add theirs.
+    bright = np.flatnonzero(unsaturated)[:_MOST_BRIGHT]
+    xy_px = sources.xy_px[bright]
+    rotation = stars.icrf_from_camera[image.time_ns]
+    axis = rotation.apply([0.0, 0.0, 1.0])
+    rows = cone(catalog, axis, field_radius_rad(stars.camera))
+    seen_px = project(stars.camera, rotation.inv().apply(catalog.direction_icrs[rows]))
+    in_front = np.isfinite(seen_px).all(axis=1)
+    rows, seen_px = rows[in_front], seen_px[in_front]
+    if not (len(xy_px) and len(rows)):
+        return np.empty(0)
+    distance_px, nearest = cKDTree(seen_px).query(xy_px)
+    near = distance_px < _SAME_STAR_PX
+    error = -2.5 * np.log10(sources.flux_dn[bright][near])
+    error -= catalog.magnitude[rows[nearest[near]]]
+    return np.asarray(error - np.median(error) if len(error) else error)
 
 
 def ideal_camera(size: tuple[int, int], focal_px: float, model: str = _PINHOLE) -> CameraModel:

@@ -37,10 +37,13 @@ from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.setup import load_setup, option_groups
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.robust_statistics import MAD_TO_SIGMA
 from starcal_ros.sky.astrometry import SiteOptions
-from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
-_FEW = 5  # images that are looked at for stars
+_FEW = 5  # images that are looked at for stars, or whose stars show a tone curve
+# The scatter of 15 brightnesses is known to a fifth.
+_FEWEST_BRIGHTNESSES, _CLEARLY_LESS = 15, 0.8
 _ATTITUDE_TOPIC = '/stars/attitude'
 # Of no site: its zenith at a time that is not known is not known either.
 _NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
@@ -73,8 +76,8 @@ def _through_air(
 
 def _in_words_of_stars(stars: by_stars.FromStars, one: StarObservations) -> StarObservations:
     """Observations of a copy refused, and of an image without stars as such."""
-    if one.time_ns in stars.copies_ns:
-        reason, detail = 'frozen', 'a copy of another image'
+    if one.time_ns in stars.copies:
+        reason, detail = 'duplicate', stars.copies[one.time_ns]
     elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
         reason, detail = 'no_match', 'its stars are no part of the sky'
     else:
@@ -127,15 +130,14 @@ def photographs_of(
         with_stars = {name: _shows_stars(group) for name, group in groups.items()}
         groups = dict(sorted(groups.items(), key=lambda item: not with_stars[item[0]]))
     (name, group), *others = groups.items()
-    chosen = image_files.without_copies(group, refusals)
     notes = refusals.lines()
     if others:
         left = ', '.join(
             f'{len(group)} of {other}{"" if with_stars[other] else ", which show no stars"}'
             for other, group in others
         )
-        notes.append(f'{len(chosen)} images of {name} are used; left out: {left}')
-    return image_files.in_order(chosen), notes
+        notes.append(f'{len(group)} images of {name} are used; left out: {left}')
+    return image_files.in_order(group), notes
 
 
 def _shows_stars(group: Sequence[image_files.Photograph]) -> bool:
@@ -170,12 +172,13 @@ def from_photographs(
         stars = _found(_images(photographs, damaged, channel), values, hints, places)
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
+    is_rendered, curve = _tone_curve(photographs, stars, _catalog_of(values), channel)
     # A FITS file whose rows have no stated order is mirrored by that order.
     by_rows = stars.mirrored and not any(one.is_upright for one in photographs)
     stars = _half_turned(stars) if by_rows else stars
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
-        for image in _images(photographs, image_files.Refusals(), channel):
+        for image in _images(photographs, image_files.Refusals(), channel, is_rendered):
             if stars.mirrored:
                 side = image.pixels[::-1] if by_rows else image.pixels[:, ::-1]
                 image = Image(image.time_ns, side.copy())
@@ -198,6 +201,7 @@ def from_photographs(
         words_of_site,
         stated_facts.doubt_of_times(photographs),
         stated_facts.half_turns(stars),
+        *curve,
     ]
     source = _set_up(stars, [bag], stated, folder, is_located, Topics(), [*filter(None, notes)])
     setup = dataclasses.replace(
@@ -225,11 +229,50 @@ def _images(
     photographs: Sequence[image_files.Photograph],
     refusals: image_files.Refusals,
     channel: str = '',
+    is_rendered: bool | None = None,
+    is_mirrored: bool = False,
 ) -> Iterator[Image]:
-    """Images of the files that can be decoded."""
+    """Images of the files that can be decoded, mirrored back if they are mirrored."""
     for one in photographs:
         with refusals.of(one.path):
-            yield Image(one.time_ns, image_files.pixels_of_photograph(one.path, channel))
+            pixels = image_files.pixels_of_photograph(one.path, channel, is_rendered)
+            yield Image(one.time_ns, pixels[:, ::-1].copy() if is_mirrored else pixels)
+
+
+def _tone_curve(
+    photographs: Sequence[image_files.Photograph],
+    stars: by_stars.FromStars,
+    catalog: StarCatalog,
+    channel: str,
+) -> tuple[bool | None, list[str]]:
+    """
+    True if images of 8 bit are rendered in sRGB, False if they are linear, and a sentence on it.
+
+    None, without a sentence, unless the brightnesses of their stars contradict what is assumed:
+    that colour is rendered, and other images are linear.
+    """
+    none = image_files.Refusals()
+    shown = [one for one in photographs if one.time_ns in stars.icrf_from_camera][:_FEW]
+    if any(image.pixels.dtype != np.uint8 for image in _images(shown, none, channel, False)):
+        return None, []
+    assumed = any(image.pixels.dtype != np.uint8 for image in _images(shown, none, channel))
+    scatter_mag = {}
+    for is_rendered in (False, True):
+        images = _images(shown, none, channel, is_rendered, stars.mirrored)
+        errors_mag = np.concatenate(
+            [by_stars.brightness_errors_mag(image, stars, catalog) for image in images]
+        )
+        if len(errors_mag) < _FEWEST_BRIGHTNESSES:
+            return None, []
+        scatter_mag[is_rendered] = MAD_TO_SIGMA * float(np.median(np.abs(errors_mag)))
+    if scatter_mag[not assumed] > _CLEARLY_LESS * scatter_mag[assumed]:
+        return None, []
+    words = 'linear: no sRGB curve is' if assumed else 'rendered: the sRGB curve is'
+    sentence = (
+        f'the images are {words} undone, since the brightnesses of their stars scatter by'
+        f' {scatter_mag[not assumed]:.1f} mag so, and by {scatter_mag[assumed]:.1f} otherwise'
+    )
+    return not assumed, [sentence]
 
 
 def from_bags(
@@ -311,11 +354,15 @@ def _found(
     """
     if url := str(values.get('camera_info_url', '')):
         hints = {url: read_camera_info(url)}
-    path = str(values.get('catalog', ''))
-    catalog = load_catalog(Path(path) if path else None)
-    too_few = stated_facts.too_few_stars(hints, catalog, bool(path), places)
+    catalog = _catalog_of(values)
+    too_few = stated_facts.too_few_stars(hints, catalog, bool(values.get('catalog')), places)
     least = option_groups(values)['calibration'].min_images
     return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
+
+
+def _catalog_of(values: Mapping[str, object]) -> StarCatalog:
+    path = str(values.get('catalog', ''))
+    return load_catalog(Path(path) if path else None)
 
 
 def _set_up(

@@ -229,23 +229,20 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
-    """By time, then name; equal stamps, as of copied files, a second apart."""
-    ordered = sorted(photographs, key=lambda one: (one.time_ns, one.path.name))
+    """
+    By time, the deepest, then the largest file first; equal stamps a second apart.
+
+    The first of several files of one exposure is kept, by their pixels.
+    """
+    ordered = sorted(
+        photographs, key=lambda one: (one.time_ns, -one.bits, -one.file_bytes, one.path.name)
+    )
     distinct: list[Photograph] = []
     for one in ordered:
         if distinct and one.time_ns <= distinct[-1].time_ns:
             one = replace(one, time_ns=distinct[-1].time_ns + _SAME_STAMP_NS)
         distinct.append(one)
     return distinct
-
-
-def without_copies(photographs: Sequence[Photograph], refusals: Refusals) -> list[Photograph]:
-    """Photographs of one camera; of those with one time of exposure, the deepest, largest file."""
-    kept: dict[object, Photograph] = {}
-    for one in sorted(photographs, key=lambda one: (-one.bits, -one.file_bytes, one.path.name)):
-        if kept.setdefault(one.time_ns if one.dated else one.path, one) is not one:
-            refusals.add(one.path, 'a copy: another file has its time of exposure')
-    return list(kept.values())
 
 
 def by_camera(photographs: Sequence[Photograph], fewest: int = 3) -> dict[str, list[Photograph]]:
@@ -267,12 +264,12 @@ def by_camera(photographs: Sequence[Photograph], fewest: int = 3) -> dict[str, l
     return dict(sorted(groups.items(), key=rank))
 
 
-def pixels_of_photograph(path: Path, channel: str = '') -> Pixels:
+def pixels_of_photograph(path: Path, channel: str = '', is_rendered: bool | None = None) -> Pixels:
     """
     Light of each pixel (height, width), as the sensor has it: not turned by the EXIF orientation.
 
-    A channel of a colour image, by default green, interpolated in a mosaic.  The sRGB curve of
-    8-bit colour is undone into 16 bit.
+    A channel of a colour image, by default green, interpolated in a mosaic.  Of 8-bit images that
+    are rendered, the sRGB curve is undone into 16 bit; None: those in colour are.
     """
     kind, channel = _readable(path), channel or 'green'
     if kind is RAW:
@@ -289,9 +286,10 @@ def pixels_of_photograph(path: Path, channel: str = '') -> Pixels:
                 _check_whole(path, content)
             values = in_rgb(decoded(path, content))  # the EXIF orientation is not applied
     if values.ndim == 3:
-        is_rendered = values.dtype == np.uint8
         values = np.ascontiguousarray(values[:, :, CHANNELS.index(channel)])
-        values = _SRGB_TO_LIGHT[values] if is_rendered else values
+        is_rendered = True if is_rendered is None else is_rendered
+    if values.dtype == np.uint8 and is_rendered:
+        return np.asarray(_SRGB_TO_LIGHT[values])
     if values.dtype in (np.uint8, np.uint16):
         return np.ascontiguousarray(values)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))

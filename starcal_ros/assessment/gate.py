@@ -618,7 +618,8 @@ REMEDIES: Mapping[str, str] = {
     'out_of_order': 'use one topic for each camera, and send images in the order of their stamps',
     'overexposed': 'expose for a shorter time',
     'blank': 'check that the camera is read out',
-    'frozen': 'check that the camera is read out',
+    'frozen': 'check that the camera is read out, and that one publisher sends each frame',
+    'duplicate': 'give each image once: a copy adds nothing',
     'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
     'glare': 'keep Sun, Moon and Earth out of the field',
     'smeared': 'expose for a shorter time, or point more steadily',
@@ -626,7 +627,10 @@ REMEDIES: Mapping[str, str] = {
         'raise magnitude_limit, or give starcal catalog a table of this sky (docs/mission.md)'
     ),
     'no_match': 'ask starcal diagnose, or setup_finder beside the nodes, for the cause',
-    'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
+    'too_few_stars': (
+        'expose for longer, or raise magnitude_limit, with a deeper catalog (starcal catalog) in a'
+        ' field of few stars; check bad_pixel_map'
+    ),
     # Checks of the gate, with the section of the report.
     'stars left out as outliers': 'look for smeared or misidentified stars (Residuals)',
     'images whose attitude does not fit': 'check their attitudes and stamps (Alignment)',

@@ -279,8 +279,12 @@ def _observations(
         centroids.refusal[left_out], return_inverse=True, return_counts=True
     )
     names = [StarRefusal(code).label for code in refusals]
+    others = ', '.join(f'{n} {name}' for name, n in zip(names, counts, strict=True))
     measured = np.count_nonzero(good)
     few = measured < _MIN_STARS
+    detail = (
+        f'{counted(measured, "star")} measured, {_MIN_STARS} needed; others: {others or "none"}'
+    )
     if few:
         good = np.zeros_like(good)
     sigma_rad = catalog.place_sigma_rad(index[good], julian_year(exposure.image.time_ns))
@@ -291,7 +295,7 @@ def _observations(
         width=width,
         height=height,
         refusal='too_few_stars' if few else '',
-        detail=f'{counted(measured, "star")} measured, {_MIN_STARS} needed' if few else '',
+        detail=detail if few else '',
         icrf_from_star_tracker_xyzw=exposure.icrf_from_star_tracker_xyzw,
         attitude_gap_s=exposure.attitude_gap_s,
         catalog_id=catalog.id[index][good],

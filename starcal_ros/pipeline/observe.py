@@ -111,6 +111,7 @@ def observe_next(
         sample = sample_rows(image.pixels)
         seen = fingerprint(image, sample)
         remembered = dataclasses.replace(track, seen=seen)
+        known['pixel_digest'] = seen.digest
         found = attitudes_at(
             image.time_ns,
             attitudes,
@@ -133,7 +134,8 @@ def observe_next(
             hot,
             temperature_degc,
         )
-        return _with_any(found, exposure, setup, remembered)
+        observations, after = _with_any(found, exposure, setup, remembered)
+        return dataclasses.replace(observations, pixel_digest=seen.digest), after
     except ImageRefused as refused:
         height, width = image.pixels.shape
         observations = refused_image(

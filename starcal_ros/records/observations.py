@@ -14,6 +14,7 @@ import numpy as np
 from starcal_ros import record_fields as fields
 from starcal_ros.arrays import Codes, Floats, Integers, Mask, Pixels, Singles
 from starcal_ros.camera import MAX_SIDE_PX
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
 
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
@@ -27,10 +28,10 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'no_attitude': 'no attitude sample on both sides of the image',
     'attitude_gap': 'the attitude samples before and after the image are too far apart',
     'out_of_order': 'the stamp is not later than the stamp of the last image',
-    'duplicate': 'the ensemble has an image with the same stamp (reported by the calibrator)',
+    'duplicate': 'the ensemble has an image with the same stamp or of the same exposure',
     'overexposed': 'too large a fraction of the image is saturated',
     'blank': 'every pixel has the same value',
-    'frozen': 'the pixels are identical to an earlier image with another stamp',
+    'frozen': 'the pixels are identical to the image before, which has another stamp',
     'incomplete': ('part of the image is constant, repeated, shifted or from an earlier image'),
     'glare': 'the background varies too strongly over most of the image to be subtracted',
     'no_stars': 'too few star-like sources in the image',
@@ -204,6 +205,9 @@ class StarObservations(fields.Record):
         stars; NaN in space.
     refraction_arcsec : (2,)
         Refraction at a zenith distance of 45 degrees for that zenith, and its 1-sigma; else zeros.
+    pixel_digest : str
+        Digest of the pixels, by which an image is recognised that comes again with another stamp;
+        empty if unknown.
 
     Examples
     --------
@@ -260,6 +264,7 @@ class StarObservations(fields.Record):
     refraction_arcsec: Annotated[Floats, fields.Finite(), fields.Shape((2,))] = dataclasses.field(
         default_factory=lambda: np.zeros(2)
     )
+    pixel_digest: _Name = ''
 
     @classmethod
     def of_image(cls, time_ns: int, size: tuple[int, int], **known: object) -> StarObservations:
@@ -338,17 +343,31 @@ class Ensemble(fields.Record):
         """
         Return the ensemble with one more image, kept or counted by its reason.
 
-        An image with the stamp of one in the ensemble is counted as ``duplicate`` and the first
-        one stays, so that a recording played twice does not count twice.
+        An image that `repeats` one of the ensemble is counted as ``duplicate`` and the first one
+        stays, so that a recording played twice does not count twice.
         """
         refusal = observations.refusal
-        if not refusal and any(image.time_ns == observations.time_ns for image in self.images):
+        if not refusal and self.repeats(observations):
             refusal = 'duplicate'
         if refusal:
             refusal = counted_refusal(refusal)
             count = self.refused.get(refusal, 0) + 1
             return Ensemble(self.images, {**self.refused, refusal: count})
         return Ensemble((*self.images, observations), self.refused)
+
+    def repeats(self, observations: StarObservations) -> str:
+        """
+        Words on the image of the ensemble that observations repeat, empty for a new image.
+
+        It has the stamp or the pixels of theirs.  Noise makes any two exposures differ.
+        """
+        for image in self.images:
+            if image.time_ns == observations.time_ns:
+                return 'the stamp of another image'
+            if image.pixel_digest and image.pixel_digest == observations.pixel_digest:
+                since_s = (observations.time_ns - image.time_ns) / NANOSECONDS_PER_SECOND
+                return f'the pixels of the image {since_s:.3f} s before'
+        return ''
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
-from starcal_ros.robust_statistics import centre_and_scatter, medians
+from starcal_ros.robust_statistics import centre_and_scatter, MAD_TO_SIGMA, medians
 from starcal_ros.stars import detection, psf_fit
 from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import (
@@ -256,7 +256,29 @@ def _misshapen(fit: psf_fit.PsfFit, model: ImageModel) -> Mask:
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(MAX_SHAPE_CHANGE, 4.0 * model.shape_scatter)
     other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
-    return np.asarray(other | (fit.worst_pixel_sigma > psf_fit.MISFIT_SIGMA))
+    misfit_sigma = np.minimum(fit.worst_pixel_sigma, _beyond_others(fit))
+    return np.asarray(other | (misfit_sigma > psf_fit.MISFIT_SIGMA))
+
+
+def _beyond_others(fit: psf_fit.PsfFit) -> Floats:
+    """
+    Largest residual (n,) of a pixel, less that of the other bright stars, over its noise.
+
+    Coma, diffraction and undersampling leave the same part of the flux of all stars in a pixel:
+    its median is no fault of one of them, and its scatter, without that of the noise, is allowed.
+    """
+    flux_dn = np.maximum(fit.parameters[:, 2, None], 1e-9)
+    common, variance = np.zeros((2, fit.residual_dn.shape[1]))
+    bright = np.flatnonzero(fit.snr > BRIGHT_SNR)[:_MOST]
+    if len(bright) >= FEWEST_BRIGHT:
+        part = np.nan_to_num(fit.residual_dn[bright]) / flux_dn[bright]
+        noise = np.nan_to_num(fit.sigma_dn[bright]) / flux_dn[bright]
+        common = np.median(part, axis=0)
+        scatter = MAD_TO_SIGMA * np.median(np.abs(part - common), axis=0)
+        variance = np.maximum(scatter**2 - np.median(noise, axis=0) ** 2, 0.0)
+    beyond_dn = np.abs(fit.residual_dn - common * flux_dn)
+    sigmas = beyond_dn / np.sqrt(fit.sigma_dn**2 + variance * flux_dn**2)
+    return np.asarray(np.nan_to_num(sigmas).max(axis=1, initial=0.0))
 
 
 def shape_changed(measured: Centroids, model: ImageModel) -> bool:
@@ -468,6 +490,9 @@ def learn(
     if measured.fit is None:
         return before
     stars = np.flatnonzero(usable[measured.fitted])
+    # What a lens adds to the shape of all stars is not the noise of a pixel.
+    plain = stars[measured.fit.worst_pixel_sigma[stars] <= psf_fit.MISFIT_SIGMA]
+    stars = plain if len(plain) >= FEWEST_BRIGHT else stars
     # Few stars of a narrow field are bright.
     for least_snr in (BRIGHT_SNR, SHOWN_SNR):
         bright = stars[measured.fit.snr[stars] > least_snr][:_MOST]

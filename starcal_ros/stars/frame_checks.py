@@ -61,13 +61,13 @@ class Fingerprint:
     """
     Checksums of a frame, to recognise it when it is delivered again.
 
-    ``rows`` (k,) are checksums of the sampled rows that hold noise, 0 for the others; ``whole`` is
-    a digest of all pixels if no row holds noise, else empty.
+    ``rows`` (k,) are checksums of the sampled rows that hold noise, 0 for the others; ``digest``
+    is that of all sampled rows, or of all pixels if no row holds noise.
     """
 
     time_ns: int
     rows: NDArray[np.uint32]
-    whole: bytes
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,11 @@ def fingerprint(image: Image, sample: RowSample) -> Fingerprint:
     """Checksums of a frame by its sampled rows."""
     distinctive = sample.distinctive
     rows = np.array([zlib.crc32(row) for row in sample.pixels], np.uint32) * distinctive
-    # Without noise a few rows may equal those of another frame: only all pixels are decisive.
-    whole = b'' if distinctive.any() else hashlib.blake2b(image.pixels.tobytes()).digest()
-    return Fingerprint(image.time_ns, rows, whole)
+    # Without noise a few rows may equal those of another frame: only all pixels are decisive.  To
+    # digest them always would double the time of a frame (27 ms for five megapixels).
+    decisive = sample.pixels if distinctive.any() else image.pixels
+    digest = hashlib.blake2b(decisive.tobytes(), digest_size=16).hexdigest()
+    return Fingerprint(image.time_ns, rows, digest)
 
 
 def screen(
@@ -190,14 +192,11 @@ def _refuse_repeated(current: Fingerprint, before: Fingerprint, options: Screeni
     if len(before.rows) != len(current.rows):
         return
     since_s = (current.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
-    distinctive = current.rows != 0
-    same = distinctive & (before.rows == current.rows)
-    everywhere = distinctive.any() and same.sum() == distinctive.sum()
-    if everywhere or (current.whole and current.whole == before.whole):
+    if current.digest == before.digest:
         if since_s == 0.0:
             return  # the same frame delivered twice: the camera is not stuck
         raise ImageRefused('frozen', f'the pixels of the image {since_s:.3f} s before')
-    part = float(same.mean())
+    part = float(((current.rows != 0) & (before.rows == current.rows)).mean())
     if part > options.max_lost_fraction:
         detail = f'{part:.0%} of its rows are of the image {since_s:.3f} s before'
         raise ImageRefused('incomplete', detail)

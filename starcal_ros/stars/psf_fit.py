@@ -41,9 +41,10 @@ class PsfFit:
     ``worst_pixel_sigma`` (n,): largest residual of a pixel in units of its noise.
     ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
     those of the PSF as a fraction of its variance, and its 1-sigma.
-    ``signal_dn`` and ``residual_dn`` (n, p): light of the star in each pixel of its stamp, and
-    residual of the fit, NaN for excluded pixels.  ``derivatives`` (n, 4, p) by the parameters,
-    over the noise of each pixel, and ``noise_covariance`` (n, 4, 4), without the error of the PSF.
+    ``signal_dn``, ``residual_dn`` and ``sigma_dn`` (n, p): light of the star in each pixel of its
+    stamp, residual of the fit and 1-sigma of the noise, NaN for excluded pixels.  ``derivatives``
+    (n, 4, p) by the parameters, over the noise of each pixel, and ``noise_covariance`` (n, 4, 4),
+    without the error of the PSF.
     """
 
     parameters: Floats
@@ -54,6 +55,7 @@ class PsfFit:
     shape_sigma: Floats
     signal_dn: Floats
     residual_dn: Floats
+    sigma_dn: Floats
     derivatives: Floats
     noise_covariance: Floats
 
@@ -230,26 +232,27 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     noise_covariance = covariance
     parameters = parameters + last
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
-    misfit = residual
+    excess: Floats | float = 0.0
     if pixel_noise.psf_error > 0:
         # The variance that the PSF error adds to a pixel, over the variance in its weight.
         flux = np.maximum(parameters[:, 2, None], 0.0)
         excess = pixel_noise.psf_error**2 * flux * light * root_weight**2
-        misfit = residual / np.sqrt(1.0 + excess)
         scatter = (rows[:, :7] * excess[:, None, :]) @ rows[:, :7].transpose(0, 2, 1)
         covariance = covariance + covariance @ scatter[:, :4, :4] @ covariance
         shape_variance = shape_variance + (of_shape * (scatter @ of_shape)).sum(axis=1)
-    with np.errstate(invalid='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore'):
         residual_dn = residual / root_weight
+        sigma_dn = np.where(root_weight > 0.0, np.sqrt(1.0 + excess) / root_weight, np.nan)
     return PsfFit(
         parameters=parameters,
         covariance=covariance,
         snr=snr,
-        worst_pixel_sigma=np.abs(misfit).max(axis=1, initial=0.0),
+        worst_pixel_sigma=np.abs(residual / np.sqrt(1.0 + excess)).max(axis=1, initial=0.0),
         shape_change=shape_step,
         shape_sigma=np.sqrt(shape_variance),
         signal_dn=light,
         residual_dn=residual_dn,
+        sigma_dn=sigma_dn,
         derivatives=rows[:, :4],
         noise_covariance=noise_covariance,
     )

@@ -354,13 +354,13 @@ def test_deep_files_with_a_date_go_before_more_previews(tmp_path: Path) -> None:
     assert notes == ['10 images of 40 x 30 are used; left out: 20 of 20 x 15, which show no stars']
 
 
-def test_the_deepest_file_of_one_exposure_is_kept(tmp_path: Path) -> None:
+def test_the_deepest_file_of_one_exposure_comes_first(tmp_path: Path) -> None:
     (tmp_path / 'deep.fits.gz').write_bytes(gzip.compress(unit(PIXELS, [START, EIGHT])))
     eight = fits.PrimaryHDU(PIXELS.astype(np.uint8), fits.Header({'EXPTIME': 8.0}))
     eight.header['DATE-OBS'] = '2024-03-09T22:10:00'
     eight.writeto(tmp_path / 'preview.fits')
     chosen, _ = photographs_of([tmp_path])
-    assert [one.path.name for one in chosen] == ['deep.fits.gz']
+    assert [one.path.name for one in chosen] == ['deep.fits.gz', 'preview.fits']
 
 
 def stars_at(rotations: Sequence[Rotation]) -> FromStars:

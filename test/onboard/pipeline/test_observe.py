@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,11 @@ from starcal_ground.simulation.scenario import attitude_samples, Inertial, scene
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.record_messages import (
+    observations_from_message,
+    observations_to_message,
+)
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image, StarObservations
@@ -175,11 +181,58 @@ def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: Setup) -> Non
 def test_a_recording_that_plays_twice_counts_once(setup: Setup) -> None:
     first, _ = observe.observe_next(image(), attitudes(), setup, observe.Track(setup.prior))
     assert not first.refusal
-    later = dataclasses.replace(first, time_ns=first.time_ns + 1)
+    later = dataclasses.replace(first, time_ns=first.time_ns + 1, pixel_digest='another')
     ensemble = Ensemble().add(first).add(later)
     again = dataclasses.replace(first, attitude_gap_s=0.125)
     ensemble = ensemble.add(again)
     assert ensemble.images == (first, later) and dict(ensemble.refused) == {'duplicate': 1}
+
+
+MS = 1_000_000
+LATER = 1000 * S
+SHOWN_AGAIN: dict[str, tuple[list[tuple[int, int]], dict[str, int]]] = {
+    'the camera hangs': ([(1, 0), (2, 0), (2, S), (2, 2 * S)], {'frozen': 2}),
+    'a recording again, with new stamps': (
+        [(k, again * LATER) for again in range(3) for k in (1, 2)],
+        {'duplicate': 4},
+    ),
+    'two publishers, in turn': ([(k, late) for k in (1, 2) for late in (0, MS)], {'frozen': 2}),
+    'two publishers, one after the other': (
+        [(k, late) for late in (0, MS) for k in (1, 2, 3, 4)],
+        # The third image from the past starts anew.
+        {'out_of_order': 2, 'duplicate': 2},
+    ),
+}
+"""Numbers of images with their delay, and the reasons to refuse some."""
+
+
+@pytest.mark.parametrize('is_recorded', [False, True])
+@pytest.mark.parametrize('name', SHOWN_AGAIN)
+def test_an_image_counts_once_whatever_its_stamps(
+    setup: Setup, name: str, is_recorded: bool
+) -> None:
+    shown, refused = SHOWN_AGAIN[name]
+    ensemble, track, held = Ensemble(), observe.Track(setup.prior), AttitudeHistory()
+    for index, delay_ns in sorted(shown, key=lambda one: one[1]):
+        for sample in attitude_samples(SCENARIO, index):
+            time_ns = sample.time_ns + delay_ns
+            held.add(time_ns, dataclasses.replace(sample, time_ns=time_ns))
+    for index, delay_ns in shown:
+        one = dataclasses.replace(image(index), time_ns=image(index).time_ns + delay_ns)
+        found, track = observe.observe_next(one, held, setup, track)
+        if is_recorded:
+            found = observations_from_message(
+                observations_to_message(found, 'camera', make_message)
+            )
+        ensemble = ensemble.add(found)
+    assert len(ensemble.images) == len({index for index, _ in shown})
+    assert dict(ensemble.refused) == refused
+
+
+def test_images_of_recordings_without_digests_are_told_apart_by_their_stamps() -> None:
+    older = [StarObservations.of_image(k, (640, 512)) for k in range(3)]
+    ensemble = functools.reduce(Ensemble.add, older, Ensemble())
+    assert len(ensemble.images) == 3
 
 
 def test_a_refused_image_does_not_put_those_after_it_out_of_order(

@@ -98,6 +98,32 @@ def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) ->
     assert 0.96 < truth < 1.04
 
 
+@pytest.mark.parametrize(
+    ('psf_sigma_px', 'tail_px', 'part'),
+    [(0.95, 0.0, 0.25), (0.7, 2.0, 0.25), (0.7, 2.5, 0.12), (0.95, 2.5, 0.12), (0.95, 3.0, 0.2)],
+)
+@pytest.mark.parametrize('brightest', [5.3, 6.3])
+def test_stars_of_one_shape_are_measured_and_another_shape_is_refused(
+    psf_sigma_px: float, tail_px: float, part: float, brightest: float
+) -> None:
+    """Comatic stars, with a part of the light in a tail; all were refused, or all but a few."""
+    rng = np.random.default_rng(4)
+    xy = star_grid(3)
+    flux = 10 ** rng.uniform(brightest - 1.5, brightest, len(xy))  # electrons
+    other = rng.choice(len(xy), 8, replace=False)
+    tail = np.tile([tail_px, 0.5 * tail_px], (len(xy), 1))
+    tail[other] = [-1.6, 1.9]  # as a companion, in another direction
+    detector = dataclasses.replace(
+        QUIET, bits=16, electrons_per_dn=40.0, offset_dn=500.0, psf_sigma_px=psf_sigma_px
+    )
+    both = np.concatenate([xy, xy + tail]), np.concatenate([(1 - part) * flux, part * flux])
+    found = measured(exposed(5, *both, detector), xy)
+    elongated = found.refusal == StarRefusal.ELONGATED
+    # A companion that is as faint as the tails may be as near to the common shape as they are.
+    assert elongated[other].sum() >= 4
+    assert elongated.sum() < len(other) + 0.07 * len(xy)
+
+
 def test_the_covariance_is_true_where_the_gain_is_given() -> None:
     options = CentroidOptions(gain_e_per_dn=QUIET.electrons_per_dn)
     squared = []
