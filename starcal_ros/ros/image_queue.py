@@ -20,13 +20,8 @@ import numpy as np
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.pipeline.diagnosis.diagnose import (
-    diagnose,
-    Diagnosis,
-    IMAGES_OF_AN_ALIGNMENT,
-    wire_attitudes,
-    WireAttitudes,
-)
+from starcal_ros.pipeline.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, IMAGES_OF_AN_ALIGNMENT
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import ChildProcess
 from starcal_ros.records import AttitudeSample, Image
@@ -378,4 +373,4 @@ def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -
     """Diagnose in a process of its own."""
     if setup.is_aligned:  # else all images wait for the answer
         os.nice(_LOWEST_PRIORITY)
-    return diagnose(images, attitudes, setup)
+    return diagnose(images, attitudes, setup, unmatched=True)

@@ -20,13 +20,8 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_frames, read_telemetry
 from starcal_ros.identification.blind.images import LOOKED_AT
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.diagnosis.diagnose import (
-    diagnose,
-    Diagnosis,
-    found_alignment,
-    wire_attitudes,
-    WireAttitudes,
-)
+from starcal_ros.pipeline.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
 from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.pipeline.topics import Topics

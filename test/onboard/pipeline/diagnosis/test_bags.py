@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.bag import reader
+from starcal_ros.pipeline.diagnosis.attitude_readings import wire_attitudes
 from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
-from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment, wire_attitudes
+from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image

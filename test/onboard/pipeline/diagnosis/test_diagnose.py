@@ -22,7 +22,8 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.camera import CameraModel
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
-from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis, WireAttitudes
+from starcal_ros.pipeline.diagnosis.attitude_readings import WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.sky.attitude import AttitudeOptions
