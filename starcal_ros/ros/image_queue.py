@@ -373,4 +373,4 @@ def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -
     """Diagnose in a process of its own."""
     if setup.is_aligned:  # else all images wait for the answer
         os.nice(_LOWEST_PRIORITY)
-    return diagnose(images, attitudes, setup, unmatched=True)
+    return diagnose(images, attitudes, setup, refused='no_match')

@@ -28,7 +28,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.first_setup import first_setup
-    from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
+    from starcal_ros.pipeline.diagnosis.bags import diagnose_source
 
     given = arguments.given(args)
     setup, _ = given.checked()
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
         source = first.source
         arguments.print_notes(source.notes)
-        diagnosis = diagnose_bags(source.bags, source.topics, source.setup)
+        diagnosis = diagnose_source(source)
     if args.json:
         arguments.print_json(diagnosis)
     else:

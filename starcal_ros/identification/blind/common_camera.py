@@ -69,7 +69,7 @@ def common_camera(
             eliminated = np.linalg.solve(N[:3, :3], np.column_stack([N[:3, 3:], b[:3]]))
             N_camera += N[3:, 3:] - N[3:, :3] @ eliminated[:, :4]
             right = right + b[3:] - N[3:, :3] @ eliminated[:, 4]
-        step: Floats = np.linalg.solve(N_camera, right)
+        step = np.linalg.solve(N_camera, right).astype(np.float64)
         turns = [-np.linalg.solve(N[:3, :3], b[:3] - N[:3, 3:] @ step) for N, b, _ in equations]
         rotations = [
             Rotation.from_rotvec(turn) * rotation

@@ -214,7 +214,7 @@ def _step(
     N[range(3, 7), range(3, 7)] += N_prior
     b[3:] += b_prior
     N[range(7), range(7)] *= 1.0 + 1e-12
-    step: Floats = np.linalg.solve(N, b)
+    step = np.linalg.solve(N, b).astype(np.float64)
     camera = moved(fit.camera, image.camera, step[3:], image.ranges.centre * image.camera.width)
     return SkyFit(Rotation.from_rotvec(-step[:3]) * fit.camera_from_icrf, camera, fit.stars)
 

@@ -165,7 +165,7 @@ def _exchanged_axes() -> tuple[tuple[str, Rotation], ...]:
                     f'{"-" if sign < 0 else ""}{"xyz"[k]}'
                     for k, sign in zip(order, signs, strict=True)
                 )
-                name = f'x, y, z along {along} of the ICRF'
+                name = f'a frame whose x, y, z are {along} of the ICRF'
                 found.append((name, Rotation.from_matrix(matrix)))
     return tuple(found)
 
