@@ -373,4 +373,5 @@ def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -
     """Diagnose in a process of its own."""
     if setup.is_aligned:  # else all images wait for the answer
         os.nice(_LOWEST_PRIORITY)
-    return diagnose(images, attitudes, setup, refused='no_match')
+    # Without an alignment nothing was measured.
+    return diagnose(images, attitudes, setup, refused='no_match' if setup.is_aligned else '')

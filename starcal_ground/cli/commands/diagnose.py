@@ -4,14 +4,16 @@ Find out why the images of a bag match no star.
 
 Identifies some of the first images without attitude or alignment, compares the attitudes,
 alignment and camera that are stated with them, and prints the error, the evidence for it and the
-lines of the parameter file that correct it.
+lines of the parameter file that correct it.  Where all of them fit, it measures up to 40 images as
+starcal calibrate does, and prints why that would refuse them.
 
   # find the cause if no image matches
   starcal diagnose bags/tiny --params bags/tiny/params.yaml
   # machine-readable output
   starcal diagnose bags/tiny --params bags/tiny/params.yaml --json
 
-exit status: 0 the set-up is right; 3 it is wrong, or the cause is unknown; 2 bad input.
+exit status: 0 the set-up is right and starcal calibrate accepts the images; 3 it does not, or the
+set-up is wrong, or the cause is unknown; 2 bad input.
 """
 
 import argparse
