@@ -448,6 +448,10 @@ def _is_read(shown: Shown) -> bool:
     return shown.reading is not None
 
 
+def _lacks_attitudes(shown: Shown) -> bool:
+    return shown.setup.has_tracker and not shown.has_attitudes
+
+
 def _is_not_read(shown: Shown) -> bool:
     return shown.has_attitudes and shown.reading is None and not shown.is_mirrored
 
@@ -564,6 +568,12 @@ def _clock(shown: Shown) -> list[Diagnosis]:
     if 0 < zones * _ZONE_S < _SAME_DATE_S and abs(abs(shift_s) - zones * _ZONE_S) < _SAME_CLOCK_S:
         evidence.append(f'{zones * _ZONE_S / 3600:g} h is the difference of two time zones')
     return [Diagnosis('clock', offset_s, sentence, tuple(evidence), tuple(mend))]
+
+
+def _no_attitudes(shown: Shown) -> list[Diagnosis]:
+    sentence = 'There are no attitudes of the star tracker to hold against the images.'
+    mend = '# record attitudes from before the first image to after the last'
+    return [Diagnosis('no_attitude', None, sentence, mend=(mend,))]
 
 
 def _frozen(shown: Shown) -> list[Diagnosis]:
@@ -830,6 +840,7 @@ def _brightness_slope(shown: Shown) -> tuple[float, float] | None:
 
 HYPOTHESES = (
     Hypothesis('mirrored', _always, _mirrored),
+    Hypothesis('no_attitude', _lacks_attitudes, _no_attitudes),
     Hypothesis('frozen_attitude', _is_not_read, _frozen),
     Hypothesis('unknown', _is_not_read, _no_reading),
     Hypothesis('quaternion_order', _is_read, _order),

@@ -87,7 +87,7 @@ def test_a_process_of_its_own(
         unmatched.add(image)
     assert unmatched._thread is not None
     unmatched._thread.join()
-    assert [found.cause for found in answers] == ['unknown']
+    assert [found.cause for found in answers] == ['no_attitude']
     assert answers[0].evidence[0].startswith('3 of 3 images identified without attitude')
     unmatched.close()
     unmatched.add(three[0])

@@ -227,7 +227,8 @@ def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
     # The prior of the rendered night is off by 150 arcsec an axis; a lost principal point of 1 px
     # would be 100 arcsec. Within the degree and a half that is searched, it will do.
     assert isinstance(found.found, list)
-    assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.0)
+    # It goes with the principal point stated: that of the real night is off by 49 of 2656 px.
+    assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.2)
 
 
 def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog) -> None:
@@ -611,6 +612,7 @@ def test_the_numbers_of_a_camera_matrix(catalog: StarCatalog) -> None:
     night = slewing_night()
     fx, cx, cy = (float(night.setup.prior.camera.parameters[k]) for k in (0, 3, 4))
     found = found_in(with_centre(0.3, 0.2)(night), catalog)
+    assert isinstance(found.found, list)
     # The prior is off by 4 px, which the stars show to 1.
     assert found.found == pytest.approx([cx, cy], abs=7.0)
     assert found.mend == (
@@ -645,7 +647,7 @@ def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: St
     quaternions = np.concatenate([night.attitudes.quaternion, turns])[order]
     of_a_day = dataclasses.replace(night, attitudes=WireAttitudes(time_ns[order], quaternions))
     found = found_in(with_stamps(of_a_day, late_s), catalog)
-    assert found.cause == 'clock' and words in found.evidence[-3:]
+    assert found.cause == 'clock' and words in ' '.join(found.evidence)
     assert found.found == pytest.approx(-late_s, abs=0.1)  # as in `test_clock`
 
 
@@ -665,7 +667,7 @@ def test_a_tone_curve_that_was_undone_but_never_there(catalog: StarCatalog) -> N
     ('shape', 'remedies'),
     [
         ((256, 320), ['if they are binned 2 x 2', 'if they are a region of the detector']),
-        ((400, 600), ['cx = 320.45 - x_offset']),
+        ((400, 600), ['cx = 319.50 - x_offset']),
         ((1024, 1280), ['the focal length in their pixels']),
     ],
 )
