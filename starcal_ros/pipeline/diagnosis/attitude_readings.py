@@ -83,7 +83,7 @@ def wire_attitudes(history: AttitudeHistory, direction: str) -> WireAttitudes:
 @dataclass(frozen=True)
 class Meaning:
     """
-    What received numbers mean: their order and signs, the direction, and the inertial axes.
+    Meaning of received numbers: their order and signs, the direction, and the inertial axes.
 
     ``numbers`` is what the fields x, y, z, w hold.  ``axes`` is one of `_OTHER_AXES`, empty for
     the ICRF, or a name of the axes whose rotation from the ICRF is ``axes_from_icrf``.

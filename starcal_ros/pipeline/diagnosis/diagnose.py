@@ -109,7 +109,7 @@ def found_alignment(diagnosis: Diagnosis) -> tuple[list[float] | None, str]:
 @dataclass(frozen=True)
 class Shown:
     """
-    What identified images show, and the set-up to hold against it.
+    Camera and rotations that identified images show, and the set-up to hold against them.
 
     ``bins`` are the pixels of the prior camera along one of the images, 0 for another focal
     length; ``stated`` is the prior camera in the pixels of the images, as far as it states them.
@@ -430,7 +430,7 @@ def _agreement(reading: Reading, case: Case) -> list[str]:
 
 class Hypothesis(NamedTuple):
     """
-    What may be wrong, as `Diagnosis.cause`; what it needs to be tested; and the test.
+    A possible mistake, as `Diagnosis.cause`; what it needs to be tested; and the test.
 
     The test gives a diagnosis where the stars show it.
     """
@@ -855,7 +855,7 @@ HYPOTHESES = (
     Hypothesis('prior_alignment', _is_aligned_by, _alignment),
     Hypothesis('not_linear', _always, _tone_curve),
 )
-"""What can be wrong where images are identified, the one that hides the others first."""
+"""Possible mistakes where images are identified, the one that hides the others first."""
 CAUSES = (
     *('none', 'smear', 'no_stars', 'refused'),
     *dict.fromkeys(hypothesis.cause for hypothesis in HYPOTHESES),
