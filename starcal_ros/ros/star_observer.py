@@ -324,7 +324,7 @@ class StarObserver(StarcalNode):
         awaited = self._star_trackers.awaited(image.time_ns)
         observations, self._track = self._observe_next(image, before)
         why = self._unmatched.diagnosis
-        if why is not None and why.cause != 'unknown' and observations.refusal == 'no_match':
+        if why and why.cause not in ('none', 'unknown') and observations.refusal == 'no_match':
             observations = dataclasses.replace(observations, detail=why.in_a_sentence())
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1

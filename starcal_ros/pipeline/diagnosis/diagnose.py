@@ -407,6 +407,8 @@ def _joined(findings: Sequence[Diagnosis], evidence: list[str], shown: Shown) ->
 
 def _fitting(shown: Shown) -> str:
     """Sentence on what was held against the stars, and fits."""
+    if shown.has_attitudes and shown.refused == 'no_match':
+        return 'Attitudes, alignment and camera fit, but a measurement matches no stars with them.'
     if shown.has_attitudes:
         return 'Attitudes, alignment and camera fit the images.'
     if _states_camera(shown):
