@@ -126,10 +126,11 @@ def observe(
     for record in bag_topics.read(source.bags, source.topics, source.setup, on_image, wanted):
         measured.append(record)
         on_record()
-    return _observed(source, measured)
+    return observed_of(source, measured)
 
 
-def _observed(source: Source, measured: Sequence[StarObservations], *notes: str) -> Observed:
+def observed_of(source: Source, measured: Sequence[StarObservations], *notes: str) -> Observed:
+    """Measured observations with the air that all together show, and notes."""
     observations, note = measured, ''
     if source.through_air is not None:
         observations, note = source.through_air(measured)
@@ -150,7 +151,7 @@ def calibrate(
     """
     campaign = _solved(observed, inputs)
     again, note = _measured_again(observed, campaign.calibration, progress)
-    return _solved(_observed(observed.source, again, note), inputs) if note else campaign
+    return _solved(observed_of(observed.source, again, note), inputs) if note else campaign
 
 
 def _measured_again(

@@ -10,7 +10,6 @@ any is searched further.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-import dataclasses
 from dataclasses import dataclass
 import itertools
 import math
@@ -24,7 +23,7 @@ from starcal_ground.blind.bright_sources import bright_sources, BrightSources, s
 from starcal_ground.blind.search import SkyMatch
 from starcal_ground.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera import CameraModel
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 from starcal_ros.stars.streak import LONGEST_PX
@@ -38,7 +37,6 @@ _FEW = 3  # identified, with which no image is searched further
 FEWEST_SOURCES = 6
 _BLURRED_ENDS_PX = 1.0  # by which the sources of a streak are longer than it
 _SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
-_MISFIT_PX = 3.0  # of a star whose identification is left out of a rotation
 
 
 @dataclass
@@ -190,8 +188,8 @@ def identify_images(
             break
     for later in search.ROUNDS[1:]:
         pending = _look_up(finder, pending, solved, later)
-    alike = sorted(_with_one_camera(solved, catalog), key=lambda image: image.time_ns)
-    return Identified(tuple(alike), tuple(looked_at), tuple(other_sizes))
+    solved.sort(key=lambda image: image.time_ns)
+    return Identified(tuple(solved), tuple(looked_at), tuple(other_sizes))
 
 
 def _look_up(
@@ -222,41 +220,3 @@ def _sources(image: Image, camera: CameraModel) -> _Sources | None:
     if pixels.shape != sides:
         return None
     return _Sources(image.time_ns, bright_sources(pixels), is_turned)
-
-
-def _with_one_camera(solved: Sequence[Solved], catalog: StarCatalog) -> list[Solved]:
-    """
-    Images with the rotation that one camera for all gives.
-
-    Each by itself cannot tell a rotation from a shift of the principal point.
-    """
-    if not solved:
-        return []
-    parameters = np.median([image.sky.camera.parameters for image in solved], axis=0)
-    camera = dataclasses.replace(solved[0].sky.camera, parameters=parameters)
-    return [
-        dataclasses.replace(
-            image,
-            sky=dataclasses.replace(
-                image.sky, camera_from_icrf=_rotation(image.sky, camera, catalog)
-            ),
-        )
-        for image in solved
-    ]
-
-
-def _rotation(sky: SkyMatch, camera: CameraModel, catalog: StarCatalog) -> Rotation:
-    """The rotation ``camera_from_icrf`` of an identified image with another camera."""
-    lines = line_of_sight(camera, sky.camera_px)
-    stars = catalog.direction_icrs[sky.catalog_index]
-    good = np.isfinite(lines[:, 0])
-    limit_rad = _MISFIT_PX / float(camera.parameters[0])
-    rotation = sky.camera_from_icrf
-    for _ in range(2):
-        if np.count_nonzero(good) < 3:
-            return sky.camera_from_icrf
-        rotation, _ = Rotation.align_vectors(lines[good], stars[good])
-        apart = np.linalg.norm(rotation.apply(stars) - lines, axis=1)
-        # A camera that fits all images on average may be some pixels off in one.
-        good = apart < max(limit_rad, 2.0 * float(np.nanmedian(apart)))
-    return rotation

@@ -206,42 +206,77 @@ def _step(
     image: SourceImage, catalog: StarCatalog, fit: SkyFit, pairs: Indices, scale_px: float
 ) -> SkyFit:
     """One robust Gauss-Newton step; ``scale_px`` is the expected residual of a pair."""
-    camera, prior, half_px = fit.camera, image.camera, image.half_diagonal_px
-    before, (fx, skew, fy, cx, cy) = prior.parameters, camera.intrinsics.tolist()
-    # k1 as displacement in the corner over the radius there.
-    k1_per_part = (fx / half_px) ** 2
-    directions = catalog.direction_icrs[pairs[:, 0]] @ fit.camera_from_icrf.as_matrix().T
+    directions = catalog.direction_icrs[pairs[:, 0]]
+    N, b, _ = star_equations(
+        fit.camera, fit.camera_from_icrf, directions, image.xy_px[pairs[:, 1]], scale_px
+    )
+    N_prior, b_prior = prior_equations(fit.camera, image.camera, image.ranges)
+    N[range(3, 7), range(3, 7)] += N_prior
+    b[3:] += b_prior
+    N[range(7), range(7)] *= 1.0 + 1e-12
+    step = np.linalg.solve(N, b).astype(np.float64)
+    camera = moved(fit.camera, image.camera, step[3:], image.ranges.centre * image.camera.width)
+    return SkyFit(Rotation.from_rotvec(-step[:3]) * fit.camera_from_icrf, camera, fit.stars)
+
+
+def star_equations(
+    camera: CameraModel,
+    camera_from_icrf: Rotation,
+    directions_icrs: Floats,
+    xy_px: Floats,
+    scale_px: float,
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Normal matrix (7, 7) and right side (7,) of stars (n, 3) measured at (n, 2), residuals (2, n).
+
+    By the rotation, the logarithm of the focal length, the principal point, px, and ``k1`` as
+    displacement in the corner over the radius there.  Residuals far over ``scale_px`` count less.
+    """
+    half_px = 0.5 * math.hypot(camera.width, camera.height)
+    fx, skew, fy, cx, cy = camera.intrinsics.tolist()
+    directions = directions_icrs @ camera_from_icrf.as_matrix().T
     ideal = ideal_points(camera.model, directions)
     xd, yd = distort(camera.model, ideal, camera.distortion).T
-    x_by_k1, y_by_k1 = (
-        k1_per_part * coefficient_jacobian(camera.model, ideal, camera.distortion)[:, 0]
+    x_by_k1, y_by_k1 = (fx / half_px) ** 2 * (
+        coefficient_jacobian(camera.model, ideal, camera.distortion)[:, 0]
     )
-    J = np.zeros((2, len(pairs), 7))  # by rotation, logarithm of the focal length, cx, cy, k1
+    J = np.zeros((2, len(ideal), 7))
     J[:, :, :3] = rotation_jacobian(camera, directions).transpose(1, 0, 2)
     J[0, :, 3], J[1, :, 3] = fx * xd, fy * yd
     J[0, :, 4] = J[1, :, 5] = 1.0
     J[0, :, 6], J[1, :, 6] = fx * x_by_k1 + skew * y_by_k1, fy * y_by_k1
-    residual = image.xy_px[pairs[:, 1]].T - [fx * xd + skew * yd + cx, fy * yd + cy]
-    weight = 1.0 / (scale_px**2 + (residual**2).sum(axis=0) / 4)
-    part = (float(camera.parameters[5]) - float(before[5])) / k1_per_part
-    off = [math.log(before[0] / fx), float(before[3]) - cx, float(before[4]) - cy, -part]
-    ranges, centre_px = image.ranges, image.ranges.centre * camera.width
-    held = (1.7 / np.array([ranges.focal, centre_px, centre_px, ranges.distortion])) ** 2
+    residual_px = xy_px.T - [fx * xd + skew * yd + cx, fy * yd + cy]
+    weight = 1.0 / (scale_px**2 + (residual_px**2).sum(axis=0) / 4)
     weighted = (J * weight[:, None]).reshape(-1, 7).T
-    N = weighted @ J.reshape(-1, 7)
-    b = weighted @ residual.reshape(-1)
-    N[[3, 4, 5, 6], [3, 4, 5, 6]] += held
-    b[3:] += held * off
-    N[range(7), range(7)] *= 1.0 + 1e-12
-    step = np.linalg.solve(N, b).tolist()
-    growth = math.exp(_within(step[3], 0.2))
+    return weighted @ J.reshape(-1, 7), weighted @ residual_px.reshape(-1), residual_px
+
+
+def prior_equations(
+    camera: CameraModel, prior: CameraModel, ranges: Ranges
+) -> tuple[Floats, Floats]:
+    """Diagonal (4,) and right side (4,) of a prior camera for the last unknowns of a star."""
+    half_px = 0.5 * math.hypot(camera.width, camera.height)
+    (fx, _, _, cx, cy, k1), before = camera.parameters[:6].tolist(), prior.parameters[:6].tolist()
+    part = (k1 - before[5]) * (half_px / fx) ** 2
+    off = [math.log(before[0] / fx), before[3] - cx, before[4] - cy, -part]
+    centre_px = ranges.centre * prior.width
+    held = (1.7 / np.array([ranges.focal, centre_px, centre_px, ranges.distortion])) ** 2
+    return held, held * off
+
+
+def moved(camera: CameraModel, prior: CameraModel, step: Floats, centre_px: float) -> CameraModel:
+    """A camera after a step (4,) of at most 22 %, ``centre_px`` and 5 % of the radius."""
+    half_px = 0.5 * math.hypot(camera.width, camera.height)
+    growth = math.exp(_within(float(step[0]), 0.2))
     changed = camera.parameters.copy()
+    before = float(prior.parameters[5])
+    part = (float(changed[5]) - before) * (half_px / float(changed[0])) ** 2
     changed[[0, 2]] *= growth
-    changed[3] += _within(step[4], centre_px)
-    changed[4] += _within(step[5], centre_px)
-    changed[5] = before[5] + (part + _within(step[6], 0.05)) * (growth * fx / half_px) ** 2
-    rotation = Rotation.from_rotvec([-step[0], -step[1], -step[2]]) * fit.camera_from_icrf
-    return SkyFit(rotation, dataclasses.replace(camera, parameters=changed), fit.stars)
+    changed[3] += _within(float(step[1]), centre_px)
+    changed[4] += _within(float(step[2]), centre_px)
+    part += _within(float(step[3]), 0.05)
+    changed[5] = before + part * (float(changed[0]) / half_px) ** 2
+    return dataclasses.replace(camera, parameters=changed)
 
 
 def _within(value: float, limit: float) -> float:

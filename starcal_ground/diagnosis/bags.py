@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import islice
 import math
 from pathlib import Path
@@ -18,39 +19,46 @@ from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.frames import read_frames, read_telemetry
 from starcal_ground.bags.topics import Topics
 from starcal_ground.blind.images import LOOKED_AT
-from starcal_ground.diagnosis.diagnose import (
-    diagnose,
-    Diagnosis,
-    found_alignment,
-    wire_attitudes,
-    WireAttitudes,
-)
+from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
+from starcal_ground.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
 from starcal_ros.assessment.gate import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
-from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations
+from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations, StarRefusal
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import sky_circle
 
 _PLACES = 8  # in the sky that a sentence lists
 _CIRCLE = re.compile(r'RA (\S+), Dec (\S+), radius (\S+) deg')  # of `sky_circle`
 _ONE_QUERY_DEG = 5.0  # radius of the sky of all images that one table can have
-_MEASURED = 10  # images, for the reason of their refusal
+_MEASURED = 10  # images, of which one is to be used before others are measured
+_STAR_REMEDIES = {
+    StarRefusal.FAINT.label: 'expose for longer',
+    StarRefusal.SATURATED.label: 'expose for a shorter time',
+    StarRefusal.HOT_PIXEL.label: 'check bad_pixel_map and dark_frame',
+    StarRefusal.ELONGATED.label: 'mend coma, focus or tracking: so many are no cosmic rays',
+    StarRefusal.NOT_DETECTED.label: 'check for clouds and dew, or lower magnitude_limit',
+}
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
 """Refusals after which the sky of an image cannot be held against the set-up."""
 
 
 @dataclass(frozen=True)
 class Refused:
-    """Images refused for one reason: their count, its meaning, and the first of them."""
+    """
+    Images refused for one reason: their count, its meaning, and the first of them.
+
+    ``stars`` are the reasons for which their stars were left out, the most frequent first.
+    """
 
     reason: str
     count: int
     meaning: str
     first_ns: int
     detail: str
+    stars: Mapping[str, int] = field(default_factory=dict)
 
 
 def diagnose_bags(
@@ -59,9 +67,32 @@ def diagnose_bags(
     """
     Why the images of bags cannot be used: by their refusals, by their stamps, by their stars.
 
-    ``refused`` are the images of a calibration in which all were refused; without them the first
-    images are measured where the sky does not name the cause. Raises BagError when a bag cannot be
-    read, or holds no images with attitudes.
+    ``refused`` are all images, if a measurement with the setup has refused them.  Raises BagError
+    when a bag cannot be read, or holds no images with attitudes.
+    """
+    diagnosis = of_bags(paths, requested, setup, refused)
+    return refused_all_the_same(refused, diagnosis) if diagnosis.cause == 'none' else diagnosis
+
+
+def refused_all_the_same(
+    refused: Sequence[Refused], fits: Diagnosis, images: int = 0
+) -> Diagnosis:
+    """The refusals of images whose set-up fits as their cause; ``images``: of so many."""
+    by_images = of_refusals(refused, images or sum(group.count for group in refused))
+    if by_images is None:
+        return fits
+    # The remedy of the others is to ask for this diagnosis.
+    mend = () if by_images.cause == 'no_match' else by_images.mend
+    return replace(by_images, evidence=(*fits.evidence, *by_images.evidence), mend=mend)
+
+
+def of_bags(
+    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused]
+) -> Diagnosis:
+    """
+    `diagnose_bags`, with ``none`` where attitudes, alignment and camera fit.
+
+    ``refused`` are the images that a measurement with the setup has refused, if there was one.
     """
     topics = bag_topics.choose_topics(paths, requested, setup)
     if topics.observations:
@@ -78,14 +109,13 @@ def diagnose_bags(
     spans = _without_common_time(first, attitudes)
     shift_ns = spans[1][0] - spans[0][0] if spans else 0
     images = _images(paths, topics.image, setup, shift_ns)
-    diagnosis = diagnose(images, attitudes, setup, shift_ns / NANOSECONDS_PER_SECOND)
+    most = refused[0].reason if refused else ''
+    shift_s = shift_ns / NANOSECONDS_PER_SECOND
+    diagnosis = diagnose(images, attitudes, setup, shift_s, most)
     if spans:
         return diagnosis if diagnosis.cause == 'clock' else of_two_clocks(*spans)
-    if diagnosis.cause not in ('none', 'unknown', 'no_stars'):
+    if diagnosis.cause not in ('unknown', 'no_stars'):
         return diagnosis
-    if not refused and setup.is_aligned:
-        measured = tuple(islice(bag_topics.read(paths, topics, setup), _MEASURED))
-        refused = refusals(measured) if all(record.refusal for record in measured) else ()
     count = sum(group.count for group in refused)
     by_itself = [group for group in refused if group.reason not in ('no_match', 'no_stars')]
     return of_refusals(by_itself, count) or diagnosis
@@ -130,10 +160,15 @@ def of_refusals(refused: Sequence[Refused], images: int) -> Diagnosis | None:
     count = 'All' if most.count == images else f'{most.count} of'
     # A detail that has a remedy of its own knows better.
     remedy = '' if ': set ' in most.detail else REMEDIES.get(most.reason)
+    detail = most.detail or most.meaning
+    if most.reason == 'too_few_stars' and most.stars:
+        listed = ', '.join(f'{name} {number}' for name, number in most.stars.items())
+        detail = f'{detail}; left out: {listed}'
+        remedy = _STAR_REMEDIES.get(next(iter(most.stars)), remedy)
     return Diagnosis(
         most.reason,
         most.count,
-        f'{count} {images} images are refused as {most.reason}: {most.detail or most.meaning}.',
+        f'{count} {images} images are refused as {most.reason}: {detail}.',
         (f'{most.reason}: {most.meaning}',) if most.meaning else (),
         (f'# {remedy}',) if remedy else (),
     )
@@ -190,7 +225,12 @@ def refusals(records: Iterable[StarObservations]) -> tuple[Refused, ...]:
             groups.setdefault(observations.refusal, []).append(observations)
     return tuple(
         Refused(
-            reason, len(group), IMAGE_REFUSALS.get(reason, ''), group[0].time_ns, _detail(group)
+            reason,
+            len(group),
+            IMAGE_REFUSALS.get(reason, ''),
+            group[0].time_ns,
+            _detail(group),
+            dict(sum((Counter(one.refused_stars) for one in group), Counter()).most_common()),
         )
         for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
     )

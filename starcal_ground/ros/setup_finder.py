@@ -24,13 +24,12 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import SetupDiagnosis
 from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
 from starcal_ground.diagnosis.diagnose import (
     diagnose,
     Diagnosis,
     found_alignment,
     IMAGES_OF_AN_ALIGNMENT,
-    wire_attitudes,
-    WireAttitudes,
 )
 from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.pipeline import setup
@@ -290,7 +289,8 @@ class Unmatched:
 def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, given: setup.Setup) -> Diagnosis:
     """Diagnose in a process of its own."""
     os.nice(_LOWEST_PRIORITY)
-    return diagnose(images, attitudes, given)
+    # Without an alignment nothing was measured.
+    return diagnose(images, attitudes, given, refused='no_match' if given.is_aligned else '')
 
 
 def main(args: Sequence[str] | None = None) -> int:

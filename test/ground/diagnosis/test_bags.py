@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import Topics
+from starcal_ground.diagnosis.attitude_readings import wire_attitudes
 from starcal_ground.diagnosis.bags import aligned_by_bags
-from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment, wire_attitudes
+from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ground.ros.setup_finder import Unmatched
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline.setup import load_setup, Setup
@@ -86,7 +87,7 @@ def test_a_process_of_its_own(
         unmatched.add(image)
     assert unmatched._thread is not None
     unmatched._thread.join()
-    assert [found.cause for found in answers] == ['unknown']
+    assert [found.cause for found in answers] == ['no_attitude']
     assert answers[0].evidence[0].startswith('3 of 3 images identified without attitude')
     unmatched.close()
     unmatched.add(three[0])

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import json
 from pathlib import Path
 
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import pytest
+import yaml
 
 from starcal_ground.cli import main
 from starcal_ground.diagnosis.diagnose import CAUSES
@@ -35,6 +37,53 @@ def test_the_cause_and_its_remedy(wrong_params: Path, capsys: pytest.CaptureFixt
         'The attitude quaternions are st_to_inertial (x, y, z, w), not inertial_to_st.'
     )
     assert lines[-1].strip() == 'attitude_direction: st_to_inertial'
+
+
+REAL_SKY = Path(__file__).parents[5] / 'shared' / 'realsky'
+
+
+def _of_camera(folder: Path, **numbers: float) -> list[str]:
+    """Arguments for the tiny bag with other numbers in its camera matrix."""
+    content = yaml.safe_load((TINY / 'camera.yaml').read_text())
+    for name, value in numbers.items():
+        content['camera_matrix']['data'][{'cx': 2, 'cy': 5}[name]] = value
+    path = folder / 'camera.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return [str(TINY), '--params', str(params_with(folder, camera_info_url=str(path)))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('given', 'cause'),
+    [
+        (lambda folder: [str(TINY), '--params', str(params_with(folder))], 'none'),
+        (lambda folder: _of_camera(folder, cx=511.5, cy=383.5), 'principal_point'),
+        # More images than there are, or than most cameras take: a sound set that is refused.
+        (lambda folder: [str(TINY), '--params', str(params_with(folder, min_images=11))], None),
+        (lambda folder: [str(TINY), '--params', str(params_with(folder, min_coverage=1.0))], None),
+        (lambda folder: [str(TINY), '--set', 'min_images=11'], None),
+        (lambda folder: [str(REAL_SKY / 'polaris')], None),
+    ],
+)
+def test_it_says_that_all_fits_only_of_what_calibrate_accepts(
+    given: Callable[[Path], list[str]],
+    cause: str | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = given(tmp_path)
+    if not Path(arguments[0]).exists():
+        pytest.skip('the real sky is not here')
+    status = main.main(['diagnose', *arguments, '--json'])
+    found = json.loads(capsys.readouterr().out)
+    calibrated = main.main(['calibrate', *arguments, '-o', str(tmp_path / 'out'), '--no-report'])
+    error = capsys.readouterr().err
+    assert (status == 0) == (calibrated == 0), error
+    assert (found['cause'] == 'none') == (status == 0)
+    assert cause in (None, found['cause'])
+    if cause is None and calibrated:
+        assert found['cause'] in ('refused', 'not_linear')
+        assert found['cause'] != 'refused' or 'but starcal calibrate refuses' in found['sentence']
 
 
 @pytest.mark.slow

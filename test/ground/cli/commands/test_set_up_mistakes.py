@@ -61,6 +61,13 @@ def _rows_lost(writer: BagWriter, image: Image) -> None:
     writer.write_image(IMAGE_TOPIC, Image(image.time_ns, pixels), 'camera')
 
 
+def _of_pixels(change: Callable[[Any], Any]) -> Write:
+    """Write an image of another size than the camera file states."""
+    return lambda writer, image: _raw(
+        writer, Image(image.time_ns, np.ascontiguousarray(change(image.pixels)))
+    )
+
+
 def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None = None) -> Path:
     """Write the tiny bag with images written in another way, and shifted attitudes; None: none."""
     raws = list(reader.read_raw([TINY], [ATTITUDE_TOPIC])) if shift_s is not None else []
@@ -123,6 +130,9 @@ def said(
         (_raw, 18000.0, ['18000.0', 'stamp_offset_s: 18000.0']),
         (_raw, -946727935.0, ['stamp_offset_s: -946727934', 'the date of the attitudes']),
         (_rows_lost, 0.0, ['incomplete', 'constant', 'max_lost_fraction']),
+        # No refusal of the size hides what the stars show of it.
+        (_of_pixels(lambda p: p[50:450, 60:600]), 0.0, ['a region of the detector', '- x_offset']),
+        (_of_pixels(lambda p: p[::2, ::2]), 0.0, ['binned 2 x 2', 'fx, fy, cx, cy = 900.']),
     ],
 )  # fmt: skip
 def test_a_mistake_of_the_bag(
