@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 import multiprocessing
 import os
@@ -17,15 +17,18 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import GRID, line_of_sight_table
-from starcal_ros.camera import pixel_grid
+from starcal_ground.simulation.centroids import scaled_inverse
+from starcal_ros.arrays import Floats, Mask
+from starcal_ros.assessment.lookup import GRID, grid_derivatives, line_of_sight_table, sigma_arcsec
+from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import solve
-from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance
 from studies.trials import rms
 from studies.workers import processors
+from studies.worlds import unit
 
 ResultT = TypeVar('ResultT')
 
@@ -36,48 +39,113 @@ class Score:
     Verdict of the gate on one calibration, and its errors over their reported 1-sigma.
 
     ``shape``: lines of sight over the detector in the camera frame, the common rotation removed,
-    rms; ``shape_arcsec`` the error and ``sigma_arcsec`` the 1-sigma of it.  ``pointing``: lines of
-    sight in the star tracker frame.  ``corners``: ``shape`` of the four corners of the detector.
+    rms; ``shape_arcsec`` the error, ``sigma_arcsec`` its 1-sigma, ``bound_arcsec`` the Cramer-Rao
+    bound of that.  ``pointing``: lines of sight in the star tracker frame.  ``z`` has the errors
+    of single angles over their 1-sigma: of the shape at the centre and in the corners of the
+    detector, and of the pointing.
     """
 
     accepted: bool
     reasons: tuple[str, ...]
+    termination: str = ''
+    iterations: int = 0
     shape: float = math.nan
     pointing: float = math.nan
     shape_arcsec: float = math.nan
     sigma_arcsec: float = math.nan
+    bound_arcsec: float = math.nan
     seconds: float = math.nan  # processor time of the estimate
-    corners: float = math.nan
+    z: Mapping[str, list[float]] = field(default_factory=dict)
 
 
 def score(
     ensemble: Ensemble, setup: Setup, truth: CameraGeometry, true_directions: Sequence[Floats]
 ) -> Score:
     """
-    Calibrate and compare with the truth.
+    Calibrate and compare with the truth; too few observations are a refusal.
 
     ``true_directions``: lines of sight (n, 3) of the pixels of the grid; several if the camera
     changes, since the error is then that of using the calibration with each of them.
     """
     start_s = time.process_time()
-    found = solve(ensemble, setup)
+    try:
+        found = solve(ensemble, setup)
+    except TooFewObservations as error:
+        return Score(False, (str(error),))
     seconds = time.process_time() - start_s
-    pixels = pixel_grid(truth.camera, GRID, GRID)
-    table = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
-    estimated = table.direction_camera
+    at = grid_derivatives(found.geometry.camera)
+    true = unit(np.mean(true_directions, axis=0))
+    common, _ = Rotation.align_vectors(true, at.directions)
     to_tracker, to_true = (g.star_tracker_from_camera for g in (found.geometry, truth))
-    off = [to_tracker.apply(estimated) - to_true.apply(true) for true in true_directions]
-    off_arcsec = np.array([shape_errors_arcsec(true, estimated) for true in true_directions])
-    shape_arcsec = rms(off_arcsec)
-    sigma_arcsec = rms(table.shape_sigma_arcsec)
-    pointing_arcsec = rms(np.linalg.norm(off, axis=-1)) / ARCSECOND_RAD
-    corner = [0, GRID - 1, -GRID, -1]
-    corners = rms(off_arcsec[:, corner]) / rms(table.shape_sigma_arcsec[corner])
+    in_camera = to_true.inv() * to_tracker
+    errors = {
+        'shape': [shape_errors_arcsec(one, at.directions) for one in true_directions],
+        'pointing': [
+            np.linalg.norm(in_camera.apply(at.directions) - one, axis=1) / ARCSECOND_RAD
+            for one in true_directions
+        ],
+    }
+    covariance_rad2 = {
+        name: at.covariance_rad2(found.map_covariance, J)
+        for name, J in (('shape', at.of_shape(found.geometry.camera)), ('pointing', at.J))
+    }
+    sigma = {name: rms(sigma_arcsec(value)) for name, value in covariance_rad2.items()}
+    shape_rad, pointing_rad = (r.apply(at.directions) - true for r in (common, in_camera))
+    middle, corners = _zones(truth.camera)
+    z = {
+        name: _over_sigma(at.directions[zone], error_rad[zone], covariance_rad2[what][zone])
+        for name, zone, what, error_rad in (
+            ('centre', middle, 'shape', shape_rad),
+            ('corners', corners, 'shape', shape_rad),
+            ('pointing', middle | corners, 'pointing', pointing_rad),
+        )
+    }
     return Score(
-        *(found.accepted, found.reasons, shape_arcsec / sigma_arcsec),
-        *(pointing_arcsec / rms(table.sigma_arcsec), shape_arcsec, sigma_arcsec, seconds),
-        corners,
+        *(found.accepted, found.reasons, found.termination, found.iterations),
+        shape=rms(np.ravel(errors['shape'])) / sigma['shape'],
+        pointing=rms(np.ravel(errors['pointing'])) / sigma['pointing'],
+        shape_arcsec=rms(np.ravel(errors['shape'])),
+        sigma_arcsec=sigma['shape'],
+        seconds=seconds,
+        z=z,
     )
+
+
+def _zones(camera: CameraModel) -> tuple[Mask, Mask]:
+    """Points of the grid within 0.3 of the half diagonal, and beyond 0.85 of it: every third."""
+    from_middle = (
+        pixel_grid(camera, GRID, GRID) - np.array([camera.width - 1, camera.height - 1]) / 2
+    )
+    radius = np.hypot(*from_middle.T) / np.hypot(*from_middle[0])
+    every_third = np.zeros((GRID, GRID), bool)
+    every_third[::3, ::3] = True
+    return every_third.ravel() & (radius < 0.3), every_third.ravel() & (radius > 0.85)
+
+
+def _over_sigma(directions: Floats, error_rad: Floats, covariance_rad2: Floats) -> list[float]:
+    """Errors (n, 3) along two axes across directions (n, 3), each over its 1-sigma."""
+    across = unit(np.asarray(np.cross(directions, [0.0, 1.0, 0.0])))
+    z = [
+        (error_rad * axis).sum(axis=1)
+        / np.sqrt(np.einsum('ni,nij,nj->n', axis, covariance_rad2, axis))
+        for axis in (across, np.cross(directions, across))
+    ]
+    return [round(value, 3) for value in np.concatenate(z).tolist()]
+
+
+def bound_arcsec(camera: CameraModel, information: Floats, centre_sigma_px: float) -> float:
+    """
+    Cramer-Rao bound of the rms 1-sigma of the shape of a camera.
+
+    ``information`` (p, p) is that of the images, each of which has a free rotation; the principal
+    point has a prior, since only in a wide field is it no rotation.
+    """
+    p = len(camera.parameters)
+    covariance = np.zeros((p + 3, p + 3))
+    information = information + np.diag([0, 0, 0, 1, 1] + [0] * (p - 5)) / centre_sigma_px**2
+    covariance[:p, :p] = scaled_inverse(information)
+    pixels = pixel_grid(camera, GRID, GRID)
+    return rms(line_of_sight_table(camera, MapCovariance(covariance), pixels).shape_sigma_arcsec)
 
 
 def shape_errors_arcsec(true: Floats, estimated: Floats) -> Floats:
