@@ -1,18 +1,15 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Trials on all processors, and the error of a calibration over its reported 1-sigma."""
+"""The error of a calibration over its reported 1-sigma; memory and environment of processes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field
 import math
-import multiprocessing
 import os
 from pathlib import Path
 import time
-from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,10 +24,7 @@ from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance
 from studies.trials import rms
-from studies.workers import processors
 from studies.worlds import unit
-
-ResultT = TypeVar('ResultT')
 
 
 @dataclass(frozen=True)
@@ -73,64 +67,48 @@ def score(
     except TooFewObservations as error:
         return Score(False, (str(error),))
     seconds = time.process_time() - start_s
-    at = grid_derivatives(found.geometry.camera)
-    true = unit(np.mean(true_directions, axis=0))
-    common, _ = Rotation.align_vectors(true, at.directions)
+    camera = found.geometry.camera
+    at = grid_derivatives(camera)
     to_tracker, to_true = (g.star_tracker_from_camera for g in (found.geometry, truth))
-    in_camera = to_true.inv() * to_tracker
-    errors = {
-        'shape': [shape_errors_arcsec(one, at.directions) for one in true_directions],
-        'pointing': [
-            np.linalg.norm(in_camera.apply(at.directions) - one, axis=1) / ARCSECOND_RAD
-            for one in true_directions
-        ],
-    }
-    covariance_rad2 = {
-        name: at.covariance_rad2(found.map_covariance, J)
-        for name, J in (('shape', at.of_shape(found.geometry.camera)), ('pointing', at.J))
-    }
-    sigma = {name: rms(sigma_arcsec(value)) for name, value in covariance_rad2.items()}
-    shape_rad, pointing_rad = (r.apply(at.directions) - true for r in (common, in_camera))
-    middle, corners = _zones(truth.camera)
-    z = {
-        name: _over_sigma(at.directions[zone], error_rad[zone], covariance_rad2[what][zone])
-        for name, zone, what, error_rad in (
-            ('centre', middle, 'shape', shape_rad),
-            ('corners', corners, 'shape', shape_rad),
-            ('pointing', middle | corners, 'pointing', pointing_rad),
-        )
-    }
+    seen = (to_true.inv() * to_tracker).apply(at.directions)
+    # (t, n, 3) of the t true cameras; the shape without the rotation common to the detector.
+    shape_rad = np.array([turned_onto(true, at.directions) - true for true in true_directions])
+    pointing_rad = seen - np.array(true_directions)
+    shape_rad2 = at.covariance_rad2(found.map_covariance, at.of_shape(camera))
+    pointing_rad2 = at.covariance_rad2(found.map_covariance, at.J)
+    error_arcsec, sigma = _rms_arcsec(shape_rad), rms(sigma_arcsec(shape_rad2))
+    from_middle = pixel_grid(camera, GRID, GRID) - pixel_grid(camera, GRID, GRID).mean(axis=0)
+    radius = np.hypot(*from_middle.T) / np.hypot(*from_middle[0])
     return Score(
         *(found.accepted, found.reasons, found.termination, found.iterations),
-        shape=rms(np.ravel(errors['shape'])) / sigma['shape'],
-        pointing=rms(np.ravel(errors['pointing'])) / sigma['pointing'],
-        shape_arcsec=rms(np.ravel(errors['shape'])),
-        sigma_arcsec=sigma['shape'],
+        shape=error_arcsec / sigma,
+        pointing=_rms_arcsec(pointing_rad) / rms(sigma_arcsec(pointing_rad2)),
+        shape_arcsec=error_arcsec,
+        sigma_arcsec=sigma,
         seconds=seconds,
-        z=z,
+        z={
+            'centre': _over_sigma(at.directions, shape_rad, shape_rad2, radius < 0.3),
+            'corners': _over_sigma(at.directions, shape_rad, shape_rad2, radius > 0.85),
+            'pointing': _over_sigma(at.directions, pointing_rad, pointing_rad2, radius < 2.0),
+        },
     )
 
 
-def _zones(camera: CameraModel) -> tuple[Mask, Mask]:
-    """Points of the grid within 0.3 of the half diagonal, and beyond 0.85 of it: every third."""
-    from_middle = (
-        pixel_grid(camera, GRID, GRID) - np.array([camera.width - 1, camera.height - 1]) / 2
-    )
-    radius = np.hypot(*from_middle.T) / np.hypot(*from_middle[0])
-    every_third = np.zeros((GRID, GRID), bool)
-    every_third[::3, ::3] = True
-    return every_third.ravel() & (radius < 0.3), every_third.ravel() & (radius > 0.85)
+def _rms_arcsec(off_rad: Floats) -> float:
+    return rms(np.linalg.norm(off_rad, axis=-1)) / ARCSECOND_RAD
 
 
-def _over_sigma(directions: Floats, error_rad: Floats, covariance_rad2: Floats) -> list[float]:
-    """Errors (n, 3) along two axes across directions (n, 3), each over its 1-sigma."""
-    across = unit(np.asarray(np.cross(directions, [0.0, 1.0, 0.0])))
-    z = [
-        (error_rad * axis).sum(axis=1)
-        / np.sqrt(np.einsum('ni,nij,nj->n', axis, covariance_rad2, axis))
-        for axis in (across, np.cross(directions, across))
-    ]
-    return [round(value, 3) for value in np.concatenate(z).tolist()]
+def _over_sigma(
+    directions: Floats, off_rad: Floats, covariance_rad2: Floats, zone: Mask
+) -> list[float]:
+    """Errors (t, n, 3) across directions (n, 3) over their 1-sigma, at every third of a zone."""
+    zone = zone & (np.indices((GRID, GRID)) % 3 == 0).all(axis=0).ravel()
+    d, C = directions[zone], covariance_rad2[zone]
+    across = unit(np.asarray(np.cross(d, [0.0, 1.0, 0.0])))
+    axes = np.stack([across, np.cross(d, across)])
+    sigma_rad = np.sqrt(np.einsum('ani,nij,anj->an', axes, C, axes))
+    z = np.einsum('ani,tni->tan', axes, off_rad[:, zone]) / sigma_rad
+    return [round(value, 3) for value in z.ravel().tolist()]
 
 
 def bound_arcsec(camera: CameraModel, information: Floats, centre_sigma_px: float) -> float:
@@ -148,21 +126,22 @@ def bound_arcsec(camera: CameraModel, information: Floats, centre_sigma_px: floa
     return rms(line_of_sight_table(camera, MapCovariance(covariance), pixels).shape_sigma_arcsec)
 
 
+def without_last(information: Floats, count: int) -> Floats:
+    """Information without its last unknowns, which are free."""
+    B = information[:-count, -count:]
+    rest = information[:-count, :-count]
+    return np.asarray(rest - B @ np.linalg.solve(information[-count:, -count:], B.T))
+
+
 def shape_errors_arcsec(true: Floats, estimated: Floats) -> Floats:
     """Angles (n,) between unit vectors (n, 3), the best common rotation removed."""
+    return np.asarray(np.linalg.norm(turned_onto(true, estimated) - true, axis=1) / ARCSECOND_RAD)
+
+
+def turned_onto(true: Floats, estimated: Floats) -> Floats:
+    """Unit vectors (n, 3) rotated onto others."""
     common, _ = Rotation.align_vectors(true, estimated)
-    return np.asarray(np.linalg.norm(common.apply(estimated) - true, axis=1) / ARCSECOND_RAD)
-
-
-def in_processes(function: Callable[..., ResultT], *arguments: Sequence[Any]) -> list[ResultT]:
-    """Results of a function in the order of its arguments; one thread of BLAS per process."""
-    chunk = max(1, len(arguments[0]) // 200)
-    spawn = multiprocessing.get_context('spawn')
-    with (
-        environment(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1'),
-        ProcessPoolExecutor(processors(), mp_context=spawn) as pool,
-    ):
-        return list(pool.map(function, *arguments, chunksize=chunk))
+    return np.asarray(common.apply(estimated))
 
 
 def memory_mb(process: int | str, field: str = 'VmRSS') -> float:

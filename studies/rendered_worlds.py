@@ -427,7 +427,7 @@ WORLDS = (
         World(
             *('turning, two samples an image', s, 'deg/s'),
             is_turning=True,
-            tracker_hz=2.0,
+            tracker_hz=10.0,
             tracker_samples=2,
             options=(('shutter', 'unknown'),),
         )
