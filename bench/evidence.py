@@ -275,16 +275,21 @@ def main(argv: Sequence[str]) -> int:
                 todo.append(job)
     ended, start_s = 0, time.monotonic()
     with args.output.open('a') as file:
+        file.write('\n' * bool(file.tell()))  # after a line that a killed run has cut
 
         def on_each(row: dict[str, object]) -> None:
             nonlocal ended
-            file.write(json.dumps({**row, 'digest': version}) + '\n')
+            file.write(f'{json.dumps({**row, "digest": version})}\n')
             file.flush()
             ended += 1
             said = f'{ended} of {len(todo)}, {time.monotonic() - start_s:.0f} s: {row["job"]}'
             print(f'\r{said[:78]:<78}', end='', file=sys.stderr, flush=True)
 
-        run_each(run_job, todo, workers=2, on_each=on_each)
+        try:
+            run_each(run_job, todo, workers=2, on_each=on_each)
+        except KeyboardInterrupt:
+            print('\nevidence: interrupted; the same command continues', file=sys.stderr)
+            return 130
     print(file=sys.stderr)
     make_evidence.write(args.output, args.before)
     return 0

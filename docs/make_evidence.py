@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+import contextlib
 import json
 import math
 from pathlib import Path
@@ -37,8 +38,10 @@ Rows = list[dict[str, Any]]
 
 def rows_of(path: Path, digest: str = '') -> Rows:
     """Rows of a results file of sources with a digest, by default those of its last row."""
-    lines = path.read_text().splitlines() if path.is_file() else []
-    rows = [json.loads(line) for line in lines if line.endswith('}')]  # a kill cuts the last one
+    rows: Rows = []
+    for line in path.read_text().splitlines() if path.is_file() else ():
+        with contextlib.suppress(ValueError):  # a run that is killed cuts its last line
+            rows.append(json.loads(line))
     digest = digest or (rows[-1]['digest'] if rows else '')
     return list({row['job']: row for row in rows if row['digest'] == digest}.values())
 
