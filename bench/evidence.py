@@ -43,6 +43,7 @@ from starcal_ros.camera import (
     project_jacobians,
 )
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.pipeline import campaign
@@ -54,7 +55,10 @@ from studies.trials import rms
 from studies.workers import run_each
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ('starcal_ros', 'starcal_ground', 'studies', 'bench/evidence.py', 'bench/trials.py')
+SOURCES = (
+    *('starcal_ros', 'starcal_ground', 'studies'),
+    *('bench/evidence.py', 'bench/frames.py', 'bench/trials.py'),
+)
 MISSIONS = 300  # sound ones, and departing ones
 # Campaigns of each world of a group; the reading of a real set is not random.
 COUNTS = {'real': 1, 'bags': 8, 'rendered': 5, 'bodies': 5, 'observed': 5}
@@ -81,10 +85,11 @@ class Job:
     @property
     def kind(self) -> str:
         """Group and world, or group and set."""
-        return f'{self.group} {Path(self.world).name if self.group == "real" else self.world}'
+        world = Path(self.world).name if self.group == 'real' else self.world
+        return f'{self.group} {world}'.strip()
 
     def __str__(self) -> str:
-        return f'{self.kind.strip()} {self.seed}'
+        return f'{self.kind} {self.seed}'
 
 
 def jobs(seed: int, real: Path | None) -> Iterator[Job]:
@@ -104,6 +109,8 @@ def run_job(job: Job) -> dict[str, object]:
     start_s = time.process_time()
     try:
         row = _scored(job)
+    except StarcalError as error:
+        row = dataclasses.asdict(Score(False, (str(error),), 'refused'))
     except Exception as error:  # a defect that one campaign shows is a result too
         row = dataclasses.asdict(Score(False, (f'{type(error).__name__}: {error}',), 'failed'))
     cpu_s = round(time.process_time() - start_s, 2)
@@ -218,9 +225,8 @@ def real_set(folder: Path) -> dict[str, object]:
         two = [solve(ensemble_of(part, whole.setup), whole.setup) for part in parts]
         found |= {f'{split} {k}': one for k, one in enumerate(two)}
         (one, sigma), (other, other_sigma) = map(_inner, two)
-        ratios[split] = rms(trials.shape_errors_arcsec(one, other)) / math.hypot(
-            sigma, other_sigma
-        )
+        off_arcsec = rms(trials.shape_errors_arcsec(one, other))
+        ratios[split] = off_arcsec / math.hypot(sigma, other_sigma)
     directions, sigma = _inner(whole.calibration)
     fit = folder.with_name(f'{folder.name}.independent') / 'calibration.json'
     if fit.is_file():

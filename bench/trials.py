@@ -19,7 +19,6 @@ from starcal_ros.arrays import Floats, Mask
 from starcal_ros.assessment.lookup import GRID, grid_derivatives, line_of_sight_table, sigma_arcsec
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance
@@ -56,16 +55,13 @@ def score(
     ensemble: Ensemble, setup: Setup, truth: CameraGeometry, true_directions: Sequence[Floats]
 ) -> Score:
     """
-    Calibrate and compare with the truth; too few observations are a refusal.
+    Calibrate and compare with the truth.
 
     ``true_directions``: lines of sight (n, 3) of the pixels of the grid; several if the camera
     changes, since the error is then that of using the calibration with each of them.
     """
     start_s = time.process_time()
-    try:
-        found = solve(ensemble, setup)
-    except TooFewObservations as error:
-        return Score(False, (str(error),))
+    found = solve(ensemble, setup)
     seconds = time.process_time() - start_s
     camera = found.geometry.camera
     at = grid_derivatives(camera)

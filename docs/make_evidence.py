@@ -120,7 +120,7 @@ def summary(rows: Rows) -> Table:
         of_kind = [row for row in rows if row['kind'] == kind]
         good, iterations = accepted(of_kind), [row['iterations'] for row in of_kind]
         table.add(
-            *(kind.strip(), len(of_kind), len(good), sum(map(is_wrongly_refused, of_kind))),
+            *(kind, len(of_kind), len(good), sum(map(is_wrongly_refused, of_kind))),
             *_errors(good),
             *(rms(z_of(good, 'centre')), rms(z_of(good, 'corners')), *_errors(good, 'pointing')),
             *(_median(over_bound(good, 'sigma_arcsec')), rms(over_bound(good, 'shape_arcsec'))),
@@ -258,7 +258,9 @@ def charts(after: Rows, before: Rows) -> list[svg.Chart]:
 
 def write(path: Path, before: Path | None = None) -> list[Table]:
     """Print the tables of a results file, beside those of another, and write its page."""
-    rows, old = rows_of(path), rows_of(before) if before else []
+    rows = rows_of(path)
+    jobs = {row['job'] for row in rows}  # the same campaigns, for a difference with little noise
+    old = [row for row in rows_of(before) if row['job'] in jobs] if before else []
     made = tables(rows, old)
     for table in made:
         print(table.text())
