@@ -61,7 +61,7 @@ SOURCES = (
 )
 MISSIONS = 300  # sound ones, and departing ones
 # Campaigns of each world of a group; the reading of a real set is not random.
-COUNTS = {'real': 1, 'bags': 8, 'rendered': 5, 'bodies': 5, 'observed': 5}
+COUNTS = {'real': 1, 'bags': 16, 'rendered': 10, 'bodies': 10, 'observed': 10}
 RENDERED = {
     group: {f'{one.name} {one.size:g} {one.unit}'.removesuffix(' 0 '): one for one in of_group}
     for group, of_group in (
