@@ -29,7 +29,7 @@ from studies.trials import rms
 FILE = Path(__file__).parent / 'evidence.md'
 LIES = 2.0  # error over sigma
 HALVES = ('turns', 'time')
-# Error over bound, rms: that of version 4a3c3ed, which later judgements of stars made worse.
+# Error over bound, rms: that of version 4a3c3ed in four scenes of each kind of another simulator.
 MOST_OVER_BOUND = {'small': 1.16, 'slew': 1.01, 'hostile': 1.3, 'paper': 1.24}
 TURNING = ('unknown shutter', 'two samples an image')
 
