@@ -29,6 +29,8 @@ def main() -> None:
     for name in args.names:
         if name not in NAMES + LONG:
             parser.error(f'{name!r} is not one of {", ".join(NAMES + LONG)}')
+    if 'evidence' in args.names:
+        parser.error('evidence is run alone: python -m bench evidence --help')
     load = os.getloadavg()[0]
     print(
         f'{platform.machine()}, {os.cpu_count()} cores, load {load:.1f}: times on a busy machine'
