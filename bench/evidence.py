@@ -92,9 +92,9 @@ class Job:
         return f'{self.kind} {self.seed}'
 
 
-def jobs(seed: int, real: Path | None) -> Iterator[Job]:
+def jobs(seed: int, real: Sequence[Path]) -> Iterator[Job]:
     """Campaigns of all groups, those that take longest first."""
-    sets = sorted(real.iterdir()) if real else []
+    sets = [path for folder in real for path in sorted(folder.iterdir())]
     kinds = [('real', str(path)) for path in sets if _prior(path).is_file()]
     kinds += [(group, name) for group, of_group in RENDERED.items() for name in of_group]
     kinds += [('observed', name) for name in worlds.WORLDS]
@@ -267,14 +267,14 @@ def digest() -> str:
 def main(argv: Sequence[str]) -> int:
     """Run the campaigns that the results file lacks, then print the tables and write the page."""
     args = parser().parse_args(argv)
-    version, given = digest(), args.real or ROOT.parent / 'shared' / 'realsky'
-    real = given if given.is_dir() else None
-    if real is None:
-        print(f'{given}: no such folder, the real sets are left out; name it with --real')
+    version, real = digest(), args.real or [ROOT.parent / 'shared' / 'realsky']
+    for folder in real:
+        if not folder.is_dir():
+            print(f'{folder}: no such folder, its real sets are left out; name it with --real')
     done = {row['job'] for row in make_evidence.rows_of(args.output, version)}
     counts: Counter[str] = Counter()
     todo = []
-    for job in jobs(args.seed, real):
+    for job in jobs(args.seed, list(filter(Path.is_dir, real))):
         if not args.only or str(job).startswith(tuple(args.only)):
             counts[job.kind] += 1
             if counts[job.kind] <= args.count and str(job) not in done:
@@ -311,5 +311,6 @@ def parser() -> argparse.ArgumentParser:
     count = number(int, 1)
     made.add_argument('--count', type=count, default=MISSIONS, help='campaigns of each kind')
     made.add_argument('--seed', type=number(int, 0), default=1, help='of all campaigns')
-    made.add_argument('--real', type=Path, metavar='DIR', help='folder with sets of real images')
+    what = 'folders with sets of real images'
+    made.add_argument('--real', type=Path, nargs='+', metavar='DIR', help=what)
     return made

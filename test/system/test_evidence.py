@@ -50,7 +50,7 @@ def test_a_run_continues_and_a_page_shows_two_beside_each_other(
     line = ['--only', 'sound', 'departing', '--real', str(tmp_path / 'none')]
     assert evidence.main(['-o', str(before), '--count', '1', *line]) == 0
     said = capsys.readouterr()
-    assert 'real sets are left out' in said.out and '2 of 2' in said.err
+    assert 'its real sets are left out' in said.out and '2 of 2' in said.err
     first = before.read_text()
     # Killed while it wrote its second line; those of other sources do not count.
     old = json.dumps({**json.loads(first.splitlines()[0]), 'digest': 'other', 'job': 'x'})
