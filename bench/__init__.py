@@ -5,7 +5,7 @@ NAMES = ('solver', 'calibrate', 'observer')
 """The benches, each a module with ``run(quick)`` that yields its tables."""
 
 LONG = (
-    *('coverage', 'trust', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
+    *('evidence', 'acquisition', 'lost_in_space', 'night_sky', 'narrow'),
     *('soak', 'fleet', 'peers'),
 )
 """Those that take some minutes: run when they are named."""

@@ -9,13 +9,16 @@ import json
 import os
 from pathlib import Path
 import platform
+import sys
 import time
 
 from bench import LONG, NAMES
 
 
 def main() -> None:
-    """Run the requested benches."""
+    """Run the requested benches; `bench.evidence` has arguments of its own."""
+    if sys.argv[1:2] == ['evidence']:
+        sys.exit(importlib.import_module('bench.evidence').main(sys.argv[2:]))
     parser = argparse.ArgumentParser(prog='python -m bench', description='Measure starcal.')
     parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(NAMES + LONG))
     parser.add_argument('--quick', action='store_true', help='small sizes, a few seconds each')
@@ -26,6 +29,8 @@ def main() -> None:
     for name in args.names:
         if name not in NAMES + LONG:
             parser.error(f'{name!r} is not one of {", ".join(NAMES + LONG)}')
+    if 'evidence' in args.names:
+        parser.error('evidence is run alone: python -m bench evidence --help')
     load = os.getloadavg()[0]
     print(
         f'{platform.machine()}, {os.cpu_count()} cores, load {load:.1f}: times on a busy machine'

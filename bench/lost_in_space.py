@@ -23,12 +23,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from bench.table import Table, timed
-from bench.trials import in_processes
 from starcal_ground.blind.search import find_in_any, SkyMatch
 from starcal_ground.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
+from studies.workers import processors, run_each
 
 SEED = 416
 WIDTHS_DEG = (4, 8, 15, 25, 40, 55, 70)
@@ -115,7 +115,8 @@ def random_points(count: int) -> Table:
     points = [rng.uniform([0, 0], SIZE, ((18, 30, 60)[k % 3], 2)) for k in range(count)]
     widths_deg = [WIDTHS_DEG[k % len(WIDTHS_DEG)] for k in range(count)]
     for name, ranges in {'stated': STATED, 'found': FOUND}.items():
-        results = in_processes(_searched, points, widths_deg, [ranges] * count)
+        search = functools.partial(_searched, ranges)
+        results = run_each(search, zip(points, widths_deg, strict=True), processors())
         identified, took_s = np.array(results).T
         wrong = int(identified.sum())
         limit = float(binomtest(wrong, count, alternative='less').proportion_ci().high)
@@ -124,8 +125,9 @@ def random_points(count: int) -> Table:
     return table
 
 
-def _searched(points: Floats, width_deg: float, ranges: Ranges) -> tuple[bool, float]:
+def _searched(ranges: Ranges, given: tuple[Floats, float]) -> tuple[bool, float]:
     """True if points (n, 2) are taken for stars, and processor time, s."""
+    points, width_deg = given
     catalog, prior = load_catalog(), camera(width_deg)
     search = functools.partial(find_in_any, [points], [prior], catalog, ranges=ranges)
     (sky, _), took_s = timed(search)

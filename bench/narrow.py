@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import dataclasses
+from functools import partial
 import math
 from pathlib import Path
 import subprocess
@@ -31,7 +32,7 @@ from bench.night_sky import calibrated, off_arcsec
 from bench.peers import scamp
 from bench.peers.campaigns import Campaign
 from bench.table import Table
-from bench.trials import in_processes, shape_errors_arcsec
+from bench.trials import bound_arcsec, shape_errors_arcsec
 from starcal_ground.mission.ingest.deep_catalog import catalog_file, integer_columns
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import centroids
@@ -43,9 +44,10 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.pipeline import solve
-from starcal_ros.records import Calibration, CameraGeometry, Ensemble, MapCovariance
+from starcal_ros.records import Calibration, CameraGeometry, Ensemble
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog
-from studies.trials import map_bound_px, rms
+from studies.trials import rms
+from studies.workers import processors, run_each
 
 SIZE, IMAGES, SEEDS = (800, 640), 14, 10
 FIELDS_DEG = (0.3, 0.5, 1.0, 2.5, 5.0)  # of the width
@@ -73,8 +75,8 @@ def run(quick: bool) -> Iterator[Table]:
     )
     table = Table(f'Narrow cameras, {IMAGES} images', columns.split(', '))
     for field_deg, blind, trail_px in kinds:
-        constant = ([value] * seeds for value in (field_deg, blind, trail_px))
-        trials = in_processes(trial, range(seeds), *constant)
+        of_seed = partial(trial, field_deg=field_deg, blind=blind, trail_px=trail_px)
+        trials = run_each(of_seed, range(seeds), processors())
         good = np.array([one.numbers for one in trials if not one.reason])
         reason = next((one.reason for one in trials if one.reason), '')
         figures = good.reshape(-1, 6).T
@@ -97,7 +99,7 @@ def _peer(seeds: int) -> Table:
     columns = ('field deg', 'solved', 'error / bound', 'median', 'heads', 'sources', 's an image')
     table = Table('Source Extractor and SCAMP, given attitudes', columns)
     for field_deg in FIELDS_DEG:
-        trials = in_processes(by_scamp, range(seeds), [field_deg] * seeds)
+        trials = run_each(partial(by_scamp, field_deg=field_deg), range(seeds), processors())
         solved = np.array([row for row in trials if math.isfinite(row[0])]).reshape(-1, 4)
         if len(solved):
             means = np.mean(solved[:, 1:], axis=0).tolist()
@@ -258,19 +260,11 @@ def _from_images(given: Scenario, folder: Path) -> tuple[Calibration, Ensemble]:
 
 
 def bound_px(given: Scenario) -> float:
-    """
-    Cramer-Rao bound of the RMS error of the lines of sight, px.
-
-    The principal point is free within its prior: only in a wide field is it no rotation.
-    """
+    """Cramer-Rao bound of the rms error of the lines of sight, px."""
     camera = given.truth.camera
-    names = list(camera.parameter_names)
-    information = centroids.scenario_information(given, range(len(names)))
-    for name in ('cx', 'cy'):
-        information[names.index(name), names.index(name)] += _CENTRE_SIGMA_PX**-2.0
-    bound = np.zeros((len(names) + 3, len(names) + 3))
-    bound[:-3, :-3] = centroids.scaled_inverse(information)
-    return map_bound_px(camera, MapCovariance(bound))
+    information = centroids.scenario_information(given, range(len(camera.parameters)))
+    focal_px = float(camera.parameters[0])
+    return bound_arcsec(camera, information, _CENTRE_SIGMA_PX) * ARCSECOND_RAD * focal_px
 
 
 def wrong_stars(given: Scenario, ensemble: Ensemble) -> int:

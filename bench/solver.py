@@ -22,9 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from bench import competitors
 from bench.table import Table, verdict
-from bench.trials import in_processes, memory_mb
+from bench.trials import memory_mb
 from starcal_ros.estimation.star_equations import normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.records import Ensemble
+from studies.workers import run_each
 
 LIMIT_S = 60.0  # longest wait for a competitor
 TARGETS_FROM = 100  # images; below, Python overhead dominates
@@ -133,7 +134,7 @@ def run(quick: bool) -> Iterator[Table]:
     All use one thread of linear algebra: on two shared cores more threads wait for each other,
     which makes SciPy up to five times slower and no solver faster.
     """
-    yield from in_processes(measure, [quick])
+    yield from run_each(measure, [quick], workers=1)
 
 
 def measure(quick: bool) -> Table:

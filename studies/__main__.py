@@ -111,7 +111,7 @@ def _rows(design: Design, args: argparse.Namespace) -> list[Row]:
     make_folder(args.output)
     trial = functools.partial(monte_carlo.run_trial, design)
     with terminal.progress_bar(design.trials, 'trials') as advance:
-        rows = run_each(trial, range(design.trials), args.workers, advance)
+        rows = run_each(trial, range(design.trials), args.workers, lambda _: advance())
     return [row for of_trial in rows for row in of_trial]
 
 
@@ -131,7 +131,7 @@ def _paper(args: argparse.Namespace) -> None:
     make_folder(args.output / 'images')
     frame = functools.partial(paper.observe_frame_of, args.seed, images)
     with terminal.progress_bar(images, 'frames') as advance:
-        observations = run_each(frame, range(images), args.workers, advance)
+        observations = run_each(frame, range(images), args.workers, lambda _: advance())
     result = paper.study(
         observations, monte_carlo.conclude(table1, _rows(table1, args)), args.seed
     )

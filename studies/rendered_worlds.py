@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 import math
 
+import cv2
 import erfa
 import numpy as np
 from numpy.random import Generator
@@ -18,7 +19,7 @@ from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.deep_sky import deep_sky
 from starcal_ground.simulation.scenario import Detector, Inertial, Scenario, Scene
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats, Mask, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
@@ -39,6 +40,12 @@ _COARSE_PX = 330.0  # focal length of pixels of 10 arcminutes, in which stars bl
 _COARSE = Detector(psf_sigma_px=0.6, zero_point_electrons=4e6, bits=14, electrons_per_dn=8.0)
 _SPREAD_DEG = 20.0  # of the fields with faint stars
 _SKY_RAD = math.radians(90.0)  # about their middle
+_PLANET_PX = 60.0  # radius of a disc
+_PLANET_ELECTRONS = 60_000.0  # of a sunlit pixel, which saturates where stars of V = 7 are seen
+_GLARE_ELECTRONS = 300.0  # scattered light at the edge of a planet that fills the frame
+_GHOSTS = ((-1.0, 1.3, 40.0), (0.5, 2.0, 12.0), (-0.4, 0.6, 80.0))  # place, radius, electrons
+_MOONS, _MOON_LOG_ELECTRONS = 4, (7.6, 12.6)  # as stars of V = 2 to 5.5
+_HOSTILE = Detector(psf_growth=0.3, hot_fraction=2e-3, cosmic_rays=40.0, sky_electrons=20.0)
 
 
 def _as_modelled(camera: CameraModel, size: float, rng: Generator, pixels: Floats) -> Floats:
@@ -75,12 +82,17 @@ class World:
     is_turning: bool = False
     tracker_hz: float = 0.0  # of samples with errors of their own; 0: one error of an image
     tracker_arcsec: float = 20.0  # each axis
+    tracker_samples: int = 0  # about an image; 0: all
     options: tuple[tuple[str, object], ...] = ()  # that are stated
+    body: str = ''  # a planet in the frame, at another place in each image
+    scenario: str = ''  # whose pointings and camera the images have
+    detector: Detector | None = None
+    has_velocity: bool = False  # of the observer, given
 
 
 def scenario_of(world: World, seed: int) -> Scenario:
     """A campaign of random pointings; the faults of the camera itself are in its truth."""
-    base = synthetic.scenario('small', seed)
+    base = synthetic.scenario(world.scenario or 'small', seed)
     rng, count = np.random.default_rng([seed, 77]), world.images
     ra_deg, z = rng.uniform(0.0, 360.0, count), rng.uniform(-0.95, 0.95, count)
     fields = np.stack([ra_deg, np.degrees(np.arcsin(z)), rng.uniform(0.0, 360.0, count)], axis=-1)
@@ -94,13 +106,15 @@ def scenario_of(world: World, seed: int) -> Scenario:
     truth, prior = base.truth, base.prior
     if world.geometries:
         truth, prior = world.geometries((truth, prior), world.size, rng)
+    if not world.scenario:
+        pointing = Inertial(tuple((a, b, c) for a, b, c in fields.tolist()))
+        base = dataclasses.replace(base, pointing=pointing, cadence_s=60.0)
     return dataclasses.replace(
         base,
         truth=truth,
         prior=prior,
-        pointing=Inertial(tuple((a, b, c) for a, b, c in fields.tolist())),
-        start_ns=base.start_ns + seed * 8_640_000_000_000,
-        cadence_s=60.0,
+        detector=world.detector or base.detector,
+        start_ns=base.start_ns + seed % 1000 * 8_640_000_000_000,
         image_count=count,
         star_tracker_sigma_arcsec=(world.tracker_arcsec,) * 3,
         star_tracker_hz=world.tracker_hz,
@@ -132,9 +146,16 @@ def frames(world: World, scenario: Scenario) -> Iterator[tuple[Image, list[Attit
             pixels = np.clip(first.pixels.astype(np.int64) + noise, 0, scenario.detector.full_dn)
             image = Image(shown.time_ns, pixels.astype(np.uint16))
         else:
-            image = rendering.render(scenario, moved, index, pattern)
+            light, is_hidden = _planet(world.body, scenario, index)
+            hidden = is_hidden(moved.pixel_px)
+            flux = np.where(hidden, 0.0, moved.flux_electrons)
+            moved = dataclasses.replace(moved, flux_electrons=flux)
+            image = rendering.render(scenario, moved, index, pattern + light)
         first = first or image
         samples = list(synthetic.attitude_samples(scenario, index))
+        if world.tracker_samples:
+            first_one = (len(samples) - world.tracker_samples) // 2
+            samples = samples[first_one : first_one + world.tracker_samples]
         if world.is_turning:
             rate_icrf = shown.camera_from_icrf.T @ _rate_rad_s(world, scenario.seed)
             samples = [_turned(sample, shown.time_ns, rate_icrf) for sample in samples]
@@ -147,6 +168,48 @@ def frames(world: World, scenario: Scenario) -> Iterator[tuple[Image, list[Attit
             pixels = world.read_out(image.pixels, int(world.size))
             image = dataclasses.replace(image, pixels=pixels)
         yield image, samples
+
+
+def _planet(
+    kind: str, scenario: Scenario, index: int
+) -> tuple[Floats | float, Callable[[Floats], Mask]]:
+    """Light (height, width) of a planet of a kind, electrons, and which pixels (n, 2) it hides."""
+    if not kind:
+        return 0.0, lambda pixels: np.zeros(len(pixels), bool)
+    camera, rng = scenario.truth.camera, np.random.default_rng([scenario.seed, 75, index])
+    size = np.array([camera.width, camera.height])
+    radius_px, at = _PLANET_PX, rng.uniform(0.15, 0.85, 2)
+    if kind == 'limb':  # far beyond a corner, which it covers
+        radius_px, at = 3.0 * camera.width, np.rint(at)
+    centre = at * size
+    if kind == 'limb':
+        centre += (2.0 * at - 1.0) * (
+            radius_px / math.sqrt(2.0) - rng.uniform(0.1, 0.25) * size[0]
+        )
+    v, u = np.mgrid[: camera.height, : camera.width]
+    x, y = (u - centre[0]) / radius_px, (v - centre[1]) / radius_px
+    r = np.hypot(x, y)
+    lit = np.clip(radius_px * (1.0 - r) + 0.5, 0.0, 1.0)
+    if kind == 'crescent':
+        lit *= np.clip(radius_px * (x - 0.8 * np.sqrt(np.maximum(1.0 - y * y, 0.0))), 0.0, 1.0)
+    light = _PLANET_ELECTRONS * lit
+    light += _GLARE_ELECTRONS * lit.mean() ** 0.25 / np.maximum(r, 1.0) ** 2
+    if kind == 'bloom':  # the charge of saturated pixels fills their columns
+        light[:, np.abs(x[0]) < 0.5] += _PLANET_ELECTRONS
+    for along, wide, electrons in _GHOSTS if kind == 'ghosts' else ():
+        place = 0.5 * size + along * (centre - 0.5 * size)
+        apart = np.hypot(u - place[0], v - place[1])
+        light += electrons * np.clip(0.2 * (wide * radius_px - apart), 0.0, 1.0)
+    psf_px = scenario.detector.psf_sigma_px
+    light = cv2.GaussianBlur(light, (0, 0), psf_px)
+    if kind == 'moons':
+        places = centre + np.outer(rng.uniform(-9.0, 9.0, _MOONS), [radius_px, 0.1 * radius_px])
+        flux, psf_px = (
+            np.exp(rng.uniform(*_MOON_LOG_ELECTRONS, _MOONS)),
+            scenario.detector.psf_sigma_px,
+        )
+        light += rendering.star_electrons(places, flux, psf_px, (camera.height, camera.width))
+    return light, lambda pixels: np.hypot(*(pixels - centre).T) < radius_px
 
 
 def _rotated(sample: AttitudeSample, error_rad: Floats) -> AttitudeSample:
@@ -360,9 +423,36 @@ WORLDS = (
         )
         for s in (0.05, 0.1, 0.3)
     ),
+    *(
+        World(
+            *('turning, two samples an image', s, 'deg/s'),
+            is_turning=True,
+            tracker_hz=10.0,
+            tracker_samples=2,
+            options=(('shutter', 'unknown'),),
+        )
+        for s in (0.05, 0.1, 0.3)
+    ),
+)
+BODIES = tuple(
+    World(kind, body=kind, has_velocity=True)
+    for kind in ('disc', 'limb', 'crescent', 'bloom', 'ghosts', 'moons')
+)
+# Campaigns whose error is compared with its Cramer-Rao bound: all is stated.
+BAGS = (
+    World('small', images=16, scenario='small', has_velocity=True),
+    World(
+        *('slew', 0.3, 'deg/s'),
+        is_turning=True,
+        has_velocity=True,
+        options=(('shutter', 'rolling'), ('readout_s', _READOUT_S)),
+    ),
+    World('hostile', detector=_HOSTILE, has_velocity=True),
+    World('paper', images=16, scenario='paper', has_velocity=True),
 )
 
 
 def world(name: str, size: float = 0.0) -> World:
     """World of a name and size."""
-    return next(one for one in WORLDS if (one.name, one.size) == (name, size))
+    worlds = (*WORLDS, *BODIES, *BAGS)
+    return next(one for one in worlds if (one.name, one.size) == (name, size))

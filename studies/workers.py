@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import as_completed, ThreadPoolExecutor
 import os
 import threading
 from typing import TypeVar
@@ -25,21 +25,21 @@ def run_each(
     function: Callable[[Item], Result],
     items: Iterable[Item],
     workers: int = 0,
-    on_each: Callable[[], None] = lambda: None,
+    on_each: Callable[[Result], None] = lambda _: None,
 ) -> list[Result]:
     """
     Results of a function for each item, in the order of the items; each on one thread of BLAS.
 
     ``workers`` is the number of processes to start; 0 runs in-process.  ``on_each`` is called
-    after each result.  Raises the first exception of the function, and StarcalError when a process
-    ends during a call.
+    with each result as soon as it is there.  Raises the first exception of the function, and
+    StarcalError when a process ends during a call.
     """
-    results: list[Result] = []
     if not workers:
+        results: list[Result] = []
         for item in items:
             with one_blas_thread():
                 results.append(function(item))
-            on_each()
+            on_each(results[-1])
         return results
     processes: dict[int, ChildProcess] = {}  # by thread
 
@@ -55,9 +55,10 @@ def run_each(
 
     threads = ThreadPoolExecutor(workers)
     try:
-        for result in threads.map(call, items):
-            results.append(result)
-            on_each()
+        futures = [threads.submit(call, item) for item in items]
+        for future in as_completed(futures):
+            on_each(future.result())
+        return [future.result() for future in futures]
     finally:
         threads.shutdown(wait=False, cancel_futures=True)
         for process in list(processes.values()):
@@ -65,4 +66,3 @@ def run_each(
         threads.shutdown()
         for process in processes.values():
             process.end()
-    return results

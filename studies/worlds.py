@@ -136,6 +136,7 @@ class World:
     tracker_arcsec: float = 20.0
     tracker_claim: float = 1.0  # stated sigma of the star tracker over the true one
     tracker_hz: float = 0.0  # of samples with errors of their own; 0: one error, an exact rate
+    tracker_samples: int = 0  # about each image; 0: all of three seconds
     filter_s: float = 0.0  # correlation time of the errors of samples
     velocity_m_s: float = 0.0  # that the observer does not take into account
     rate_deg_s: float = 0.0  # about an axis across the line of sight
@@ -234,7 +235,7 @@ def simulate(world: World, seed: int, images: int | None = None) -> Campaign:
 def _sampled(made: Campaign, k: int, image: StarObservations) -> StarObservations:
     """Observations with attitude and rate by samples of the star tracker, each with its error."""
     world, rng = made.world, _stream(made.scenario.seed, _SAMPLES, k)
-    half = math.ceil(1.5 * world.tracker_hz)
+    half = world.tracker_samples // 2 or math.ceil(1.5 * world.tracker_hz)
     late_s = (np.arange(-half, half) + rng.uniform()) / world.tracker_hz
     memory = math.exp(-1.0 / (world.tracker_hz * world.filter_s)) if world.filter_s else 0.0
     errors_rad = world.tracker_arcsec * ARCSECOND_RAD * _walk(rng, 2 * half, 3, memory)
@@ -248,7 +249,7 @@ def _sampled(made: Campaign, k: int, image: StarObservations) -> StarObservation
     for stamp_ns, xyzw in zip(stamps_ns.tolist(), reported.as_quat(), strict=True):
         history.add(stamp_ns, AttitudeSample(stamp_ns, xyzw))
     xyzw, gap_s = history.at(image.time_ns, _GAP_S)
-    sigma_rad = np.full(3, world.tracker_arcsec * ARCSECOND_RAD)
+    sigma_rad = np.array(made.scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD  # as stated
     rate = history.rate_at(image.time_ns, _GAP_S, sigma_rad)
     image = dataclasses.replace(image, icrf_from_star_tracker_xyzw=xyzw, attitude_gap_s=gap_s)
     return with_rate(image, *rate)

@@ -98,7 +98,7 @@ def test_workers_are_reached_through_no_socket() -> None:
     earlier = {child.pid for child in us.children(recursive=True)}  # of other tests
     opened, seen = set(), 0
 
-    def look() -> None:
+    def look(_: object) -> None:
         nonlocal seen
         opened.update(set(sockets(us, 'all')) - before)
         for child in us.children(recursive=True):

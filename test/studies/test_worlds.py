@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.coverage import drawn, score
+from bench.evidence import simulated
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from studies import worlds
+from studies.missions import drawn
 from studies.worlds import Campaign
 
 
@@ -117,6 +120,27 @@ def test_a_drawn_mission_is_within_the_priors_that_the_documents_promise(mission
 
 @pytest.mark.slow
 def test_a_sound_world_is_honest_and_near_its_bound() -> None:
-    scores = [score(worlds.WORLDS['plain'], seed) for seed in (1, 2, 3)]
-    assert 0.5 < np.sqrt(np.mean([s.shape**2 for s, _ in scores])) < 1.6
-    assert all(0.9 < over_bound < 1.6 for _, over_bound in scores)
+    stated = dataclasses.replace(worlds.WORLDS['plain'], shutter='global')
+    scores = [simulated(stated, seed) for seed in (1, 2, 3)]
+    assert 0.5 < np.sqrt(np.mean([s.shape**2 for s in scores])) < 1.6
+    assert all(0.9 < s.sigma_arcsec / s.bound_arcsec < 1.6 for s in scores)
+
+
+@pytest.mark.parametrize('samples', [0, 2])
+def test_rates_by_samples_of_a_star_tracker_scatter_by_their_sigma(samples: int) -> None:
+    world = worlds.World(images=60, rate_deg_s=0.1, tracker_hz=5.0, tracker_samples=samples)
+    made = worlds.simulate(world, 1)
+    to_tracker = made.scenario.truth.star_tracker_from_camera
+    images = made.ensemble.images
+    off_rad_s = [image.star_tracker_rate_rad_s for image in images] - to_tracker.apply(
+        made.rate_rad_s
+    )
+    sigma_rad_s = np.array([image.star_tracker_rate_sigma_rad_s for image in images])
+    # 180 numbers give their rms to 5 %.  Errors of a stream may be correlated, so that its sigma
+    # is that of the worst correlation.
+    low, high = (0.8, 1.2) if samples else (0.2, 1.2)
+    assert low < np.sqrt(np.mean((off_rad_s / sigma_rad_s) ** 2)) < high
+    if samples:
+        per_sample_s = 1.0 / 5.0
+        expected = np.sqrt(2.0) * 20.0 * ARCSECOND_RAD / per_sample_s
+        assert np.allclose(sigma_rad_s, expected, rtol=0.01)

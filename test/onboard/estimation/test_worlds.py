@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bench.coverage import score
+from bench.evidence import simulated
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.arrays import Floats
@@ -182,7 +182,7 @@ DEPARTURES = {
 @pytest.mark.slow
 @pytest.mark.parametrize('name', DEPARTURES)
 def test_departures_are_in_the_sigma(name: str) -> None:
-    scores = [score(WORLDS[name], seed)[0] for seed in (1, 2)]
+    scores = [simulated(WORLDS[name], seed) for seed in (1, 2)]
     shape = np.sqrt(np.mean([s.shape**2 for s in scores]))
     pointing = np.sqrt(np.mean([s.pointing**2 for s in scores]))
     assert shape < DEPARTURES[name][0]
