@@ -13,6 +13,7 @@ from starcal_ground.campaign import calibrate, Observed, observed_of, Source
 from starcal_ground.diagnosis.bags import (
     diagnose_bags,
     of_bags,
+    of_most,
     refusals,
     Refused,
     refused_all_the_same,
@@ -44,9 +45,8 @@ def diagnose_source(source: Source) -> Diagnosis:
         measured += islice(records, LOOKED_AT - len(measured))
     observed = observed_of(source, measured)
     refused = refusals(observed.observations)
-    # A few images may be refused for themselves, not for the set-up.
-    of_most = refused if 2 * sum(group.count for group in refused) > len(measured) else ()
-    diagnosis = of_bags(source.bags, topics, source.setup, of_most)
+    most = of_most(refused, len(measured))
+    diagnosis = of_bags(source.bags, topics, source.setup, most)
     return (
         _of_calibration(observed, refused, diagnosis) if diagnosis.cause == 'none' else diagnosis
     )
@@ -57,14 +57,14 @@ def _of_calibration(observed: Observed, refused: Sequence[Refused], fits: Diagno
     count, there = len(observed.observations), observed.source.image_count
     by_images = refused_all_the_same(refused, fits, count)
     if there > count:
-        if 2 * sum(group.count for group in refused) > count:
+        if of_most(refused, count):
             return by_images
         looked = f'looked at: the first {count} of {there} images'
         return replace(fits, evidence=(*fits.evidence, looked))
     try:
         calibration = calibrate(observed).calibration
     except TooFewObservations as error:
-        if refused:
+        if of_most(refused, count):
             return by_images
         reasons: Sequence[str] = (str(error),)
     else:

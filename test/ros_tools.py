@@ -110,7 +110,8 @@ class RosTools:
 
     def start_node(self, name: str, *ros: str | Path) -> Started:
         """Start a node of starcal with ROS arguments."""
-        module = f'starcal_ros.ros.{name}'
+        package = 'starcal_ground' if name in ('bag_player', 'setup_finder') else 'starcal_ros'
+        module = f'{package}.ros.{name}'
         return self._start([sys.executable, '-m', module, '--ros-args', *map(str, ros)])
 
     def _start(self, command: list[str]) -> Started:

@@ -170,7 +170,7 @@ def _drawn(
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ground.diagnosis.bags import refusals
+    from starcal_ground.diagnosis.bags import of_most, refusals
     from starcal_ground.planning.inspect import cause_of
 
     source, count = observed.source, len(observed.observations)
@@ -181,7 +181,9 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
     named = tuple(map(str, source.bags))
-    cause = cause_of(source.bags, source.topics, source.setup, groups, count)
+    cause = None
+    if of_most(groups, count):
+        cause = cause_of(source.bags, source.topics, source.setup, groups, count)
     if cause is None:
         return NotCalibrated(words, named, refused)
     command = 'starcal diagnose' if source.setup.has_tracker else ''

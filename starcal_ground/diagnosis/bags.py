@@ -152,6 +152,11 @@ def _images(paths: Sequence[Path], topic: str, setup: Setup, shift_ns: int = 0) 
             yield Image(image.time_ns + shift_ns, image.pixels)
 
 
+def of_most(refused: Sequence[Refused], images: int) -> Sequence[Refused]:
+    """The refusals if they are of most images, else none: a few may be refused for themselves."""
+    return refused if 2 * sum(group.count for group in refused) > images else ()
+
+
 def of_refusals(refused: Sequence[Refused], images: int) -> Diagnosis | None:
     """The most frequent refusal of some images as their cause; None if none is refused."""
     if not refused:

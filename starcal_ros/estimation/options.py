@@ -218,5 +218,8 @@ def check_enough(ensemble: Ensemble, options: CalibrationOptions) -> None:
     if missing:
         refused = sum(ensemble.refused.values())
         also = f'; {counted(refused, "image")} refused' if refused else ''
-        words = f'{" and ".join(missing)} needed{also}'
+        more = 'take more images'
+        if stars < options.min_stars:
+            more += ', or find fainter stars (magnitude_limit, catalog)'
+        words = f'{" and ".join(missing)} needed{also}; {more}'
         raise TooFewObservations(f'too few observations: {words}')

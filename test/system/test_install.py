@@ -210,8 +210,11 @@ def test_types_and_definitions_are_installed(flight_install: Path) -> None:
 @pytest.mark.nodes
 def test_the_nodes_import_nothing_of_the_extras() -> None:
     pytest.importorskip('rclpy')
-    nodes = ('star_observer', 'calibrator', 'bag_player', 'setup_finder')
-    source = '; '.join(f'import starcal_ros.ros.{node}' for node in nodes)
+    nodes = [
+        *('starcal_ros.ros.star_observer', 'starcal_ros.ros.calibrator'),
+        *('starcal_ground.ros.bag_player', 'starcal_ground.ros.setup_finder'),
+    ]
+    source = '; '.join(f'import {node}' for node in nodes)
     source += '; import sys; print(*sys.modules)'
     done = run(sys.executable, '-c', source, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -410,13 +410,15 @@ def test_too_few_are_counted_for_a_person() -> None:
         check_enough(two, CalibrationOptions())
     assert str(refused.value) == (
         'too few observations: 1 more image (2 of 3 collected) and '
-        '46 more stars (14 of 60 collected) needed'
+        '46 more stars (14 of 60 collected) needed; take more images, or find fainter stars '
+        '(magnitude_limit, catalog)'
     )
     refused_too = Ensemble(clean().images[:2], {'no_match': 3, 'no_stars': 1})
     with pytest.raises(TooFewObservations) as refused:
         estimate_calibration(refused_too, PRIOR, CalibrationOptions())
     assert str(refused.value) == (
-        'too few observations: 1 more image (2 of 3 collected) needed; 4 images refused'
+        'too few observations: 1 more image (2 of 3 collected) needed; 4 images refused; '
+        'take more images'
     )
     check_enough(clean(), CalibrationOptions())
 
