@@ -30,7 +30,7 @@ flat numpy arrays of the field's type.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -80,7 +80,7 @@ class RawMessage:
     definition: str
     log_time_ns: int
     view: memoryview
-    place: tuple[Path, int, int] | None = None
+    place: tuple[Path, int, int] | None = field(default=None, compare=False)
 
     @property
     def data(self) -> bytes:

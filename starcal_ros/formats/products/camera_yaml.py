@@ -22,6 +22,7 @@ from starcal_ros.record_fields import Finite, read_record, Shape
 from starcal_ros.untrusted import PARAMETER_BYTES, shown, yaml_value
 
 DEFAULT_CAMERA_NAME = 'camera'
+_HAS_CONTENT = re.compile(r'^\s*[^#\s]', re.MULTILINE)
 _IS_MRCAL = re.compile(r'["\']lensmodel["\']\s*:')
 _OF_MRCAL = (4, 5, 8, 12)  # coefficients of OpenCV's models
 
@@ -95,9 +96,10 @@ def _camera_info_values(text: str) -> Mapping[str, Any]:
         return _values_of_mrcal(text)
     if text.startswith('%YAML:1.0'):  # neither OpenCV's first line nor its tag is YAML
         text = text.partition('\n')[2].replace('!!opencv-matrix', '')
-    # A line ends each message of ros2 topic echo; the camera of one is that of all.
+    # A line ends each message of ros2 topic echo, and the head of a file of OpenCV: the first
+    # document with more than comments is read, since the camera of one message is that of all.
     documents = re.split(r'^---\s*$', text, flags=re.MULTILINE)
-    content = yaml_value(next(filter(str.strip, documents), ''))
+    content = yaml_value(next(filter(_HAS_CONTENT.search, documents), ''))
     if not isinstance(content, dict):
         raise ValueError('not a camera YAML (no keys)')
     if any(isinstance(body, dict) and 'ros__parameters' in body for body in content.values()):

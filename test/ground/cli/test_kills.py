@@ -37,6 +37,7 @@ from starcal_ground.cli import entry_point, main
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
+from starcal_ros import files
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.products.product_files import read_calibration, write_atomically
 
@@ -222,7 +223,8 @@ def _reads(path: Path) -> bool:
         elif path.suffix == '.sqlite':
             Table(path.parent).rows()
         elif path.suffix == '.html':
-            return path.read_text().rstrip().endswith('</html>')
+            with path.open('rb') as page:
+                return files.is_marked(page)
         else:
             return path.stat().st_size > 0
     except (StarcalError, ValueError, OSError):
