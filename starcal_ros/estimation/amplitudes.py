@@ -42,7 +42,7 @@ LARGEST_SHAPE_PX = 30.0
 # The gradient vanishes near zero: the search starts from a small amplitude and a large one, px.
 _STARTS_PX = (1e-4, 2e-2)
 _MOST_STEPS = 12
-_SETTLED = 1e-3  # change of the log likelihood that moves no sigma by a thousandth
+_SETTLED = 1e-3  # a smaller change of the log likelihood moves no sigma by a thousandth
 _NO_EFFECT = 1e-6  # information on an unknown times its prior variance
 NO_AMPLITUDE = -25.0  # log amplitude without any effect
 # Common factors of the amplitudes over which results are averaged, in logarithms.
@@ -162,7 +162,7 @@ def field_amplitudes(
 
 def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
     """Return the lower factor and the inverse of a positive definite matrix."""
-    if len(matrix) == 0:  # of a field that nothing shows
+    if len(matrix) == 0:  # no data show the field
         return matrix, matrix
     lower, failed = dpotrf(matrix, lower=True, clean=True)
     if failed:
@@ -185,8 +185,8 @@ def averaged_field(
     Return the coefficients averaged over a common factor of the amplitudes of the octaves.
 
     ``term`` (q,) are the coefficients of a departure that is likely, at 1 px.  It is averaged over
-    an amplitude of its own; those of the octaves are found without it, since what looks like it
-    may be another one.
+    an amplitude of its own; those of the octaves are found without it, since another
+    departure may look like it.
     """
     mean, precision = octave_prior(len(amplitudes.log_px), first)
     s = np.exp(amplitudes.log_px)[octave]
@@ -275,8 +275,8 @@ _AHEAD = 1024  # images times amplitudes that are tried before the one before th
 _SHAPE_STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
 _SHAPE_SHIFTS = np.linspace(-8.0, 6.0, 43)
 _LOG_SHAPE = np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70)
-_NO_WEIGHT = 1e-9  # of the largest: what has less moves no interval by a millionth
-_HALVINGS = 36  # of the interval that has the answer, in logarithms: to 1e-9 of it
+_NO_WEIGHT = 1e-9  # relative weight below which a sigma moves no interval by a millionth
+_HALVINGS = 36  # bisections in the logarithm: an interval of 20 shrinks to below 1e-9
 _TWO_SIGMA = math.erf(math.sqrt(2.0))
 
 
@@ -285,7 +285,7 @@ class Shapes:
     """
     Amplitudes of the shapes of the images.
 
-    ``sigma_px`` (s,): those that stand for the posterior (`interval_factor`); ``amplitudes`` has
+    ``sigma_px`` (s,): those that represent the posterior (`interval_factor`); ``amplitudes`` has
     its maximum; ``sums`` are those of several images.
     """
 

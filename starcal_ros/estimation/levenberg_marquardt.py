@@ -112,8 +112,8 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     Raises
     ------
     NotObservable
-        When the matrix is not positive definite, or what the blocks leave of the information on
-        a shared unknown is below rounding.
+        When the matrix is not positive definite, or the elimination of the blocks leaves less
+        information on a shared unknown than rounding.
     """
     p = len(normal.a)
     A = normal.A + damping * np.diag(np.diag(normal.A))
