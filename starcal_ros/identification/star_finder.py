@@ -53,7 +53,7 @@ from starcal_ros.stars.streak import Streak, without_streaks
 from starcal_ros.text import counted
 
 _SEARCH_SIGMAS = 3.0
-_CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
+_CENTRE_SIGMA = 0.01  # 1-sigma of the principal point, in longer image sides
 _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
 _DEEPER_SIGMA = 4.0  # distance from which a star that is not measured pulls no centroid

@@ -58,7 +58,7 @@ DEEPER_MAG = 2.0
 # Margin of a cone: 35 years of motion of the fastest star (8.7 arcsec a year) and 20 arcsec of
 # aberration.
 CONE_MARGIN_RAD = 330 * ARCSECOND_RAD
-_STEP_RAD = 0.05  # of directions whose surroundings are kept: 0.87 of it to the farthest
+_STEP_RAD = 0.05  # grid of directions with cached surroundings: every axis is within 0.87 steps
 
 
 # 1-sigma of the proper motion of a star of V = 9 per axis, and its factor for each magnitude
