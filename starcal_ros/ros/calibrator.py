@@ -48,9 +48,9 @@ _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
 # Deep enough to lose no image at one a second during a solve of minutes.
 _OBSERVATIONS = QoSProfile(depth=1000)
 _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-# Of every publisher of static transforms the last message.
+# Every publisher of static transforms latches one message, and all of them are needed.
 _ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_TIMEOUT_S = 5.0  # of set_camera_info, and of its answer: a driver may write to flash memory
+_TIMEOUT_S = 5.0  # longest wait for set_camera_info or its answer: a driver may write to flash
 _LOOK_S = 0.5  # period of checks for the service and the timeout
 _LONGEST_PAUSE_S = 300.0  # beyond the time limit, before a driver is called again
 _RETRY_S = 1.0  # after a failed write
@@ -394,7 +394,7 @@ class CameraDriver:
         self._call: Any = None
         self._since_s = 0.0  # monotonic clock: the last request, or the last that was due
         self._pause_s = _TIMEOUT_S
-        self._next_s = math.inf  # of the next request; infinite: once the service appears
+        self._next_s = math.inf  # time of the next request; infinite: once the service appears
         self._closed = False
         self._lock = threading.RLock()
         group = ReentrantCallbackGroup()
@@ -463,7 +463,7 @@ class CameraDriver:
     def _answered(self, call: Any) -> None:
         with self._lock:
             if call is not self._call or self._closed:
-                return  # of a calibration that is no longer active
+                return  # the request was for a calibration that is no longer active
             self._call = None
             if call.exception() is not None:
                 self._fail(f'failed: {call.exception()}')

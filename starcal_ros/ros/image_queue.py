@@ -197,7 +197,7 @@ class StarTrackers:
         self._most_ns = int(patience_s * NANOSECONDS_PER_SECOND)
         self._lags_ns: tuple[deque[int], ...] = tuple(deque(maxlen=_LAGS) for _ in range(count))
         self._heard_s = [-math.inf] * count  # wall clock of the last sample of each
-        self._lock = threading.Lock()  # of the lags and of these
+        self._lock = threading.Lock()  # guards the lags and the times of the last samples
 
     def add(self, which: int, time_ns: int, sample: AttitudeSample | None) -> None:
         """Add a sample of a star tracker; None marks an invalid one."""

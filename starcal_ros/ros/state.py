@@ -67,9 +67,9 @@ class CalibratorState:
         self._records = threading.Lock()
         self._ensemble = records.Ensemble()
         self._collections = Collections()
-        self._details: dict[str, str] = {}  # of the last image refused for each reason
+        self._details: dict[str, str] = {}  # the last refused image for each reason
         self._history: tuple[records.Activation, ...] = ()
-        self._active: records.Activation | None = None  # of the history
+        self._active: records.Activation | None = None  # an entry of the history
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
