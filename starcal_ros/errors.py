@@ -20,7 +20,7 @@ _OF_EXTRAS = (
     'astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'rawpy', 'spiceypy',
 )  # fmt: skip
 _OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
-# Of the plain install, by their names in PyPI: rosdep brings none of them.
+# Packages of the plain install that rosdep does not bring, by their names in PyPI.
 _NEEDED = {
     'jinja2': 'Jinja2',
     'markupsafe': 'Jinja2',

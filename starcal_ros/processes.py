@@ -171,7 +171,7 @@ def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
         clear(force=True)
 
 
-_M_ARENA_MAX = -8  # of malloc.h
+_M_ARENA_MAX = -8  # as in malloc.h
 
 
 def use_one_arena() -> None:

@@ -50,7 +50,7 @@ TIMES = 'image times'
 """Key of the provenance: where the stamps are from, if the images state none."""
 _FEWEST_STARS = 3  # two fit their mirror image
 _SHOWING = 50  # stars, from bright to faint, show the constellation as well as all
-_MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
+_MOST_OFF = 0.5  # misfit in RMS sizes of a constellation; a mirrored one misfits by 1.4
 _ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
