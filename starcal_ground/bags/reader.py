@@ -79,7 +79,7 @@ _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
 _ZSTD = b'\x28\xb5\x2f\xfd'  # RFC 8878, 3.1.1: CDR begins with a zero
-_LATCHED = re.compile(r'durability: (1|transient_local)\b')  # of Humble, and since
+_LATCHED = re.compile(r'durability: (1|transient_local)\b')  # a number in Humble, a word since
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
