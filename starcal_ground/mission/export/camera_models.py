@@ -30,7 +30,7 @@ from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import LENSES, ros_distortion
 from starcal_ros.records import Calibration
 
-_LARGEST = 'thin_prism'  # of the models that GIANT and mrcal have
+_LARGEST = 'thin_prism'  # largest model that both GIANT and mrcal have
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
 
 

@@ -29,7 +29,7 @@ _MAGIC = (_TEXT, b'DAF/', b'NAIF/DAF', b'DAS/', b'NAIF/DAS')
 # A CK is sampled beside each image too: a stamp offset of the camera may be applied later.
 _BESIDE_NS = (-NANOSECONDS_PER_SECOND, 0, NANOSECONDS_PER_SECOND)
 _KM = 1000.0
-_TEXT_BYTES = 1 << 26  # of a text kernel: the largest have 1 MB
+_TEXT_BYTES = 1 << 26  # longest text kernel that is read: the largest in use have 1 MB
 
 
 def is_kernel(path: Path) -> bool:

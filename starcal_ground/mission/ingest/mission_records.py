@@ -166,7 +166,7 @@ def _rows(
     lines = (match[0] for match in re.finditer(r'[^\r\n]+', text_of(path)))
     lines = (line for line in lines if not line.startswith('#'))
     header = next(lines, '')
-    mark = max(',;\t', key=header.count)  # of spreadsheets, which differ by country
+    mark = max(',;\t', key=header.count)  # spreadsheets use another mark in another country
     table = csv.DictReader(itertools.chain([header], lines), delimiter=mark)
     number = 1
     try:
