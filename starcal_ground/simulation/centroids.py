@@ -159,7 +159,7 @@ def centroid_bound(
     information = np.empty((len(flux), 3, 3))
     for first in range(0, len(flux), _AT_ONCE):
         k = slice(first, first + _AT_ONCE)
-        # Of all parts of the path together: products of matrices.
+        # Matrix products sum over all parts of the path at once.
         of_star = flux[k] / share_u.shape[1]
         along_u, along_v = share_u[k], share_v[k].transpose(0, 2, 1)
         # By log flux, which keeps the matrix well scaled.
