@@ -38,10 +38,10 @@ UNSTATED = LOG_CENTRE, LOG_SIGMA
 OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
-LARGEST_SHAPE_PX = 30.0
+LARGEST_SHAPE_PX = 30.0  # change of a camera from image to image
 # The gradient vanishes near zero: the search starts from a small amplitude and a large one, px.
 _STARTS_PX = (1e-4, 2e-2)
-_MOST_STEPS = 12
+_MOST_STEPS = 12  # steps of Fisher scoring from each start
 _SETTLED = 1e-3  # a smaller change of the log likelihood moves no sigma by a thousandth
 _NO_EFFECT = 1e-6  # information on an unknown times its prior variance
 NO_AMPLITUDE = -25.0  # log amplitude without any effect
@@ -144,6 +144,7 @@ def field_amplitudes(
         value, slope, fisher = evaluate(log_px)
         for _ in range(_MOST_STEPS):
             step = np.linalg.solve(fisher, slope)
+            # A step changes an amplitude by e^2 at most, and is shortened until the posterior rises.
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
             before = value
             for share in (1.0, 0.4, 0.16, 0.06):

@@ -111,7 +111,7 @@ def misfit_images(
         Attitude errors as the stars show them, in the stated sigma of each axis, and their
         variances by the centroids.
     seen : (m,) bool
-        Images with stars enough.
+        Images with enough stars.
     is_stated : bool
         False where the stated sigma is a guess.
 
@@ -119,8 +119,8 @@ def misfit_images(
     -----
     Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
     line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
-    guess, a scatter of few images determines none: the limit is that of Student's t.  With more
-    misfits than a third there is no majority that they could fail to fit.
+    guess, the scatter of few images alone is uncertain: the limit is that of Student's t if it is
+    larger.  If more than a third would be misfits, none is reported: the others are no clear majority.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):

@@ -110,7 +110,7 @@ class Groups:
     One kind of groups of n observations.
 
     ``group`` (n,): the number of the group of each; ``of_one_star`` (n,): a number for the members
-    of a group that are of one star, whose common error is of the star; None if all are.
+    of a group that show one star, whose common error belongs to the star; None if all do.
     ``together`` (n,): correlation of the first of the fine octaves between sightings of the star.
     """
 

@@ -331,10 +331,10 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     the share of its error in their scatter; an image without a rate has the mean.  The errors of
     the images are not lowered for it: together they are the error of the mean.
 
-    A sigma that is not stated is the scatter of the rates, since a data sheet that is too good
-    would leave errors that seem to be differences; of less than three, the turn of a low orbit.
-    Where no image has a rate, the camera is assumed to
-    turn about as fast as it does from image to image, at most as in a low orbit.
+    The scatter of the rates replaces a sigma that is not stated, since a data sheet that is too
+    good would leave errors that seem to be differences; for less than three rates it is the turn
+    of a low orbit.  Where no image has a rate, the camera is assumed to turn about as fast as it
+    does from image to image, at most as in a low orbit.
     """
     m = len(images)
     rate = np.array([image.star_tracker_rate_rad_s for image in images])

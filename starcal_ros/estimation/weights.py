@@ -66,11 +66,11 @@ _SIGMA_PER_MEDIAN = 1.5  # 1-sigma of normal errors over the median of their siz
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
 _ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
-_ROUNDS = 12
-_SETTLED = 1e-3
+_ROUNDS = 12  # iterations of a reweighted fit
+_SETTLED = 1e-3  # relative change of a fitted variance that ends the iterations
 _NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
 _BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
-_STARS_PER_NODE = 40
+_STARS_PER_NODE = 40  # 80 residuals determine a variance to 16 %
 _NODE_SIGMA = 0.5  # prior 1-sigma of a log factor: cores and wings of bright stars
 _LEAST_FREEDOM = 0.1  # floor of the freedom of two axes: one star of few keeps none
 
