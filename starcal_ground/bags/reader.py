@@ -567,7 +567,7 @@ def by_stamp(
         places.append((image_stamp_ns(raw), raw.place, raw.log_time_ns, kind))
     chunks: dict[tuple[Path, int], list[McapRecord]] = {}
     for _, place, log_time_ns, kind in sorted(places, key=operator.itemgetter(0)):
-        assert place is not None  # the reader of MCAP files knows it
+        assert place is not None  # the reader of MCAP files sets it
         file, offset, number = place
         chunk = chunks.pop((file, offset), None) or _records_at(file, offset)
         chunks = dict([*chunks.items(), ((file, offset), chunk)][-2:])

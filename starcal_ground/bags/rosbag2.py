@@ -84,7 +84,7 @@ def _opened(file: Path) -> Any:
     from rosbag2_py import SequentialReader
 
     for name in ('rosbag2_cpp', 'rosbag2_storage', 'rosbag2_storage_mcap'):
-        set_logger_level(name, LoggingSeverity.FATAL)  # one line of ours says it
+        set_logger_level(name, LoggingSeverity.FATAL)  # one line of ours reports it
     reader = SequentialReader()
     try:
         reader.open_uri(str(file))

@@ -32,7 +32,7 @@ _FEWEST_CELLS = 1000
 # same pixels; copies in 8 bit and JPEG of quality 85 keep 0.5 to 1 if it exceeds a digital number.
 _LEAST_COMMON = 0.5
 _BY_CHANCE = 0.1  # six sigma
-# Without other images to know the pattern by: it would have nine times the variance of the noise.
+# Without other images to show the pattern: it would have nine times the variance of the noise.
 _LEAST_ALONE = 0.9
 _MOST_OTHERS = 8  # images that show the pattern: a ninth of the noise is left in it
 _BRIGHTEST, _FEWEST_STARS = 50, 8

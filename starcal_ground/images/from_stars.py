@@ -52,7 +52,7 @@ _HALF_FIELDS_DEG = (
 )
 _SEARCHED = 4  # images that are searched over all focal lengths
 _SEARCH_S = 150.0  # processor time after which the search for a first camera ends
-_BRIEF_S = 4.0  # in which seven of eight simulated cameras of 6 to 117 degrees were found
+_BRIEF_S = 4.0  # enough for seven of eight simulated cameras of 6 to 117 degrees
 _CENTROID_PX = 0.3  # 1-sigma of the centroid of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
@@ -64,7 +64,7 @@ _ONE_LENS = 0.3  # tangent of a half diagonal to which the lenses are the same w
 _OTHERS = 20, 80  # percentiles between which the focal lengths of one camera lie
 _SAME_FOCAL = 0.1  # error of a data sheet that needs no word
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
-_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 0.1  # as of the first search of the estimate
+_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 0.1  # as in the first search of the estimate
 _FREE_ARCSEC = 7200.0  # free rotations: at 20 arcsec those of single images bent the camera
 _FEWEST_STARS, _MORE_STARS = 30, 1.02  # in all images; growth to match them again
 _SIGMA_ARCSEC = 60.0  # 1-sigma of the rotations, more than refraction and aberration change them

@@ -33,7 +33,7 @@ _IMAGES_AHEAD = 4  # images sent ahead of their observations: a star observer qu
 _SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other work
 _ACK_S = 30.0
 _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS down
-# A node is discovered subscription by subscription, and what is sent before a match is lost.
+# A node is discovered subscription by subscription; messages before a match are lost.
 _SETTLED_S = 0.5
 _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (

@@ -58,7 +58,7 @@ def true_observations(
         root = np.linalg.cholesky(covariance)
         measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
         observed = observations(scenario, shown, measured, covariance, snr).select(keep)
-        # A rate is exact where all samples have one error; a sigma of 0 says that none is known.
+        # A rate is exact where all samples have one error; a sigma of 0 means an unknown one.
         own = 1.0 if scenario.star_tracker_hz > 0 else 1e-6
         tracker_sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD * own
         samples = synthetic.attitude_samples(scenario, index)

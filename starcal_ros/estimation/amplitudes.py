@@ -144,7 +144,7 @@ def field_amplitudes(
         value, slope, fisher = evaluate(log_px)
         for _ in range(_MOST_STEPS):
             step = np.linalg.solve(fisher, slope)
-            # A step changes an amplitude by e^2 at most, and is shortened until the posterior rises.
+            # A step changes an amplitude by e^2 at most, and shrinks until the posterior rises.
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
             before = value
             for share in (1.0, 0.4, 0.16, 0.06):
@@ -269,7 +269,7 @@ _CORRELATIONS: tuple[tuple[float, Callable[[Floats], Floats]], ...] = (
     (0.45, lambda k: 0.9**k),
     (0.05, lambda k: 0.5 + 0.5 * np.equal(k, 0)),
 )
-_STEP_S = 100.0  # over which heat loses a tenth
+_STEP_S = 100.0  # time in which heat loses a tenth
 _MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
 _AT_ONCE = 8192  # images times amplitudes
 _AHEAD = 1024  # images times amplitudes that are tried before the one before them is settled

@@ -120,7 +120,7 @@ def misfit_images(
     Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
     line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
     guess, the scatter of few images alone is uncertain: the limit is that of Student's t if it is
-    larger.  If more than a third would be misfits, none is reported: the others are no clear majority.
+    larger.  If more than a third would be misfits, the majority is unclear, and none is reported.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):

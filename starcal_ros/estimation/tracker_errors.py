@@ -293,7 +293,7 @@ _UNKNOWN_RATE_RAD_S = 6.4e-4  # per axis: a low orbit, 1.1e-3, about an unknown 
 # comes round nor often turns away and back.
 _NEAR_S = 600.0
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
-_FEWEST_RATES = 3  # whose scatter bounds the sigma that a sender does not state
+_FEWEST_RATES = 3  # their scatter replaces a sigma that a sender does not state
 
 
 @dataclass(frozen=True)

@@ -566,7 +566,7 @@ def _excess_of_stars(response: Floats) -> int:
     Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
     """
     level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
-    # Columns and rows of another gain have edges, whose maxima are no stars either.
+    # Columns and rows with another gain have edges, whose maxima are not stars either.
     level = level / np.maximum(np.median(level, axis=0), _LEAST)
     level = level / np.maximum(np.median(level, axis=1), _LEAST)[:, None] * _UNIT_DN
     bright, dark = (

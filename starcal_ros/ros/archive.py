@@ -646,7 +646,7 @@ def _locked(folder: Path) -> int:
         number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
         for path in (folder / own for own in _OWN):
-            # What a link leads to is of somebody else.
+            # The target of a link may belong to somebody else.
             if os.path.lexists(path) and not stat.S_ISDIR(path.lstat().st_mode):
                 raise NotADirectoryError(0, 'not a folder; move it to another place', f'{path}')
     except OSError as error:

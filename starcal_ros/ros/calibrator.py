@@ -52,7 +52,7 @@ _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _TIMEOUT_S = 5.0  # longest wait for set_camera_info or its answer: a driver may write to flash
 _LOOK_S = 0.5  # period of checks for the service and the timeout
-_LONGEST_PAUSE_S = 300.0  # beyond the time limit, before a driver is called again
+_LONGEST_PAUSE_S = 300.0  # longest pause after the time limit, before a driver is called again
 _RETRY_S = 1.0  # after a failed write
 _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
@@ -97,7 +97,7 @@ class Calibrator(node.StarcalNode):
             self.get_logger().info(self._state.moved)
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)
-        # Answers and verdicts are of today's parameters: the gate has judged what is stored anew.
+        # Answers and verdicts use today's parameters: the gate judges stored calibrations again.
         self._last_answer, active = Answer(True, ''), self._state.active
         self._last_gate = 'none'
         if self._state.withheld:

@@ -28,7 +28,7 @@ WINDOW_S = 60.0
 _MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messages
 _SILENT_S = 2.0  # without a sample: no image waits for more of them for its rate
 _LAGS = 100  # samples from which the delay of a star tracker is learned
-_MORE = 2  # times the longest of them: it has fallen silent
+_MORE = 2  # silent after so many times its longest lag
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ from starcal_ros.text import counted
 NAME = 'star_observer'
 _ATTITUDES = (QuaternionStamped, PoseStamped, TransformStamped, Imu)
 _IMAGE_TYPES = (ImageMessage, CompressedImage)
-_IMAGES = 20  # that wait with their pixels: 200 MB of 5 megapixels and 16 bit
+_IMAGES = 20  # images that wait with their pixels: 200 MB at 5 megapixels and 16 bit
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
 _COMPARED = 8  # velocities with that of the Earth: 1 ms, once a second

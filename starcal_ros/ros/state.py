@@ -61,7 +61,7 @@ class CalibratorState:
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibrations
-        self.moved = ''  # what became of the records in memory when the folder was opened
+        self.moved = ''  # a sentence on the records in memory when the folder was opened
         # Guards the fields below; never held during a solve.  Activations change only with both
         # locks held, `_disk` first.
         self._records = threading.Lock()
@@ -73,7 +73,7 @@ class CalibratorState:
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
-        self._camera: tuple[int, int, str] = (0, 0, '')  # that the records in memory are of
+        self._camera: tuple[int, int, str] = (0, 0, '')  # camera of the records in memory
         self._on_disk = Kept()  # last written
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:

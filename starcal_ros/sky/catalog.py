@@ -70,12 +70,12 @@ _USUAL_MOTION_FACTOR = 0.85
 class MotionSource(IntEnum):
     """Source of a star's proper motion, which determines the accuracy of its position."""
 
-    UNKNOWN = 0  # Gaia position, moved by none
+    UNKNOWN = 0  # Gaia position without a motion
     DIFFERENCE = 1  # Gaia position at J2016 minus Tycho-2 position at J2000, over 16 years
     HIPPARCOS = 2  # Hipparcos-2 solution
     GAIA = 3  # Gaia solution
     TYCHO = 4  # Tycho-2 solution
-    UNKNOWN_J2000 = 5  # position of about J2000, as of 2MASS, moved by none
+    UNKNOWN_J2000 = 5  # position of about J2000, such as in 2MASS, without a motion
 
 
 UNMOVED = (MotionSource.UNKNOWN, MotionSource.UNKNOWN_J2000)

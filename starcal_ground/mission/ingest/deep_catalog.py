@@ -89,7 +89,7 @@ _SOURCES = (
             2000.0, _NONE, _of_2mass),
 )  # fmt: skip
 # Units, and ranges wider than the extremes of Gaia DR3 and within what a catalog file can hold.
-# Numbers that stand for none, as 99.99 or -999, are outside.
+# Marks of a missing number, such as 99.99 or -999, are outside.
 _RANGES = {
     'ra': ('deg', 0.0, 360.0),
     'dec': ('deg', -90.0, 90.0),

@@ -170,7 +170,7 @@ def _icrf_from_frame(spice: Any, frame: str, time_ns: int) -> Floats | None:
     except spice.NotFoundError:
         return None
     except spice.SpiceyError as error:
-        # Both stand for a CK without data at the time.
+        # Both mark a CK without data at the time.
         if error.short in ('SPICE(NOFRAMECONNECT)', 'SPICE(FRAMEDATANOTFOUND)'):
             return None
         raise ValueError(f'frame {frame}: {_short(error)}') from error
