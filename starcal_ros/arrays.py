@@ -16,5 +16,5 @@ Integers = NDArray[np.int64]  # stamps, identifiers, counts
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]  # (h, w) grey or (h, w, 3) BGR, for display
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # detector counts, indexed [v, u]
-Rows = NDArray[np.intp]  # of a table, as a search returns them
+Rows = NDArray[np.intp]  # row numbers of a table, the type that NumPy searches return
 Singles = NDArray[np.float32]  # for whole images, where double precision would take longer

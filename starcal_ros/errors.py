@@ -19,8 +19,8 @@ import sys
 _OF_EXTRAS = (
     'astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'rawpy', 'spiceypy',
 )  # fmt: skip
-_OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # which of them, the URL decides
-# Of the plain install, by their names in PyPI: rosdep brings none of them.
+_OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # the URL decides which of them is needed
+# Packages of the plain install that rosdep does not bring, by their names in PyPI.
 _NEEDED = {
     'jinja2': 'Jinja2',
     'markupsafe': 'Jinja2',

@@ -79,7 +79,7 @@ class ChildProcess:
     def end(self) -> int:
         """End the process and close its pipes; returns its exit status."""
         for pipe in (self._requests, self._answers):
-            with contextlib.suppress(OSError):  # what is left to write finds no reader
+            with contextlib.suppress(OSError):  # buffered output has no reader any more
                 pipe.close()
         try:
             return self._process.wait(_END_S)
@@ -92,7 +92,7 @@ def main() -> None:
     """Answer calls from the standard input until the parent closes it, as when it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends Ctrl-C here too
     answers = os.fdopen(os.dup(1), 'wb')
-    os.dup2(2, 1)  # what a library prints is no answer
+    os.dup2(2, 1)  # output of a library is not part of the answer
     with contextlib.suppress(EOFError, BrokenPipeError):
         sys.path[:] = pickle.load(sys.stdin.buffer)
         while True:
@@ -171,7 +171,7 @@ def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
         clear(force=True)
 
 
-_M_ARENA_MAX = -8  # of malloc.h
+_M_ARENA_MAX = -8  # as in malloc.h
 
 
 def use_one_arena() -> None:

@@ -188,7 +188,7 @@ def _field_type(hint: Any, marks: tuple[object, ...] = ()) -> FieldType:
     return FieldType(dict, item=_field_type(arguments[1], of_items), **limits)  # a Mapping
 
 
-_LINES, _WIDTH = 3, 96  # of a record as it is shown
+_LINES, _WIDTH = 3, 96  # lines and columns in which a record is shown
 
 
 class Record:

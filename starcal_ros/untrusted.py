@@ -27,13 +27,13 @@ import zipfile
 
 import yaml
 
-PARAMETER_BYTES = 256 * 1024  # of a parameter or camera file: thirty times the longest in use
+PARAMETER_BYTES = 256 * 1024  # parameter or camera file: thirty times the longest in use
 METADATA_BYTES = 4 * 1024 * 1024  # 5000 topics
 PRODUCT_BYTES = 8 * 1024 * 1024  # a calibration.json with the covariance of a field has 1 MB
-ARCHIVE_BYTES = 1 << 30  # of a catalog, residuals or a message, inflated: 30 million stars
+ARCHIVE_BYTES = 1 << 30  # catalog, residuals or message, inflated: 30 million stars
 
 _DEPTH = 32
-_VALUES = 100_000  # of a YAML document; containers of a JSON document
+_VALUES = 100_000  # values of a YAML document; containers of a JSON document
 # Python takes quadratic time to read an integer, or refuses it from 4300 digits.
 _DIGITS = re.compile(r'[0-9]{400}')
 _SHOWN = 60  # characters of a value in an error message
@@ -118,7 +118,7 @@ def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(open(path, 'rb', opener=lambda at, _: os.open(at, flags)))
-        except ValueError as error:  # of a name with NUL or half a surrogate pair
+        except ValueError as error:  # the name has a NUL or half a surrogate pair
             raise ValueError('not the name of a file') from error
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise ValueError('not a regular file')

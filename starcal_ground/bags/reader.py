@@ -79,7 +79,7 @@ _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
 _RECORD = struct.Struct('<BQ')  # kind, length
 _MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
 _ZSTD = b'\x28\xb5\x2f\xfd'  # RFC 8878, 3.1.1: CDR begins with a zero
-_LATCHED = re.compile(r'durability: (1|transient_local)\b')  # of Humble, and since
+_LATCHED = re.compile(r'durability: (1|transient_local)\b')  # a number in Humble, a word since
 _LONGEST_NAME = 4096  # Linux has no longer path
 
 
@@ -567,7 +567,7 @@ def by_stamp(
         places.append((image_stamp_ns(raw), raw.place, raw.log_time_ns, kind))
     chunks: dict[tuple[Path, int], list[McapRecord]] = {}
     for _, place, log_time_ns, kind in sorted(places, key=operator.itemgetter(0)):
-        assert place is not None  # the reader of MCAP files knows it
+        assert place is not None  # the reader of MCAP files sets it
         file, offset, number = place
         chunk = chunks.pop((file, offset), None) or _records_at(file, offset)
         chunks = dict([*chunks.items(), ((file, offset), chunk)][-2:])

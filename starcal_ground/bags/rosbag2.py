@@ -60,11 +60,11 @@ def read_messages(
     reader = _opened(file)
     reader.set_filter(StorageFilter(topics=list(counts)))
     missing = sum(counts.values())
-    with contextlib.suppress(RuntimeError, MemoryError, LookupError, ValueError):  # of C++
+    with contextlib.suppress(RuntimeError, MemoryError, LookupError, ValueError):  # from C++
         while reader.has_next():
             yield reader.read_next()
             missing -= 1
-    if missing > 0:  # of a topic with two types more are read than are wanted
+    if missing > 0:  # negative: a topic with two types gives more messages
         on_damage(f'{file}: damaged, rosbag2 reads only a part: {_REMEDY}')
 
 
@@ -84,7 +84,7 @@ def _opened(file: Path) -> Any:
     from rosbag2_py import SequentialReader
 
     for name in ('rosbag2_cpp', 'rosbag2_storage', 'rosbag2_storage_mcap'):
-        set_logger_level(name, LoggingSeverity.FATAL)  # one line of ours says it
+        set_logger_level(name, LoggingSeverity.FATAL)  # one line of ours reports it
     reader = SequentialReader()
     try:
         reader.open_uri(str(file))

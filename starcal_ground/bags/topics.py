@@ -95,7 +95,7 @@ def _choose_attitudes(
 
     A star tracker may drop out, but not all of them.
     """
-    # Of several types on a topic all are read; the first of them states what it is for.
+    # All types on a topic are read; the first of `ATTITUDE_TYPES` among them states its purpose.
     kinds = {
         topic.name: kind
         for kind in reversed(codec.ATTITUDE_TYPES)

@@ -13,7 +13,7 @@ from starcal_ros.stars import detection
 from starcal_ros.stars.detection import Background
 
 _STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
-LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # that a window shows whole, its ends blurred
+LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # the longest that a window shows whole, its ends blurred
 _APART_PX = 10.0  # the fainter of two sources nearer than this counts as a part of the other
 _MEASURED = 400  # sources measured, brightest by their peak
 _KEPT = 200

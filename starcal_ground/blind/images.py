@@ -35,8 +35,8 @@ LOOKED_AT = 40  # at most, those without sources included
 _OTHER_SCALES = (0.55, 1.8, 0.3, 3.3)
 _FEW = 3  # identified, with which no image is searched further
 FEWEST_SOURCES = 6
-_BLURRED_ENDS_PX = 1.0  # by which the sources of a streak are longer than it
-_SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
+_BLURRED_ENDS_PX = 1.0  # the blurred ends lengthen the sources of a streak by it
+_SEARCH_S = 10.0  # half of the 20 s of a diagnosis; reading and measuring take the rest
 
 
 @dataclass

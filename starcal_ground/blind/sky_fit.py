@@ -55,7 +55,7 @@ class Ranges:
 
 
 STATED = Ranges(0.25, 0.05, 0.03, (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005))
-FOUND = Ranges(0.02, 0.01, 0.005, (0.01, 0.005))  # of a camera that identified another image
+FOUND = Ranges(0.02, 0.01, 0.005, (0.01, 0.005))  # once another image gave the camera
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def _nearest(apart: Apart, most: int, most_sources: int) -> Apart:
     np.minimum.at(of_rank, rank, apart_px)
     np.minimum.at(of_source, source, apart_px)
     good = np.flatnonzero((apart_px == of_rank[rank]) & (apart_px == of_source[source]))
-    # Of stars at one place, as in catalogs of doubles, the brightest.
+    # Catalogs of double stars list several at one place: the brightest is kept.
     good = np.sort(good[np.unique(source[good], return_index=True)[1]])
     return rank[good], source[good], apart_px[good]
 

@@ -49,7 +49,7 @@ calibration; 2 bad input, named in one line; 130 interrupted."""
 class _Parser(argparse.ArgumentParser):
     """Reports errors in one line; an option of a parameter file is named as ``--set`` takes it."""
 
-    command = ''  # that the line names
+    command = ''  # the command that the line names
     has_set = False  # whether it takes ``--set``
 
     def error(self, message: str) -> NoReturn:

@@ -476,7 +476,7 @@ def _sent_at(attitudes: WireAttitudes, at_ns: Integers, max_gap_s: float) -> tup
     behind = np.where(cosine < 0, -behind, behind)
     angle = np.arccos(np.minimum(np.abs(cosine), 1.0))
     part = np.asarray((at_ns - times[after - 1]) / np.maximum(gap_ns, 1))[..., None]
-    # Of equal attitudes the angle is zero, and any mean of them is right.
+    # Equal attitudes have an angle of zero, and any mean of them is right.
     sine = np.where(angle > 1e-9, np.sin(angle), 1.0)
     one = np.where(angle > 1e-9, np.sin((1.0 - part) * angle) / sine, 1.0 - part)
     other = np.where(angle > 1e-9, np.sin(part * angle) / sine, part)

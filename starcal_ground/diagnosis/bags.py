@@ -31,7 +31,7 @@ from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import sky_circle
 
 _PLACES = 8  # in the sky that a sentence lists
-_CIRCLE = re.compile(r'RA (\S+), Dec (\S+), radius (\S+) deg')  # of `sky_circle`
+_CIRCLE = re.compile(r'RA (\S+), Dec (\S+), radius (\S+) deg')  # text made by `sky_circle`
 _ONE_QUERY_DEG = 5.0  # radius of the sky of all images that one table can have
 _MEASURED = 10  # images, of which one is to be used before others are measured
 _STAR_REMEDIES = {

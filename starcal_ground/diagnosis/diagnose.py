@@ -53,9 +53,9 @@ _FOCAL_SHARE = 0.03  # error of the focal length that an image is still matched 
 _LINEAR_SLOPES = 0.5, 1.6
 _FEW_IN_AN_IMAGE = 5  # stars whose brightnesses are compared with each other
 _FAR_DEX = 0.2  # least difference of two stars: half a magnitude, twice their usual scatter
-_SAME_ALIGNMENT_RAD = math.radians(3.0)  # of one written in another way and the one found
+_SAME_ALIGNMENT_RAD = math.radians(3.0)  # notations of one alignment differ by less
 _MOST_BINNED = 8
-_SIGMAS = 3.0  # of a principal point that the stars show elsewhere
+_SIGMAS = 3.0  # significance with which the stars show the principal point elsewhere
 _HELD = 1e-5  # range, widths, of a principal point that is held
 _FREE = 0.5  # range of one that is free: the whole image
 # Differences of clocks that people mix up, s, with an error of a shift.

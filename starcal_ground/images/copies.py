@@ -28,11 +28,11 @@ from starcal_ros.robust_statistics import MAD_TO_SIGMA
 
 _SIDE_PX = 256  # in the middle: 16,000 cells, whose correlations by chance have a sigma of 0.016
 _FEWEST_CELLS = 1000
-# Of noise, in common: two exposures of a real camera had at most 0.42, by faint stars at the same
-# pixels; 8 bit and JPEG of quality 85 leave 0.5 to 1 of noise over one digital number.
+# Correlation of the noise: two exposures of a real camera had at most 0.42, by faint stars at the
+# same pixels; copies in 8 bit and JPEG of quality 85 keep 0.5 to 1 if it exceeds a digital number.
 _LEAST_COMMON = 0.5
 _BY_CHANCE = 0.1  # six sigma
-# Without other images to know the pattern by: it would have nine times the variance of the noise.
+# Without other images to show the pattern: it would have nine times the variance of the noise.
 _LEAST_ALONE = 0.9
 _MOST_OTHERS = 8  # images that show the pattern: a ninth of the noise is left in it
 _BRIGHTEST, _FEWEST_STARS = 50, 8

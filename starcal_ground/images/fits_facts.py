@@ -147,7 +147,7 @@ def _compared(
         if other == name or other not in header or _is_clock(header, other):
             continue
         with contextlib.suppress(ValueError, OverflowError):
-            # A date alone, in a whole number of days too, is no time.
+            # A date alone, or a whole number of days, gives no time.
             if value_of(header, other) % 1.0 in (0.0, 0.5):
                 continue
             off_s = (_stamp(header, other)[0] - time_ns) / NANOSECONDS_PER_SECOND

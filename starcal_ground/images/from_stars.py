@@ -51,26 +51,23 @@ _HALF_FIELDS_DEG = (
     *((_PINHOLE, deg) for deg in (6.0, 4.0, 2.7)),
 )
 _SEARCHED = 4  # images that are searched over all focal lengths
-_SEARCH_S = 150.0  # of processor time
-_BRIEF_S = 4.0  # in which seven of eight simulated cameras of 6 to 117 degrees were found
-_CENTROID_PX = 0.3  # of a bright source
+_SEARCH_S = 150.0  # processor time after which the search for a first camera ends
+_BRIEF_S = 4.0  # enough for seven of eight simulated cameras of 6 to 117 degrees
+_CENTROID_PX = 0.3  # 1-sigma of the centroid of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
-_MOST_OF_PEAK, _SAME_STAR_PX, _MOST_BRIGHT = (
-    0.9,
-    2.0,
-    40,
-)  # of stars whose light is compared with the catalog
+# The brightest unsaturated stars are compared with the catalog in brightness.
+_MOST_OF_PEAK, _SAME_STAR_PX, _MOST_BRIGHT = 0.9, 2.0, 40
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
 _MORE, _CLOSER = 1.1, 0.7
 _ONE_LENS = 0.3  # tangent of a half diagonal to which the lenses are the same within a pixel
 _OTHERS = 20, 80  # percentiles between which the focal lengths of one camera lie
 _SAME_FOCAL = 0.1  # error of a data sheet that needs no word
 _SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
-_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 0.1  # as of the first search of the estimate
-_FREE_ARCSEC = 7200.0  # of the rotation of an image, which trades with its principal point
-_FEWEST_STARS, _MORE_STARS = 30, 1.02  # of all images, and over those of the camera before
-_SIGMA_ARCSEC = 60.0  # of the rotations, above what refraction and aberration change in them
+_ROBUST_SCALE, _ROBUST_GAIN = 3.0, 0.1  # as in the first search of the estimate
+_FREE_ARCSEC = 7200.0  # free rotations: at 20 arcsec those of single images bent the camera
+_FEWEST_STARS, _MORE_STARS = 30, 1.02  # in all images; growth to match them again
+_SIGMA_ARCSEC = 60.0  # 1-sigma of the rotations, more than refraction and aberration change them
 
 
 @dataclass(frozen=True)

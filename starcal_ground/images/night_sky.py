@@ -45,7 +45,7 @@ _FEW = 5  # images that are looked at for stars, or whose stars show a tone curv
 # The scatter of 15 brightnesses is known to a fifth.
 _FEWEST_BRIGHTNESSES, _CLEARLY_LESS = 15, 0.8
 _ATTITUDE_TOPIC = '/stars/attitude'
-# Of no site: its zenith at a time that is not known is not known either.
+# The site does not matter: at an unknown time its zenith is unknown too.
 _NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
 
 

@@ -56,9 +56,9 @@ from starcal_ros.formats.image_files import (
 from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic
 from starcal_ros.text import counted
 
-# Of files whose content says nothing, as of damaged ones; HEIC, of telephones, is not read.
+# These names mark images whose content does not, as damaged ones; HEIC of telephones is not read.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts', '.heic')
-_DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
+_DIAGONAL_35_MM = 43.2666  # diagonal of a frame of 36 mm x 24 mm
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
 _EXIF, _GPS = 0x8769, 0x8825
 _FOCAL_LENGTH, _BITS = 0x920A, 0x0102
@@ -549,7 +549,7 @@ def _of_fits(path: Path, image: FileImage) -> tuple[Photograph, float, float]:
 
 
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
-_FULL = 65000  # of 16 bit; the end of the range means saturation
+_FULL = 65000  # largest 16-bit value written: the end of the range means saturation
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def _stars_of_field(
     """Number of stars of the catalog in an image of a camera, as `too_few_stars` counts them."""
     half = 0.5 * np.array([camera.width, camera.height]) / float(camera.parameters[0])
     radius_rad = math.atan(float(np.hypot(*half)))
-    area_sr = 4.0 * math.asin(float(np.prod(np.sin(np.arctan(half)))))  # of a pyramid
+    area_sr = 4.0 * math.asin(float(np.prod(np.sin(np.arctan(half)))))  # sr of a pyramid
     if radius_rad > _NARROW_RAD or not (is_own or places):
         return len(catalog) * area_sr / (4.0 * math.pi)
     tree = direction_tree(catalog.direction_icrs)

@@ -25,7 +25,7 @@ _TAI_MINUS_NS = {
     'TAI': 0,
     'GPS': 19 * NANOSECONDS_PER_SECOND,
     'TT': -32_184_000_000,
-    'TDB': -32_184_000_000,  # of the TT that `to_utc_ns` makes of it
+    'TDB': -32_184_000_000,  # from the TT into which `to_utc_ns` converts TDB
 }
 _LAST_STAMP_NS = ((1 << 31) - 60) * NANOSECONDS_PER_SECOND  # no system is 60 s off UTC
 _OTHER_NAMES = {'ET': 'TDB', 'TDT': 'TT', 'GPST': 'GPS', 'IAT': 'TAI', 'UT': 'UTC', '': 'UTC'}

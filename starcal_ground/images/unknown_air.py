@@ -34,20 +34,20 @@ from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
 USUAL_ARCSEC = (52.0, 7.0)
 """A of sites between the sea and 2000 m, 0.55 micrometres: mean and 1-sigma."""
 _CUBIC = -0.00115  # B / A, from the scale height of the air and the Earth's radius
-_STARS = 150  # of an image, the most accurate
-_FLOOR_PX = 0.03  # of a centroid
-_OUTLIER = 4.0  # times the median residual
+_STARS = 150  # most accurate stars used in each image
+_FLOOR_PX = 0.03  # added to the sigma of a centroid in quadrature
+_OUTLIER = 4.0  # limit of a residual over their median
 # 1-sigma per axis, less the velocity of the Earth: of a spacecraft about the Sun, and of the Earth
 # on another date.
 SPACE_M_S, EARTH_M_S = 50000.0, 24000.0
-_FASTEST_M_S = 200000.0  # of a spacecraft about the Sun, at its perihelion
-_FIELD_PX = 0.1  # rms of what the lens model leaves, of _OCTAVES
+_FASTEST_M_S = 200000.0  # fastest spacecraft about the Sun, at its perihelion
+_FIELD_PX = 0.1  # rms residual of the lens model, in _OCTAVES
 _OCTAVES = 2
 _LATITUDES_RAD = np.radians(np.arange(-84.0, 85.0, 6.0))
 _LOWEST_BORESIGHT = math.cos(math.radians(75.0))
-_TURNS = 30  # of fits of the camera and of the times
+_TURNS = 30  # alternate fits of the camera and of the times
 _TELLING = 12.0  # twice the logarithm of a ratio of likelihoods: 400
-_MISSHAPEN, _MISSHAPEN_PX = 3.5, 0.5  # of an image, over the median and in a corner
+_MISSHAPEN, _MISSHAPEN_PX = 3.5, 0.5  # stretch of an image in a corner: over the median, and least
 
 
 def refracted(direction_icrf: Floats, zenith_icrf: Floats, refraction_arcsec: float) -> Floats:

@@ -28,7 +28,7 @@ INK, MUTED, GRID, PAPER = (f'var(--{name})' for name in ('ink', 'muted', 'grid',
 SERIES = tuple(f'var(--series-{k})' for k in (1, 2, 3))
 
 CHARACTER = 0.6 * LETTER  # width
-_POINTS_BGR = (212, 139, 61)  # of clouds, which are bitmaps: readable on white and on black
+_POINTS_BGR = (212, 139, 61)  # clouds of points are bitmaps: readable on white and on black
 _PER_UNIT = 2  # pixels of a bitmap
 _MARKS = {
     'circle': 'M{r},0A{r},{r} 0 1 1 -{r},0A{r},{r} 0 1 1 {r},0Z',
@@ -378,7 +378,7 @@ HEIGHT = 340.0
 Range = tuple[float | None, float | None]
 """Limits of an axis; None: the range of the data."""
 
-_MARGIN = 0.04  # of the range of the data, at each end of an axis
+_MARGIN = 0.04  # free part of an axis at each end, in ranges of the data
 
 
 def plot(

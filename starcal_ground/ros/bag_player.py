@@ -29,11 +29,11 @@ NAME = 'bag_player'
 # are acknowledged within 10 ms, small messages only with the next heartbeat, after up to 3 s.
 _IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
 _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
-_IMAGES_AHEAD = 4  # of their observations: a star observer queues twenty
+_IMAGES_AHEAD = 4  # images sent ahead of their observations: a star observer queues twenty
 _SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other work
 _ACK_S = 30.0
 _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS down
-# A node is discovered subscription by subscription, and what is sent before a match is lost.
+# A node is discovered subscription by subscription; messages before a match are lost.
 _SETTLED_S = 0.5
 _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (
@@ -150,7 +150,7 @@ class BagPlayer(printable_log.PrintableLog):
     def _wait_for_subscribers(self) -> None:
         """Wait until the topics that matter have subscribers and no more come, or the timeout."""
         attitudes = self._of(message_codec.ATTITUDE_TYPE)
-        # Of other types, one holds the attitudes, and the others may be there for anything.
+        # One topic of the other types holds the attitudes; the rest may have other purposes.
         others = [] if attitudes else self._of(*message_codec.ATTITUDE_TYPES)
         needed = [*self._images, *attitudes] or list(self._players)
         other = self.own.wait_for_topic

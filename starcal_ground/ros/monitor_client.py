@@ -28,7 +28,7 @@ from starcal_ros.ros.node import end_quietly, is_overdue, until_told_to_end
 from starcal_ros.text import counted
 
 NAME = 'monitor'
-_PREFIX = 'starcal: '  # of the diagnostics of our nodes
+_PREFIX = 'starcal: '  # begins the names of our nodes in the diagnostics
 _PERIOD_S = 0.25
 
 

@@ -41,9 +41,9 @@ from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 
 NAME = 'setup_finder'
-_IMAGES = QoSProfile(depth=20)  # as of the star observer, so that both see the same
+_IMAGES = QoSProfile(depth=20)  # as in the star observer, so that both see the same
 _SAMPLES = QoSProfile(depth=2000)  # ten seconds of a fast star tracker
-_HISTORY_S, _JUMP_S = 3600.0, 10.0  # of attitudes, as of the star observer
+_HISTORY_S, _JUMP_S = 3600.0, 10.0  # attitudes kept, and steps of the clock, as in star_observer
 _KEPT = 5  # images that are searched: of 5 megapixels and 16 bit they are 50 MB
 _UNANSWERED = 20  # images whose observations may come later
 _IN_A_ROW = 5  # images without a match: fewer may be clouds, a bright body or a slew

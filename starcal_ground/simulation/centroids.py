@@ -58,7 +58,7 @@ def true_observations(
         root = np.linalg.cholesky(covariance)
         measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
         observed = observations(scenario, shown, measured, covariance, snr).select(keep)
-        # A rate is exact where all samples have one error; a sigma of 0 says that none is known.
+        # A rate is exact where all samples have one error; a sigma of 0 means an unknown one.
         own = 1.0 if scenario.star_tracker_hz > 0 else 1e-6
         tracker_sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD * own
         samples = synthetic.attitude_samples(scenario, index)
@@ -159,7 +159,7 @@ def centroid_bound(
     information = np.empty((len(flux), 3, 3))
     for first in range(0, len(flux), _AT_ONCE):
         k = slice(first, first + _AT_ONCE)
-        # Of all parts of the path together: products of matrices.
+        # Matrix products sum over all parts of the path at once.
         of_star = flux[k] / share_u.shape[1]
         along_u, along_v = share_u[k], share_v[k].transpose(0, 2, 1)
         # By log flux, which keeps the matrix well scaled.

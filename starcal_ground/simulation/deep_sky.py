@@ -15,7 +15,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky import catalog
 
 _MOTION_MAS = 8.0  # a year, 1-sigma of each axis
-_V_LESS_G = 0.15  # of a star without a colour, as `deep_catalog.johnson_v` has it
+_V_LESS_G = 0.15  # for a star without a colour, as in `deep_catalog.johnson_v`
 
 
 def log10_density(magnitude: NDArray[np.floating]) -> Floats:

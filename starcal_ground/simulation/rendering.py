@@ -65,7 +65,7 @@ def star_electrons(
     light_u = share_u * ((u >= 0) & (u < width))
     light_v = flux_electrons[:, None] * share_v * ((v >= 0) & (v < height))
     light = light_v[:, :, None] * light_u[:, None, :]
-    # Pixels beyond an edge, which have no light, stand for those at the edge.
+    # Pixels beyond an edge have no light, so that they may be counted at the edge.
     cells = (v.clip(0, height - 1) * width)[:, :, None] + u.clip(0, width - 1)[:, None, :]
     electrons = np.bincount(cells.ravel(), light.ravel(), height * width).reshape(height, width)
     return np.asarray(electrons, np.float64)

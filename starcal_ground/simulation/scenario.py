@@ -119,9 +119,9 @@ class Scenario:
     magnitude_limit: float = 9.0
     stars_per_image: int | None = None  # the brightest on the detector; None: all
     sky: StarCatalog | None = None  # sorted by magnitude; None: the bundled catalog
-    table: str | None = None  # of the sky, as of an archive; None: the bundled catalog will do
-    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera during each exposure
-    star_tracker_hz: float = 0.0  # of samples with errors of their own; 0: at ATTITUDE_OFFSETS_S
+    table: str | None = None  # the sky as an archive gives it; None: the bundled catalog
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # turn of the camera in an exposure
+    star_tracker_hz: float = 0.0  # rate of samples, errors independent; 0: at ATTITUDE_OFFSETS_S
 
     def time_ns(self, index: int) -> int:
         """Middle of the exposure of an image."""

@@ -50,7 +50,7 @@ _UNKNOWNS = {
 """Entries of the list of unknowns by cause."""
 _SIGMAS = {'stamps': 'stamp_sigma_s', 'mountings': 'star_tracker_mounting_sigma_arcsec'}
 """Options that are a sigma, by cause: a tenth may be stated."""
-_WORTH_STATING = 0.9  # of the sigma before
+_WORTH_STATING = 0.9  # a statement that lowers the sigma by less is not worth stating
 _SHOWN = 3.0  # times its noise: a slow error of a star tracker that the images show
 _OF_TRACKERS = (TRACKER_NOISE, TRACKER_SLOW, 'mountings', 'stamps')
 
@@ -388,7 +388,7 @@ def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:
 
 
 def _of_stamps(label: str, sigma: float) -> str:
-    if label.endswith('_rad'):  # of a rate that is not known
+    if label.endswith('_rad'):  # the rate is not known
         return f'rate not known: {significant(sigma / ARCSECOND_RAD, 3)}″ per axis assumed'
     return f'{significant(1e3 * sigma, 3)} ms assumed'
 

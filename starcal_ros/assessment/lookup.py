@@ -81,7 +81,7 @@ def sigma_arcsec(covariance_rad2: Floats) -> Floats:
 @dataclass(frozen=True)
 class Derivatives:
     """
-    Lines of sight of n pixels and what moves them, in the camera frame.
+    Lines of sight of n pixels and their derivatives, in the camera frame.
 
     For a fixed pixel: a direction moves so as to undo the effect of a parameter on its image.
 

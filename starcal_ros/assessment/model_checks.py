@@ -29,9 +29,9 @@ _AS_STATED = {  # label -> name and unit of what an operator states
     'sidereal_time_1_rad': ('clock_offset_min', 1.0 / (60.0 * SIDEREAL_RAD_S)),
 }
 _CLEAR_SIGMA = 5.0  # from a prior, beyond which the evidence is asked: the default of the gate
-_INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
+_INNER = (0.1, 0.9)  # part of the detector: nearer the edge too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for
-_STRIP = 1 / 24  # of the width: a quarter of the shortest wave of the field
+_STRIP = 1 / 24  # in widths: a sixth of the shortest wave of the field
 
 
 def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:
@@ -126,7 +126,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     for entry in layout.shared:
         at = layout.of([entry.name])
         tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
-        tested &= entry.widest > entry.sigma  # of any lens: nobody states it
+        tested &= entry.widest > entry.sigma  # a prior that holds for any lens states nothing
         if entry.name not in _STATED or not tested.any():
             continue
         means, variances, log_evidence = without_prior(

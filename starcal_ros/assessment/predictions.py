@@ -12,8 +12,8 @@ covariance of the others by the errors that observations share, beyond the worki
 posterior averaged over the amplitudes has wide tails: less an image, its inverse is nearly
 singular.)  Stars, cells and stars alike are predicted as groups: the sum of
 the residuals of a group has the variance of their noise and of the error that they share, less
-what the unknowns follow.  The mean square over the predicted variance is 1 where the model and its
-sigmas hold, in every part of the data.
+the part that the unknowns absorb.  The mean square over the predicted variance is 1 where the
+model and its sigmas hold, in every part of the data.
 """
 
 from __future__ import annotations
@@ -122,16 +122,16 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
     )
 
 
-_BINS = 4  # of each kind: corners and faint stars stand apart, and each holds a quarter
-_FEWEST_STARS = 30  # of a bin: its normalised residual is known to 9 %
+_BINS = 4  # quantiles of radius, magnitude and time: corners and faint stars are separate
+_FEWEST_STARS = 30  # the normalised residual of a bin is then accurate to 9 %
 _FEWEST_IMAGES = 4  # three may determine no calibration without one of them
 _NO_EFFECT = 1e-3  # information on a coefficient times its prior variance
-_CELLS = 24  # of the detector along its width
+_CELLS = 24  # cells across the width, the size of those of the first fine octave
 
 
 def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
     """
-    Return the normalised residuals of what others predict, by parts of the data.
+    Return the normalised residuals of parts of the data, each predicted by the others.
 
     Images by radius, magnitude and time; then stars by the number of their images, cells of the
     detector by radius, and stars of like brightness of an image by magnitude.  Empty with fewer
@@ -195,8 +195,8 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     sigma_px = entry.sigma * np.exp(posterior.field.log_px)[entry.octave]
     term, precision = np.zeros(layout.count), layout.prior_precision.copy()
     term[field], precision[field] = entry.term * np.exp(posterior.term.log_px[0]), sigma_px**-2.0
-    # Kept as found: each image may have a sidereal time of its own, which the others do not show.
-    # Coefficients of the field that their prior holds at zero say nothing of an image.
+    # These keep their values: each image may have its own sidereal time, which others do not show,
+    # and field coefficients that their prior holds at zero predict nothing of an image.
     shown = (sigma_px**2 + term[field] ** 2) * np.diag(given.information)[field]
     kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])
     part, held = np.setdiff1d(posterior.estimated, kept), np.intersect1d(posterior.estimated, kept)
@@ -305,7 +305,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
 
 
 def _of_pairs(group: Indices, weight: Floats, share_px2: Floats) -> Floats:
-    """Return the variances of weighted sums over groups by what their members share in pairs."""
+    """Return the variances of weighted sums over groups by the covariances of their members."""
     each = weight * np.sqrt(share_px2)
     return np.asarray(np.bincount(group, each) ** 2 - np.bincount(group, each**2))
 

@@ -1,9 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Checks without stars of what an ensemble states: velocity, rates, time of read-out and clock.
+Checks of the statements of an ensemble without stars: velocity, rates, read-out and clock.
 
-Each compares a statement with something else that is known.  A statement that nothing contradicts
-and nothing confirms is listed as not checked.  Checks of one value alone are made where it is
+Each compares a statement with another known quantity.  A statement that nothing contradicts or
+confirms is listed as not checked.  Checks of one value alone are made where it is
 read (`pipeline.setup`); those by the stars are `model_checks`.
 """
 
@@ -29,8 +29,8 @@ from starcal_ros.text import significant
 _SAMPLED = 8  # images whose velocities are compared, in 25 ms; eight show the turn of an orbit
 _FEWEST_STARS = 2  # one does not show the velocity along its direction
 _UNSTATED_M_S = 1.0  # from the velocity of the Earth, which is taken where none is stated
-# A turn between two images is by one rate where the rates at both agree to a fifth; it shows the
-# rate where it exceeds the noise of two coarse attitudes ten times, and is no full turn.
+# Two images that turn at one rate have rates that agree to a fifth.  Their turn shows the rate if
+# it exceeds the noise of two coarse attitudes ten times and is less than a full turn.
 _EVEN, _LEAST_TURN_RAD, _MOST_TURN_RAD = 0.2, 5e-3, 1.0
 _FEWEST_TURNS = 3
 _RATE_MISTAKES = {
@@ -53,7 +53,7 @@ def check_statements(
 
 
 def with_doubts(ensemble: Ensemble, catalog: StarCatalog) -> Ensemble:
-    """Return the ensemble with what a usual mistake of its velocities changes in their sigma."""
+    """Return the ensemble with velocity sigmas as large as a usual mistake that explains them."""
     times_ns, velocity_m_s = _stated_velocities(ensemble.images, catalog)
     doubt = doubt_of(times_ns, velocity_m_s) if times_ns else None
     if doubt is None:

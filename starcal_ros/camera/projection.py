@@ -47,10 +47,10 @@ ALL_PARAMETER_NAMES = parameter_names('tilted')
 """Names of the parameters of all lens models; `tilted` has them all."""
 
 _INVERSE_STEPS = 50  # Newton iterations: 6 suffice in the field, far corners need more
-# A field changes by less than 0.1 px per pixel, so each step reduces the error tenfold; the field
-# of a good camera by a thousandth of that.
+# A field changes by less than 0.1 px per pixel, that of a good camera by 0.0001 px, so that each
+# step reduces the error at least tenfold.
 _FIELD_STEPS = 12
-_FIELD_TOLERANCE_PX = 1e-11  # of a step: the rounding of a pixel
+_FIELD_TOLERANCE_PX = 1e-11  # a smaller step is the rounding of a pixel coordinate
 _SHORT = 0.3  # a step that stays on the branch, on the ideal image plane
 _INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal length of 4000 px
 # Penalty of a fit for each unit by which a coefficient of a rational polynomial changes.

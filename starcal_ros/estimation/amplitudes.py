@@ -38,11 +38,11 @@ UNSTATED = LOG_CENTRE, LOG_SIGMA
 OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
-LARGEST_SHAPE_PX = 30.0
+LARGEST_SHAPE_PX = 30.0  # change of a camera from image to image
 # The gradient vanishes near zero: the search starts from a small amplitude and a large one, px.
 _STARTS_PX = (1e-4, 2e-2)
-_MOST_STEPS = 12
-_SETTLED = 1e-3  # change of the log likelihood that moves no sigma by a thousandth
+_MOST_STEPS = 12  # steps of Fisher scoring from each start
+_SETTLED = 1e-3  # a smaller change of the log likelihood moves no sigma by a thousandth
 _NO_EFFECT = 1e-6  # information on an unknown times its prior variance
 NO_AMPLITUDE = -25.0  # log amplitude without any effect
 # Common factors of the amplitudes over which results are averaged, in logarithms.
@@ -144,6 +144,7 @@ def field_amplitudes(
         value, slope, fisher = evaluate(log_px)
         for _ in range(_MOST_STEPS):
             step = np.linalg.solve(fisher, slope)
+            # A step changes an amplitude by e^2 at most, and shrinks until the posterior rises.
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
             before = value
             for share in (1.0, 0.4, 0.16, 0.06):
@@ -162,7 +163,7 @@ def field_amplitudes(
 
 def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
     """Return the lower factor and the inverse of a positive definite matrix."""
-    if len(matrix) == 0:  # of a field that nothing shows
+    if len(matrix) == 0:  # no data show the field
         return matrix, matrix
     lower, failed = dpotrf(matrix, lower=True, clean=True)
     if failed:
@@ -185,8 +186,8 @@ def averaged_field(
     Return the coefficients averaged over a common factor of the amplitudes of the octaves.
 
     ``term`` (q,) are the coefficients of a departure that is likely, at 1 px.  It is averaged over
-    an amplitude of its own; those of the octaves are found without it, since what looks like it
-    may be another one.
+    an amplitude of its own; those of the octaves are found without it, since another
+    departure may look like it.
     """
     mean, precision = octave_prior(len(amplitudes.log_px), first)
     s = np.exp(amplitudes.log_px)[octave]
@@ -268,15 +269,15 @@ _CORRELATIONS: tuple[tuple[float, Callable[[Floats], Floats]], ...] = (
     (0.45, lambda k: 0.9**k),
     (0.05, lambda k: 0.5 + 0.5 * np.equal(k, 0)),
 )
-_STEP_S = 100.0  # over which heat loses a tenth
+_STEP_S = 100.0  # time in which heat loses a tenth
 _MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
 _AT_ONCE = 8192  # images times amplitudes
 _AHEAD = 1024  # images times amplitudes that are tried before the one before them is settled
 _SHAPE_STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
 _SHAPE_SHIFTS = np.linspace(-8.0, 6.0, 43)
 _LOG_SHAPE = np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70)
-_NO_WEIGHT = 1e-9  # of the largest: what has less moves no interval by a millionth
-_HALVINGS = 36  # of the interval that has the answer, in logarithms: to 1e-9 of it
+_NO_WEIGHT = 1e-9  # relative weight below which a sigma moves no interval by a millionth
+_HALVINGS = 36  # bisections in the logarithm: an interval of 20 shrinks to below 1e-9
 _TWO_SIGMA = math.erf(math.sqrt(2.0))
 
 
@@ -285,7 +286,7 @@ class Shapes:
     """
     Amplitudes of the shapes of the images.
 
-    ``sigma_px`` (s,): those that stand for the posterior (`interval_factor`); ``amplitudes`` has
+    ``sigma_px`` (s,): those that represent the posterior (`interval_factor`); ``amplitudes`` has
     its maximum; ``sums`` are those of several images.
     """
 

@@ -4,7 +4,7 @@ From an ensemble of observed images to camera, alignment and covariance.
 
 A robust search from the prior; then, in turns, the posterior of all unknowns at the state, a step
 to its mean, and the variances of centroids and star trackers, the errors that observations share
-and the outliers from what is left, until nothing changes.
+and the outliers from the residuals, until nothing changes.
 """
 
 from __future__ import annotations
@@ -95,18 +95,18 @@ from starcal_ros.records import (
     TemperatureTerms,
 )
 
-_START_FLOOR_PX = 0.05  # until the residuals show it: of the order of what is left in good images
-_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
-_ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
+_START_FLOOR_PX = 0.05  # replaced by the residuals; the size of those in good images
+_ROBUST_SCALE = 3.0  # Cauchy loss, sigma: normal noise loses 3 % of its information
+_ROBUST_GAIN = 0.1  # the search ends at a step of half a sigma, where the posterior goes on
 _ROUNDS = 24  # three or four are usual; principal points that stars hardly show take ten
-_STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
-_LEAST_SHARE = 0.25  # of a step, so that it still arrives
+_STEP_SIGMA = 0.05  # converged when no unknown moves by more than this part of its sigma
+_LEAST_SHARE = 0.25  # smallest share of a step: a damped estimate must still arrive
 _IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')
-_SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
-_USUAL_M_S = 8000.0  # of orbits about the Earth
-_UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
-_LENS_RESIDUAL_LOG_SIGMA = 1.5  # of a residual by a data sheet: it is of the ground, not of flight
-_READOUT_ERROR = 0.01  # of the time by a data sheet: the tolerance of a clock, and rounding
+_SPACE_VELOCITY_M_S = 20000.0  # 1-sigma per axis against the Earth: orbits about it and the Sun
+_USUAL_M_S = 8000.0  # low orbit about the Earth; stars that show five times it ask for a statement
+_UNKNOWN_READOUT_S = 0.02  # rolling shutters usually take 5 to 50 ms a frame
+_LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states the residual on the ground, not in flight
+_READOUT_ERROR = 0.01  # relative error of a stated time: tolerance of a clock, and rounding
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def estimate_calibration(
     Raises
     ------
     TooFewObservations
-        When there are too few images or stars, they do not determine what is to be estimated, or
+        When there are too few images or stars, they do not determine the unknowns, or
         the images are mirrored.
     OptionError
         For options that do not go together.
@@ -288,7 +288,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
 
 @dataclass(frozen=True)
 class _Round:
-    """A linearisation, its posterior, and what the state after its step leaves of the data."""
+    """A linearisation, its posterior, the state after its step, and the residuals there."""
 
     linear: Linearisation
     sums: StarSums
@@ -323,7 +323,7 @@ def _round(
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
     found = posterior(sums, linear, shape_px, before.posterior if before else None)
-    # What is not in the state, as a velocity, is at its mean: the images follow both.
+    # Unknowns outside the state, such as a velocity, take their mean; the images follow both.
     shared = found.mean.copy()
     shared[layout.of(_IN_STATE)] *= share
     own = found.equations.own - found.equations.back @ shared
@@ -335,7 +335,7 @@ def _round(
 
 
 def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
-    """Return the priors of what is stated by the options and the observations."""
+    """Return the priors that the options and the observations state."""
     velocity_m_s, usual_m_s = options.velocity_sigma_m_s, math.inf
     if velocity_m_s < 0:
         velocity_m_s = float(np.max([image.velocity_sigma_m_s for image in ensemble.images]))
@@ -407,8 +407,8 @@ def residuals_px(
     """
     Measured minus predicted pixels (n, 2) of all observations at a state.
 
-    With what is not in the state at its mean, where there is a posterior: ``size`` (width, height)
-    is that of the detector.
+    Unknowns outside the state take their mean in a posterior, where there is one: ``size`` (width,
+    height) is that of the detector.
     """
     own = image_parameters(problem, state)
     measured = table.measured_px

@@ -188,7 +188,7 @@ def star_rows(
         wuu, wuv, wvv = (w.reshape(m, n) for w in chunk.whitener)
         residual = rows[:, -1] - mean[at] @ rows[:, : len(at)]
         residual -= np.concatenate([wuu * u + wuv * v, wvv * v], axis=1)
-        # Star by star: what is written and read along the stars takes a third of the time.
+        # Stars are the last axis: reading and writing along it takes a third of the time.
         shared = np.zeros((m, len(part), 2 * n))
         shared[:, to] = rows[:, seen]
         phi = phi.reshape(-1, m, n)
@@ -420,7 +420,7 @@ def _add_star_tracker(
     layout: Layout,
 ) -> float:
     """
-    Add the star-tracker attitudes: prior of the rotations about what the trackers predict.
+    Add the prior of the rotations about the attitudes that the star trackers predict.
 
     Return its cost.
     """

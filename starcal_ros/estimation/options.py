@@ -123,7 +123,7 @@ class CalibrationOptions:
         False, 'estimate an alignment that is linear in temperature; not with method: per_image'
     )
     min_stars: int = 60  # observations in a calibration: about five for each unknown of a camera
-    # Of 2000 stars without an outlier it rejects one in 12 calibrations.
+    # The limit rejects one good star of 2000 in 12 calibrations.
     outlier_sigma: float = 4.5
     # 1-sigma of cx and cy, as a fraction of the longer side: how far mounts decentre detectors.
     principal_point_prior: float = 0.03

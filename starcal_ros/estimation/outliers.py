@@ -2,7 +2,7 @@
 """
 Stars and attitudes that do not fit the others.
 
-An error is judged by its variance beside the others, less what the unknowns follow of it.
+An error is compared with its variance given the others, less the part that the unknowns absorb.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.shared_errors import Groups
 from starcal_ros.estimation.star_equations import squared_sigmas, StarTable
 
-FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
-_FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
-_STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
-_FEWEST_ATTITUDES = 3  # whose scatter shows that one of them does not fit
-_MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
+FEWEST_STARS = 3  # the rotation of an image fits one star exactly and two nearly
+_FEWEST_SIGHTINGS = 3  # sightings that separate the error of a star from those of its images
+_STAR_CHANCE = 1e-7  # probability that the sum of its residuals drops a good star
+_FEWEST_ATTITUDES = 3  # two show that one of them is wrong, but not which
+_MISFIT_SIGMA = 6.0  # noise exceeds it once in 10^8 attitudes, and a jump is far larger
 _MOST_OF_A_LINE = 200  # attitudes: their 20,000 pairs give a slope to a hundredth of a sigma
-_EFFICIENCY = 0.37  # of the median of squares against their mean
-_CHANCE = 1e-5  # that the attitude of an image lies beyond the limit
+_EFFICIENCY = 0.37  # efficiency of a variance from the median of squares, normal errors
+_CHANCE = 1e-5  # probability that a good attitude lies beyond the limit
 _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
 
 
@@ -56,7 +56,7 @@ def fitting_stars(
     star = table.star
     sightings = np.bincount(star)
     misses = np.bincount(star, ~fits)
-    # What sightings share is in the variance of each, but it is one error.
+    # The variance of each sighting has the error that all share, but it is only one error.
     own = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
     share = np.minimum(star_px2 / own, 1.0)
     largest = np.bincount(star, share) / sightings * (sightings - 1) + 1.0
@@ -71,10 +71,10 @@ def _squared_beside(
     residual_px: Floats, covariance_px2: Floats, length2: Floats, cells: Groups, limit: float
 ) -> Floats:
     """
-    Squared sigmas (n,) from what other stars in the same cell of the detector show together.
+    Squared sigmas (n,) from the mean residual of other stars in the same cell of the detector.
 
-    Their mean with their residuals cut at the limit, and with the observation itself as a zero:
-    a lone neighbour, or a wrong one among several, moves it little.
+    Their residuals are cut at the limit, and the observation itself counts as a zero: a lone
+    neighbour, or a wrong one among several, moves the mean little.
     """
     weight = 2.0 / (covariance_px2[:, 0] + covariance_px2[:, 2])
     cut = np.minimum(1.0, limit / np.sqrt(np.maximum(length2, 1e-30)))
@@ -89,7 +89,7 @@ def _squared_beside(
 
 
 def dropped_stars(table: StarTable, kept: Mask) -> NDArray[np.int64]:
-    """Return catalog stars seen often enough to be told apart and left out of all images."""
+    """Return the catalog stars with enough sightings that are left out of all images."""
     sightings, uses = np.bincount(table.star), np.bincount(table.star, kept)
     return np.asarray(np.unique(table.catalog_id)[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
 
@@ -111,7 +111,7 @@ def misfit_images(
         Attitude errors as the stars show them, in the stated sigma of each axis, and their
         variances by the centroids.
     seen : (m,) bool
-        Images with stars enough.
+        Images with enough stars.
     is_stated : bool
         False where the stated sigma is a guess.
 
@@ -119,8 +119,8 @@ def misfit_images(
     -----
     Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
     line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
-    guess, a scatter of few images determines none: the limit is that of Student's t.  With more
-    misfits than a third there is no majority that they could fail to fit.
+    guess, the scatter of few images alone is uncertain: the limit is that of Student's t if it is
+    larger.  If more than a third would be misfits, the majority is unclear, and none is reported.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):

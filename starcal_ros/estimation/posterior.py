@@ -47,7 +47,7 @@ from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
 
-_WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
+_WITHOUT = 1e3  # factor that removes a prior: no data sheet is off by so many sigma
 LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
@@ -80,22 +80,22 @@ class Posterior:
     ----------
     mean : (P,)
     working : (P, P)
-        Covariance under independent errors of the working weights; what all images share in their
-        shapes is not in it.
+        Covariance under independent errors of the working weights, without the part of the shapes
+        that all images share.
     equations : Equations
         From the stars and the star trackers, at these amplitudes of the shapes.
     estimated : (e,) int
         Shared unknowns that are estimated; the others are held.
     field, term : Amplitudes
-        Of the octaves of the field, and of the next term of the lens.
+        Octaves of the field, and the next term of the lens.
     shapes : Shapes
-        Of the images.
+        Shapes of the images.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
     log_evidence : float
-        Of the data given the priors, but for what follows from the data alone.
+        Log evidence of the data given the priors, up to a constant.
     layout : Layout
     errors : ErrorParts or None
         None before `with_shared_errors`.
@@ -187,10 +187,10 @@ def without_prior(
 
     With ``held`` only that number of the entry, which is held, is free.
 
-    The amplitudes are found again: field and shapes may hide that a prior is wrong.  A trend keeps
-    its value of the posterior ``near`` with the prior, and its cost: together with a free velocity
-    it can be much that is of the lens.  The variance is that of the working weights; infinite
-    where stars show less than what is possible at all.
+    The amplitudes are found again: field and shapes may hide that a prior is wrong.  A free trend
+    and a free velocity together would absorb errors of the lens, so the trend is held at its value
+    in ``near``, the posterior with the prior, with its cost.  The variance is that of the working
+    weights; infinite where it is larger than any possible one.
     """
     at_trend = linear.layout.of(['trend'])
     trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
@@ -222,7 +222,7 @@ def without_prior(
 
 
 def _without_prior(entry: Unknown, held: int | None) -> Floats:
-    """Return the sigma (q,) of an entry without its prior: of what is possible at all."""
+    """Return the sigma (q,) of an entry without its prior: the largest possible."""
     if held is not None:
         return np.where(np.arange(len(entry)) == held, np.inf, entry.sigma)
     widest = np.minimum(_WITHOUT * entry.sigma, entry.widest)
@@ -251,7 +251,7 @@ class _Solver:
         return inverse(information), arrow.gradient[self.free] - offset
 
     def _of_field(self, arrow: Equations) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return information and gradient of the field in its unit, and what eliminated it."""
+        """Return information and gradient of the field in its unit, and the eliminated part."""
         free, gradient = self._of_free(arrow)
         cross = arrow.information[np.ix_(self.free, self.field)] * self.unit
         back = free @ cross
@@ -305,10 +305,10 @@ def _shape_sums(
     sums: StarSums, linear: Linearisation, solver: _Solver, field_px: Floats
 ) -> ShapeSums:
     """
-    Return what each image shows of its shape, the field known and its other unknowns eliminated.
+    Return the sums of each image for its shape, the field known, its other unknowns eliminated.
 
-    The images are alike in the field; each has stars in other parts of it.  A trend is a change of
-    the images as well, and correlated: what all share of it has to be known here.
+    The images share the field; each has stars in other parts of it.  A trend is a change of the
+    images as well, and correlated: its common part has to be known here.
     """
     layout = linear.layout
     blocks = sums.blocks.copy()
@@ -351,7 +351,7 @@ def common_shape(layout: Layout, common_px2: Floats) -> Floats:
 
 
 TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
-_KEPT = 1e-3  # of the sigma of a prior, by which an unknown stays at its mean
+_KEPT = 1e-3  # factor on a prior sigma that holds an unknown at its mean
 _HELD = 0.05  # information on a mode times its variance, below which its prior holds it
 
 

@@ -40,7 +40,7 @@ from starcal_ros.camera import parameter_names
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble, TemperatureTerms
 
 METHODS = ('hierarchical', 'per_image', 'single')
-FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
+FEWEST_SPREAD_K = 1.0  # standard deviation; sensor errors and lag hide a smaller one
 _SCALED = slice(0, 3)  # fx, skew, fy
 
 

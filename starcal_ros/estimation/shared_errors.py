@@ -4,8 +4,8 @@ Errors that stars of different images share: places of stars, and patterns of th
 
 The observations of a group share one random displacement: those of a catalog star its error of
 place, those of a cell, a row or a column of the detector the structure of the lens and the sensor
-that is finer than the field.  Such errors need no coefficients.  Their variance is what residuals
-of different members of a group have in common::
+that is finer than the field.  Such errors need no coefficients.  Their variance is the mean
+product of residuals of different members of a group::
 
     s^2 = [sum_g |sum w r|^2 - sum_i |w r|^2] / [2 (sum_g (sum w)^2 - sum_i w^2)],
 
@@ -14,8 +14,8 @@ estimator with weights W has the exact covariance ``S^-1 (X' W V W X) S^-1`` und
 covariance V (consider analysis, Schmidt 1966); groups are the off-diagonal part of V.
 
 Sightings i and j of a star share the variance ``c^2 + rho sigma_i sigma_j``: the error of its
-catalog place, and what displaces its centroids in proportion to their own sigma, as stars below
-the limit of the catalog, the phase of the pixel and its colour do.  A few blended stars have most
+catalog place, and displacements of its centroids in proportion to their own sigma, by stars below
+the limit of the catalog, the phase of the pixel and its colour.  A few blended stars have most
 of it: each star has a factor on its variance, as the errors of Student's t have (Lange, Little &
 Taylor 1989).
 """
@@ -45,17 +45,18 @@ from starcal_ros.estimation.amplitudes import (
 # a sixth of its longest wave, over which it keeps nine tenths of its correlation.
 _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
-_OF_ONE_LENGTH = 0.05  # of octaves: not tied to the one before, as any amplitude
-_STRIPS = (1 / 48, 1 / 192)  # of the width: height of groups of rows, width of groups of columns
-# Of the variance of the mean of a group.  In the thousands of images in which a star is seen a
-# hundred times, what no residual shows of its place comes to 0.01, and costs a third of the time.
+_OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
+_STRIPS = (1 / 48, 1 / 192)  # heights of groups of rows, widths of groups of columns, in widths
+# Groups that add under 1 % (stars 2 %) to the variance of their mean are skipped: in thousands of
+# images, places of stars that are seen a hundred times add 1 % and take a third of the time.
 _NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
-_ROUNDING = 1e-9  # of sums over pairs, where there are none
-_ROUNDS = 8  # of the factors of stars
-# Of a floor of the centroids that is noise, and of one that is structure, each against none.
+_ROUNDING = 1e-9  # relative rounding of a sum over pairs where there are no pairs
+_ROUNDS = 8  # iterations of expectation and maximisation for the factors of stars
+# Prior odds that the centroids have a floor, as noise or as structure, against none: at 0.2 the
+# sigma of a tenth of sound missions grows by 9 %, at 0.02 by 1 % (docs/experiments.md).
 _FLOOR_ODDS = 0.02
-_SHARES = 20  # of a floor that may be structure
+_SHARES = 20  # grid of the share of a floor that is structure
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
@@ -109,7 +110,7 @@ class Groups:
     One kind of groups of n observations.
 
     ``group`` (n,): the number of the group of each; ``of_one_star`` (n,): a number for the members
-    of a group that are of one star, whose common error is of the star; None if all are.
+    of a group that show one star, whose common error belongs to the star; None if all do.
     ``together`` (n,): correlation of the first of the fine octaves between sightings of the star.
     """
 
@@ -198,13 +199,13 @@ def shared_errors(
     moments = [
         pair_moment(residual_px, weight, kind.group, kind.of_one_star) for kind in groups[1:]
     ]
-    # What a star shows at one place of the detector may be of the star or of the detector.
+    # The error of a star that stays at one place may come from the star or from the detector.
     together = max(_pairs(working * np.sqrt(groups[0].together), star), 0.0)
     share = together / max(_pairs(working, star), together, 1e-300)
     octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
     first = longest * _beside_stars(of_places, share)
     variances = chain_means(first, _increments(moments[:octaves]))
-    # What stars share is in the floor too, and known by their number.
+    # The floor contains the errors of stars too, which their number determines.
     stars = np.unique(star[used])
     places_px2 = float(usual_px2[used].mean())
     sigma_px2 = math.hypot(floor_px2[1], places_px2 / math.sqrt(max(len(stars), 1)))
@@ -346,7 +347,7 @@ def pair_moment(
 
 def _increments(moments: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """
-    Return what moments of cells show beyond those of the coarser ones before them, with 1-sigma.
+    Return the excess of the moments of cells over those of coarser ones before, with 1-sigma.
 
     Neighbours in a small cell are neighbours in the large one, and share its structure too.
     """
@@ -407,10 +408,10 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
 
 def _of_floor(floor_px2: float, sigma_px2: float, moments: Floats) -> list[float]:
     """
-    Return the variances (k,) of the fine octaves that a floor of the centroids is.
+    Return the variances (k,) of the fine octaves that may cause a floor of the centroids.
 
-    What adds to the centroids of all stars alike is noise of each of them, or structure of the
-    detector at its place; where no two stars are near each other, nothing tells the two apart.
+    A variance that all centroids have alike is noise of each, or structure of the detector at its
+    place; where no two stars are near each other, the data cannot separate the two.
     Posterior means: there is no floor, or it is noise, or a share of it, uniform, is structure of
     one octave, which the pairs of its cells and of the finer ones show (`pair_moment`).
     """
@@ -452,8 +453,8 @@ def group_sums(
 
     They are ``sum_g |sum_i s_i Y_i|^2`` of each error that matters, and ``sum_i s_i^2 |Y_i|^2`` of
     all with the inflation of the weights: the difference is the part of V beyond the working one.
-    A group of one observation has only noise.  Observations of a variance below the sum of s^2, as
-    of bright stars, share no more than that.
+    A group of one observation has only noise.  Observations whose variance is below the sum of
+    s^2, such as bright stars, share no more than it.
 
     Parameters
     ----------
@@ -476,7 +477,7 @@ def group_sums(
         return {}, own
     for rows, Y in parts:
         k = len(rows)
-        # By what each of two axes of a group gets of u and of v of its members.
+        # The factors of u and v of the members of a group on each of its two axes.
         axis, of = np.array([0, 1])[:, None, None], np.array([0, 1])[:, None]
         column = np.broadcast_to(of * k + np.arange(k), (2, 2, k)).ravel()
         for error, error_px2, summed in zip(errors, shared_px2, sums, strict=True):

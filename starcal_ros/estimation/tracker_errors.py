@@ -10,8 +10,8 @@ scatter: it stays in the sigma of the alignment at the size of its prior.
 
 The rate of an image is measured by a star tracker with noise, or not at all.  Its error times the
 time of read-out turns the camera from the first row to the last: three unknowns of each image.
-The time is an unknown too: its root mean square, by its prior and then by the posterior of the
-round before, stands for it.  An offset of the stamps times the error of a rate is a hundredth of
+The time is an unknown too: its root mean square replaces it, from its prior and then from the
+posterior of the round before.  An offset of the stamps times the error of a rate is a hundredth of
 the noise of the star tracker that gave the rate, which is estimated anyway.
 """
 
@@ -36,17 +36,17 @@ _SPANS = (0.3, 1.0, 3.0, 10.0)  # correlation times, in spans of the campaign
 _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a large part of the sky
 _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
 _LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma
-_NOISE_SIGMA = 0.5  # of ln n: data sheets are right to a factor of 1.6
-_UNSTATED_SIGMA = 3.0  # of ln n where no sigma is stated
-_WRONG_SHEETS = 0.02  # of data sheets: four times too small and more, as if none were stated
-_LEAST_WRONG = 4  # place in the grid of the least noise of these, from its sheet's
-_BEYOND = 1.0  # of the grid over the RMS of the errors, in logarithms
-_SLOW_SIGMA = 1.25  # of ln s about the stated noise
-_STATED_SLOW_SIGMA = 0.3  # of ln s about star_tracker_slow_arcsec
-# Groups of a correlation: neighbours in time are joined to at most so many, 1/100 of a campaign
-# against correlation times of a third of it and more.  The time of an estimate stays linear.
+_NOISE_SIGMA = 0.5  # prior 1-sigma of ln n: data sheets are right to a factor of 1.6
+_UNSTATED_SIGMA = 3.0  # the same where no sigma is stated: within a factor of 20
+_WRONG_SHEETS = 0.02  # prior probability that a data sheet is four times too small or worse
+_LEAST_WRONG = 4  # steps in the grid from the stated noise to four times it
+_BEYOND = 1.0  # the grid of wrong data sheets ends a factor of e above the RMS of the errors
+_SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
+_STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
+# Images are joined in at most 100 groups of neighbours in time, a hundredth of a campaign against
+# correlation times of a third of it and more, so that the time of an estimate stays linear.
 _MOST_GROUPS = 100
-_MOST_MEMBERS = 4  # of a group, of which the mean correlation is taken
+_MOST_MEMBERS = 4  # members of a group that give its mean correlation
 _FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
 _HOUR_S = 3600.0
 
@@ -190,8 +190,8 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     """
     Return a grid (n,) of ln n for errors (m, 3), the centres of ln s there, and its log prior.
 
-    First data sheets that are right, then those that are wrong, as far as the errors may ask for:
-    of these the slow error is as large as the noise, not as the stated one.
+    Right data sheets come first, then wrong ones, up to the size of the errors: with a wrong one
+    the slow error is as large as the noise, not as the stated noise.
     """
     sigma = _NOISE_SIGMA if is_stated else _UNSTATED_SIGMA
     step = _LOG_NOISE[1] - _LOG_NOISE[0]
@@ -211,7 +211,7 @@ def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise:
     """
     Return the 1-sigma that the slow error is expected to give the mean of images.
 
-    Of its prior, the mean of s and of K: before a solve no scatter has been seen.
+    It uses the prior means of s and K, since there is no scatter before a solve.
     """
     log_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
     size = np.bincount(correlations.group) / len(correlations.group)
@@ -288,12 +288,12 @@ def _restricted(
     return -0.5 * (error.shape[1] * log_det + squared), (1.0 / alone) @ ones**2
 
 
-_UNKNOWN_RATE_RAD_S = 6.4e-4  # of each axis: 1.1e-3, a low orbit, about an axis not known
+_UNKNOWN_RATE_RAD_S = 6.4e-4  # per axis: a low orbit, 1.1e-3, about an unknown axis
 # Images so near in time show how fast a camera turns: a tenth of a low orbit, in which it neither
 # comes round nor often turns away and back.
 _NEAR_S = 600.0
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
-_FEWEST_RATES = 3  # whose scatter bounds the sigma that a sender does not state
+_FEWEST_RATES = 3  # their scatter replaces a sigma that a sender does not state
 
 
 @dataclass(frozen=True)
@@ -328,13 +328,13 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
 
     Rates that differ by their errors would seem to show that there is no time of read-out, since
     the stars do not differ with them (errors in variables).  So a rate moves to the mean of all by
-    as much as its error is of their scatter; an image without a rate has the mean.  The errors of
+    the share of its error in their scatter; an image without a rate has the mean.  The errors of
     the images are not lowered for it: together they are the error of the mean.
 
-    A sigma that is not stated is the scatter of the rates, since a data sheet that is too good
-    would leave errors that seem to be differences; of less than three, the turn of a low orbit.
-    Where no image has a rate, the camera is assumed to
-    turn about as fast as it does from image to image, at most as in a low orbit.
+    The scatter of the rates replaces a sigma that is not stated, since a data sheet that is too
+    good would leave errors that seem to be differences; for less than three rates it is the turn
+    of a low orbit.  Where no image has a rate, the camera is assumed to turn about as fast as it
+    does from image to image, at most as in a low orbit.
     """
     m = len(images)
     rate = np.array([image.star_tracker_rate_rad_s for image in images])
@@ -348,7 +348,7 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     if np.count_nonzero(known) >= _FEWEST_RATES:
         unstated = np.sqrt(np.diag(scatter))
     own = np.where(sigma > 0, sigma, unstated)[:, :, None] ** 2 * np.eye(3)
-    # What their errors may make of the scatter at 2 sigma is no difference between rates.
+    # The errors explain the scatter up to their 2 sigma; only the rest is a difference of rates.
     likely = 1.0 + 2.0 * math.sqrt(2.0 / max(np.count_nonzero(known) - 1, 1))
     values, vectors = np.linalg.eigh(scatter - likely * own[known].mean(axis=0))
     without_errors = (vectors * values.clip(0.0)) @ vectors.T
@@ -374,13 +374,13 @@ def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Errors of the star trackers as the stars show them, and what follows from them."""
+    """Errors of the star trackers as the stars show them, and their variances."""
 
     error_rad: Floats
     covariance_rad2: Floats
     seen: Mask
     misfit: Mask
-    trackers: tuple[TrackerErrors, ...]  # of each star tracker and each size of its stated sigma
+    trackers: tuple[TrackerErrors, ...]  # one for each tracker and each stated sigma
 
 
 def star_tracker_alignments(
@@ -402,7 +402,7 @@ def star_tracker_alignments(
     covariance : (3 + 3 s, 3 + 3 s)
         Covariance of the alignment and of the mountings of the s further star trackers.
     attitudes : Attitudes
-        Of images at ``time_ns`` (m,), each about the axes of its own star tracker.
+        Errors in images at ``time_ns`` (m,), about the axes of the star tracker of each.
     sigma_rad : (3,)
         Noise of a star tracker.
     """
@@ -461,6 +461,6 @@ def _drift(
     freedom = len(hours) - 2
     scatter = (weight * (error_rad - mean_rad - from_middle * slope) ** 2).sum(axis=0) / freedom
     t = slope * np.sqrt(information / np.maximum(scatter, 1e-300))
-    p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # of three axes
+    p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # any axis
     rate = slope / ARCSECOND_RAD
     return rate, float(np.linalg.norm(rate) * np.ptp(hours)), p_value

@@ -72,11 +72,11 @@ _FOCAL_MODES = {
     'shear_px': (0.0, 1.0, 0.0),
 }
 """Changes of fx, skew and fy."""
-_DECENTRING = ('p1', 'p2')  # of the lens models that have them
-_TREND = 1e-4  # of the focal length, rms over the images: a lens that warms by some degrees
-_SCALE_BY_COLOUR = 3e-4  # of the focal length, per mag of BP - RP: 0.5 px in a corner, blue to red
+_DECENTRING = ('p1', 'p2')  # an equidistant lens has none
+_TREND = 1e-4  # relative, rms over the images: a lens that warms by some degrees
+_SCALE_BY_COLOUR = 3e-4  # relative, per mag of BP - RP: 0.5 px in a corner, blue to red
 _NO_TURN_RAD = 1e-8  # within an image: 2 milliarcseconds
-FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
+FIELD_OCTAVES = 3  # to a quarter of the width; a fourth takes 3.4 times as long (experiments.md)
 _SHOWN = 1e-2  # least singular value over the largest: none that only a border shows
 
 
@@ -259,7 +259,7 @@ def unknowns_in_state(problem: Problem, state: State) -> Layout:
         if q
         else np.broadcast_to(np.eye(p), (m, p, p))
     )
-    sigma = np.zeros(p)  # of parameters that are held
+    sigma = np.zeros(p)  # held parameters keep a sigma of zero
     sigma[problem.free] = problem.prior_sigma[problem.free]
     offset = state.parameters - problem.prior_parameters
     widest = np.where(problem.is_weak, sigma, np.inf)
@@ -581,8 +581,8 @@ def _next_lens_term(width: int, height: int) -> Floats:
     return coefficients
 
 
-ZENITH_SIGMA_RAD = 1.0  # of latitude and sidereal time: anywhere above the horizon
-STATED_SITE_RAD = 0.01  # of a site and a clock that are stated: 60 km, and two minutes
+ZENITH_SIGMA_RAD = 1.0  # latitude and sidereal time unknown: anywhere above the horizon
+STATED_SITE_RAD = 0.01  # accuracy of a stated site and clock: 60 km, and two minutes
 _ONE_CLOCK_RAD = 1e-6
 _MOST_TIMES = 40  # images beyond it share the error of a sidereal time with their neighbours
 

@@ -3,7 +3,7 @@
 Weights of stars and star trackers from the residuals of a round of the estimate.
 
 The variances of centroids, the errors that observations share, the stars that are left out and
-the errors of the star trackers follow from what a posterior leaves; they weigh the next round.
+the errors of the star trackers follow from the residuals of a posterior and weigh the next round.
 
 A residual is smaller than its error, because the unknowns follow it: of two axes an observation of
 leverage h keeps ``2 - h`` degrees of freedom.  A bright star holds the rotation of its image and
@@ -62,17 +62,17 @@ from starcal_ros.records import CameraGeometry
 # Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
 # thousand times the stated one, and of a milliarcsecond.
 FREE_FACTOR, EXACT_RAD = 1e3, 1e-3 * ARCSECOND_RAD
-_SIGMA_PER_MEDIAN = 1.5  # of the sizes of normal errors
+_SIGMA_PER_MEDIAN = 1.5  # 1-sigma of normal errors over the median of their sizes
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
 _ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
-_ROUNDS = 12
-_SETTLED = 1e-3
-_NODES = 5  # of the function of brightness, at quantiles
-_BINS = 500  # of magnitudes, over which the function is constant to a hundredth
-_STARS_PER_NODE = 40
-_NODE_SIGMA = 0.5  # of the logarithm of the factor at a node, before the data
-_LEAST_FREEDOM = 0.1  # of two axes: one star of few in an image
+_ROUNDS = 12  # iterations of a reweighted fit
+_SETTLED = 1e-3  # relative change of a fitted variance that ends the iterations
+_NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
+_BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
+_STARS_PER_NODE = 40  # 80 residuals determine a variance to 16 %
+_NODE_SIGMA = 0.5  # prior 1-sigma of a log factor: cores and wings of bright stars
+_LEAST_FREEDOM = 0.1  # floor of the freedom of two axes: one star of few keeps none
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class Data:
     stated_rad: Floats  # (3,)
     prior: CameraGeometry
     options: CalibrationOptions
-    rates: Rates  # of the first star tracker in its frame
+    rates: Rates  # in the frame of the first star tracker
     assumed: Assumptions
     groups: tuple[Groups, ...]
 
@@ -445,7 +445,7 @@ def judge(
         )
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()
-    # Without what is beyond others: whether a star is left out must not follow from its own size.
+    # A star is judged without the excess of its own error, which must not decide about itself.
     share_px2, beyond_px2 = star_shares_px2(before.errors)
     kept = fitting_stars(
         residual_px,
@@ -470,9 +470,9 @@ def judge(
 
 def towards(one: Judged, other: Judged, share: float) -> Judged:
     """
-    Return other conclusions, with weights that are a share of the way from one to theirs.
+    Return the other conclusions, with weights a share of the way from one to the other.
 
-    Weights and what they leave may answer each other to and fro, as a step may overshoot.
+    Weights and residuals may oscillate from round to round, as a step may overshoot.
     """
     a, b, to = one.variance, other.variance, other.attitudes
     if share == 1.0 or one.attitudes is None or to is None:

@@ -40,7 +40,7 @@ _TIFF_MOST_ENTRIES = 1000
 # Extensions that are of the image and no image of the sky, by their names.
 _OF_ANOTHER = re.compile(r'BPM|MASK|DQ|ERR|VAR|WHT|WEIGHT|IVAR|UNC|NOISE|BACK|BKG|FLAG|THUMB')
 _SECTION = re.compile(r'\[(\d+):(\d+),(\d+):(\d+)\]')
-_PATTERN = re.compile('[RGBCMYW]{4}')  # of a mosaic of 2 x 2 colours
+_PATTERN = re.compile('[RGBCMYW]{4}')  # a colour filter mosaic of 2 x 2 pixels
 _OTHER_GREENS = 0.05
 _PATTERNS = ('RGGB', 'BGGR', 'GBRG', 'GRBG')
 

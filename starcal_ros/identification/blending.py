@@ -22,7 +22,7 @@ from starcal_ros.stars.psf_fit import apart_px, neighbour_pull_px, stamp_radius_
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
 _NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
-_NEGLIGIBLE = 0.02  # of the sigma of a centroid: a smaller pull, roughly, is not computed
+_NEGLIGIBLE = 0.02  # in sigmas of a centroid: a pull estimated to be smaller is not computed
 MAX_BLEND_SIGMA = 3.0  # largest uncertainty by neighbours, in sigmas of the centroid
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 

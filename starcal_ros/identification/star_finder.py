@@ -53,13 +53,13 @@ from starcal_ros.stars.streak import Streak, without_streaks
 from starcal_ros.text import counted
 
 _SEARCH_SIGMAS = 3.0
-_CENTRE_SIGMA = 0.01  # of the principal point, longer image sides
+_CENTRE_SIGMA = 0.01  # 1-sigma of the principal point, in longer image sides
 _ROLL_FACTOR = 10.0 / 3.0  # a mounting is measured with less accuracy about the line of sight
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
 _DEEPER_SIGMA = 4.0  # distance from which a star that is not measured pulls no centroid
 _ON_STAR_PX = 2.0  # largest distance of the prediction of a source that shows the PSF
 _SHOW_PSF = 80  # the brightest sources do
-_MIN_STARS = 5  # in an image; fewer cannot be told from a match by chance
+_MIN_STARS = 5  # in an image; fewer may match by chance
 _FEWEST_IN_FIELD = 2.0  # catalog stars in an image, on average over the window of the search
 _NEAREST = 200  # brightest predictions, searched in windows first
 _NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis

@@ -28,8 +28,8 @@ from starcal_ros.stars.frame_checks import Fingerprint, fingerprint, sample_rows
 from starcal_ros.stars.hot_pixels import HotPixels, learn_hot_pixels
 from starcal_ros.stars.image_model import saturation_level
 
-_SAME_ATTITUDE = 1e-12  # of a component; interpolation between equal samples rounds at 1e-16
-_TURN_SIGMAS = 2.0  # of the star tracker: a coarse output may repeat itself within its noise
+_SAME_ATTITUDE = 1e-12  # difference of a component; interpolation of equal samples rounds at 1e-16
+_TURN_SIGMAS = 2.0  # a coarse star tracker may repeat its output within its noise
 _TURN_PX = 0.1  # noise of the turn between two images, of their centroids and the prior camera
 _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
 _IMAGES_OF_AN_UNFIT = 10  # cost of an unfit attitude: its search takes as long as five images

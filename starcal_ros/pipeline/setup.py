@@ -58,9 +58,9 @@ _LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 _RADIANS_BELOW, _DEGREES_BELOW = 1e-3, 1e-2
 _FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as many
 _FAINTEST = 100  # stars of the catalog about which its stars are counted
-_UNIT_DN = 30000  # of a response of 1, where it is searched for stars
-_STAR_SIGMA = 8.0  # of a star in a flat field: five megapixels of noise have none
-_MOST_STARS = 5  # of a flat field of the twilight
+_UNIT_DN = 30000  # level of a response of 1 in the 16-bit image that is searched for stars
+_STAR_SIGMA = 8.0  # detection limit in a flat field: the noise of five megapixels stays below
+_MOST_STARS = 5  # a flat field of the twilight may show as many
 _MOST_BAD = 0.5  # part of the pixels from which a map is taken to be inverted
 _LEAST = 0.1  # response over the median below which a pixel is bad: its noise is ten times larger
 
@@ -566,7 +566,7 @@ def _excess_of_stars(response: Floats) -> int:
     Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
     """
     level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
-    # Columns and rows of another gain have edges, whose maxima are no stars either.
+    # Columns and rows with another gain have edges, whose maxima are not stars either.
     level = level / np.maximum(np.median(level, axis=0), _LEAST)
     level = level / np.maximum(np.median(level, axis=1), _LEAST)[:, None] * _UNIT_DN
     bright, dark = (

@@ -50,7 +50,7 @@ TIMES = 'image times'
 """Key of the provenance: where the stamps are from, if the images state none."""
 _FEWEST_STARS = 3  # two fit their mirror image
 _SHOWING = 50  # stars, from bright to faint, show the constellation as well as all
-_MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
+_MOST_OFF = 0.5  # misfit in RMS sizes of a constellation; a mirrored one misfits by 1.4
 _ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
@@ -103,7 +103,7 @@ def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> boo
         return True
     lines, directions = lines[exists], observations.direction_icrf[some][exists]
     spread = float(np.sqrt(((lines - lines.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    # What the best rotation leaves (Kabsch 1976), without the rotation; a mirror image is none.
+    # The misfit of the best rotation (Kabsch 1976), without that rotation; no rotation mirrors.
     product = lines.T @ directions
     fit = np.linalg.svd(product, compute_uv=False)
     fit[2] = math.copysign(fit[2], np.linalg.det(product))
@@ -258,7 +258,7 @@ def _not_judged(
 
 # Twice the log likelihood of a field that is not there: the 1 % level of three amplitudes.
 _CHANCE = 9.0
-_PER_COEFFICIENT = 2.0  # Akaike 1974: less of a likelihood ratio is what any coefficient takes
+_PER_COEFFICIENT = 2.0  # Akaike 1974: any coefficient gains so much likelihood ratio by chance
 
 
 def estimate_with_smallest_lens(

@@ -59,8 +59,8 @@ _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
 # not reach it, and a file with a longer number would leave none for those after it.
 _NUMBERED = re.compile(r'\.?(\d{8})[._]')
 _LAST_NUMBER = 999_999_999
-_MOST_BYTES = 64 << 20  # of a file: an image of 10,000 stars has 1 MB
-_MOST_COUNT = 2**32 - 1  # of refused images: that of the message
+_MOST_BYTES = 64 << 20  # largest file that is read: an image of 10,000 stars has 1 MB
+_MOST_COUNT = 2**32 - 1  # the message counts refused images in a uint32
 _LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
 _CHECKSUM, _HMAC = 'sha256', 'hmac_sha256'
 
@@ -646,7 +646,7 @@ def _locked(folder: Path) -> int:
         number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
         for path in (folder / own for own in _OWN):
-            # What a link leads to is of somebody else.
+            # The target of a link may belong to somebody else.
             if os.path.lexists(path) and not stat.S_ISDIR(path.lstat().st_mode):
                 raise NotADirectoryError(0, 'not a folder; move it to another place', f'{path}')
     except OSError as error:

@@ -48,11 +48,11 @@ _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
 # Deep enough to lose no image at one a second during a solve of minutes.
 _OBSERVATIONS = QoSProfile(depth=1000)
 _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-# Of every publisher of static transforms the last message.
+# Every publisher of static transforms latches one message, and all of them are needed.
 _ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_TIMEOUT_S = 5.0  # of set_camera_info, and of its answer: a driver may write to flash memory
+_TIMEOUT_S = 5.0  # longest wait for set_camera_info or its answer: a driver may write to flash
 _LOOK_S = 0.5  # period of checks for the service and the timeout
-_LONGEST_PAUSE_S = 300.0  # beyond the time limit, before a driver is called again
+_LONGEST_PAUSE_S = 300.0  # longest pause after the time limit, before a driver is called again
 _RETRY_S = 1.0  # after a failed write
 _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
@@ -97,7 +97,7 @@ class Calibrator(node.StarcalNode):
             self.get_logger().info(self._state.moved)
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)
-        # Answers and verdicts are of today's parameters: the gate has judged what is stored anew.
+        # Answers and verdicts use today's parameters: the gate judges stored calibrations again.
         self._last_answer, active = Answer(True, ''), self._state.active
         self._last_gate = 'none'
         if self._state.withheld:
@@ -394,7 +394,7 @@ class CameraDriver:
         self._call: Any = None
         self._since_s = 0.0  # monotonic clock: the last request, or the last that was due
         self._pause_s = _TIMEOUT_S
-        self._next_s = math.inf  # of the next request; infinite: once the service appears
+        self._next_s = math.inf  # time of the next request; infinite: once the service appears
         self._closed = False
         self._lock = threading.RLock()
         group = ReentrantCallbackGroup()
@@ -463,7 +463,7 @@ class CameraDriver:
     def _answered(self, call: Any) -> None:
         with self._lock:
             if call is not self._call or self._closed:
-                return  # of a calibration that is no longer active
+                return  # the request was for a calibration that is no longer active
             self._call = None
             if call.exception() is not None:
                 self._fail(f'failed: {call.exception()}')

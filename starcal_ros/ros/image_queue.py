@@ -28,7 +28,7 @@ WINDOW_S = 60.0
 _MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messages
 _SILENT_S = 2.0  # without a sample: no image waits for more of them for its rate
 _LAGS = 100  # samples from which the delay of a star tracker is learned
-_MORE = 2  # times the longest of them: it has fallen silent
+_MORE = 2  # silent after so many times its longest lag
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class StarTrackers:
         self._most_ns = int(patience_s * NANOSECONDS_PER_SECOND)
         self._lags_ns: tuple[deque[int], ...] = tuple(deque(maxlen=_LAGS) for _ in range(count))
         self._heard_s = [-math.inf] * count  # wall clock of the last sample of each
-        self._lock = threading.Lock()  # of the lags and of these
+        self._lock = threading.Lock()  # guards the lags and the times of the last samples
 
     def add(self, which: int, time_ns: int, sample: AttitudeSample | None) -> None:
         """Add a sample of a star tracker; None marks an invalid one."""

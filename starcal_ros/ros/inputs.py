@@ -36,7 +36,7 @@ def with_reliability(qos: QoSProfile, reliability: ReliabilityPolicy) -> QoSProf
 class _Input:
     kinds: tuple[Any, ...]
     topic: str
-    name: str  # of the topic on the graph, after remapping
+    name: str  # topic on the graph, after remapping
     callback: Callable[..., None]
     qos: QoSProfile
     adapts: bool

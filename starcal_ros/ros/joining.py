@@ -99,7 +99,7 @@ def _joined_images(places: Sequence[Kept]) -> Ensemble:
 
 def _is_same(one: StarObservations, other: StarObservations) -> bool:
     # Measured pixels are equal to the last bit only in one measurement of one image.  A record
-    # that was read differs from the one written in what the message cannot tell.
+    # that was read differs from the one written in fields that the message lacks.
     return np.array_equal(one.measured_px, other.measured_px) and np.array_equal(
         one.catalog_id, other.catalog_id
     )

@@ -72,7 +72,7 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
         self._taken: Counter[Callable[[Any], None]] = Counter()
-        self._counting = threading.Lock()  # of errors and messages
+        self._counting = threading.Lock()  # guards the counts of errors and messages
         self._level: bytes | None = None
         self._listening_since_s = math.inf
         self._trim_due_s = 0.0

@@ -45,13 +45,13 @@ from starcal_ros.text import counted
 NAME = 'star_observer'
 _ATTITUDES = (QuaternionStamped, PoseStamped, TransformStamped, Imu)
 _IMAGE_TYPES = (ImageMessage, CompressedImage)
-_IMAGES = 20  # that wait with their pixels: 200 MB of 5 megapixels and 16 bit
+_IMAGES = 20  # images that wait with their pixels: 200 MB at 5 megapixels and 16 bit
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
 _COMPARED = 8  # velocities with that of the Earth: 1 ms, once a second
 _STAMP_NS = operator.itemgetter(0)
 _DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
-_HISTORY_S = 3600.0  # of attitudes: 2 MB at 10 Hz; images come later only from a recorder
+_HISTORY_S = 3600.0  # attitudes of an hour take 2 MB at 10 Hz; only a recorder sends later images
 _KEPT = 5  # images that matched nothing: 50 MB of 5 megapixels and 16 bit
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
 
@@ -82,7 +82,7 @@ class StarObserver(StarcalNode):
                 ' setup_finder beside the camera'
             )
         self._geometry = self._setup.prior
-        self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
+        self._calibration_number = 0  # the calibration that predicts the stars; 0: the prior
         self._withdrawn = ''  # why the prior predicts the stars where a calibration did
         self._observations = self.publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)

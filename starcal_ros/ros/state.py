@@ -61,19 +61,19 @@ class CalibratorState:
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibrations
-        self.moved = ''  # what became of the records in memory when the folder was opened
+        self.moved = ''  # a sentence on the records in memory when the folder was opened
         # Guards the fields below; never held during a solve.  Activations change only with both
         # locks held, `_disk` first.
         self._records = threading.Lock()
         self._ensemble = records.Ensemble()
         self._collections = Collections()
-        self._details: dict[str, str] = {}  # of the last image refused for each reason
+        self._details: dict[str, str] = {}  # the last refused image for each reason
         self._history: tuple[records.Activation, ...] = ()
-        self._active: records.Activation | None = None  # of the history
+        self._active: records.Activation | None = None  # an entry of the history
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
-        self._camera: tuple[int, int, str] = (0, 0, '')  # that the records in memory are of
+        self._camera: tuple[int, int, str] = (0, 0, '')  # camera of the records in memory
         self._on_disk = Kept()  # last written
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:

@@ -31,7 +31,7 @@ from starcal_ros.options import option
 from starcal_ros.sky.catalog import StarCatalog
 
 SIDEREAL_RAD_S = 7.292115e-5  # GRS 1980, rotation of the Earth
-_WEATHER = 0.057  # of the refraction at a site: 15 of 283 K and 20 of 1013 hPa
+_WEATHER = 0.057  # relative 1-sigma of the refraction at a site: 15 K of 283 K, 20 hPa of 1013 hPa
 LEAST_COSINE = 0.17  # 80 degrees of zenith distance, where A tan z + B tan^3 z is off by 1 arcsec
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 _DAY_S = 86400

@@ -58,7 +58,7 @@ DEEPER_MAG = 2.0
 # Margin of a cone: 35 years of motion of the fastest star (8.7 arcsec a year) and 20 arcsec of
 # aberration.
 CONE_MARGIN_RAD = 330 * ARCSECOND_RAD
-_STEP_RAD = 0.05  # of directions whose surroundings are kept: 0.87 of it to the farthest
+_STEP_RAD = 0.05  # grid of directions with cached surroundings: every axis is within 0.87 steps
 
 
 # 1-sigma of the proper motion of a star of V = 9 per axis, and its factor for each magnitude
@@ -70,12 +70,12 @@ _USUAL_MOTION_FACTOR = 0.85
 class MotionSource(IntEnum):
     """Source of a star's proper motion, which determines the accuracy of its position."""
 
-    UNKNOWN = 0  # Gaia position, moved by none
+    UNKNOWN = 0  # Gaia position without a motion
     DIFFERENCE = 1  # Gaia position at J2016 minus Tycho-2 position at J2000, over 16 years
     HIPPARCOS = 2  # Hipparcos-2 solution
     GAIA = 3  # Gaia solution
     TYCHO = 4  # Tycho-2 solution
-    UNKNOWN_J2000 = 5  # position of about J2000, as of 2MASS, moved by none
+    UNKNOWN_J2000 = 5  # position of about J2000, such as in 2MASS, without a motion
 
 
 UNMOVED = (MotionSource.UNKNOWN, MotionSource.UNKNOWN_J2000)

@@ -490,7 +490,7 @@ def learn(
     if measured.fit is None:
         return before
     stars = np.flatnonzero(usable[measured.fitted])
-    # What a lens adds to the shape of all stars is not the noise of a pixel.
+    # The lens changes the shape of all stars alike; this is not the noise of a pixel.
     plain = stars[measured.fit.worst_pixel_sigma[stars] <= psf_fit.MISFIT_SIGMA]
     stars = plain if len(plain) >= FEWEST_BRIGHT else stars
     # Few stars of a narrow field are bright.

@@ -39,7 +39,7 @@ _DETECTION_SIGMA_PX, _FILTER_PX = 1.0, (7, 7)
 NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
 _AROUND = [(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1) if (dv, du) != (0, 0)]
-_ROWS_AT_ONCE = 64  # of an image: a cache holds them
+_ROWS_AT_ONCE = 64  # rows of an image that fit in the cache of a processor
 _RIM_PX = 4  # reach of the filter, plus one pixel to interpolate the maximum
 # Peak over filtered peak: 6.3 for a single lit pixel without noise; for a star centred on a pixel
 # 4.2 with a PSF of 0.45 px (half of the light in that pixel) and 4.65 with one of 0.4 px.

@@ -35,7 +35,7 @@ _TESTED, _TESTED_SNR = 15, 20.0  # sources that show whether there are streaks a
 _FEWEST = 5
 _LEVEL = 0.3  # pixels above this part of the peak, joined to it, are the source
 _NOISE = 3.0  # and this many sigma above the background
-_SHORTEST = 0.35  # s^2 / 12 over the variance of the PSF: what shape_median allows without streaks
+_SHORTEST = 0.35  # s^2 / 12 over the variance of the PSF: shape_median allows it without streaks
 _EXPLAINED = 0.5  # part of the elongation that a turn of the camera may leave
 # Shares of a window that a source fills: a core that may be of a body, as of a planet or its limb,
 # and a window that is; a streak from rim to rim fills a fifth.

@@ -8,6 +8,7 @@ import builtins
 import functools
 import importlib
 import importlib.util
+import inspect
 from pathlib import Path
 import pkgutil
 import re
@@ -123,11 +124,27 @@ def resolves(name: str) -> bool:
 
 
 def has(owner: object, attributes: list[str]) -> bool:
+    """True if an object has attributes of each other; the last may be a field of a record."""
     for attribute in attributes:
+        if attribute in getattr(owner, '__dataclass_fields__', ()):
+            return attribute == attributes[-1]
         if not hasattr(owner, attribute):
             return False
         owner = getattr(owner, attribute)
     return True
+
+
+def test_each_symbol_of_the_algorithm_has_a_name_in_the_code() -> None:
+    """The last column: functions and fields that exist, and names in the modules of these."""
+    table = (ROOT / 'docs' / 'algorithm.md').read_text().split('## Notation')[1].split('\n## ')[0]
+    cells = [line.rsplit('|', 2)[1] for line in table.splitlines() if line.startswith('| ')]
+    for cell in cells[1:]:
+        names = re.findall('`([^`]+)`', cell)
+        dotted = {name.split('.')[0] for name in names if '.' in name}
+        modules = [name for name in MODULES if name.rpartition('.')[2] in dotted]
+        text = '\n'.join(inspect.getsource(importlib.import_module(name)) for name in modules)
+        assert dotted and all(map(exists, names)), cell
+        assert {name for name in names if '.' not in name} <= {*re.findall(r'\w+', text)}, cell
 
 
 @pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
@@ -212,7 +229,8 @@ def identifiers() -> frozenset[str]:
 @pytest.mark.parametrize(
     'span',
     [
-        *('estimation/calibrate.no_such', 'docs/no_such.md', 'no_such_option', '--no-such'),
+        *('estimation/calibrate.no_such', 'equations.Equations.no_such'),
+        *('docs/no_such.md', 'no_such_option', '--no-such'),
         *(
             'pytest test/onboard/test_api.py -k no_such',
             'bench no_such',

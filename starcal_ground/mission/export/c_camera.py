@@ -37,9 +37,9 @@ _MODELS = ('plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidist
 _MOST_WAVES = 128  # STARCAL_MAX_WAVES
 _NAME_SIZE = 32  # STARCAL_NAME_SIZE
 _VECTORS_A_SIDE = 5
-_VECTOR_STEP_K = 7.0  # of the temperature from one vector to the next
+_VECTOR_STEP_K = 7.0  # temperature step between test vectors
 _NO_FOLD = sys.float_info.max  # the table has finite numbers only
-_NO_VARIANCE = 1e-14  # of the largest, scaled: rounding
+_NO_VARIANCE = 1e-14  # relative eigenvalue of the scaled covariance that is rounding
 _BYTES_A_LINE = 20
 
 

@@ -30,7 +30,7 @@ from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import LENSES, ros_distortion
 from starcal_ros.records import Calibration
 
-_LARGEST = 'thin_prism'  # of the models that GIANT and mrcal have
+_LARGEST = 'thin_prism'  # largest model that both GIANT and mrcal have
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
 
 
@@ -94,7 +94,7 @@ def giant_json(calibration: Calibration) -> exported.Content:
     """
     own = calibration.geometry.camera.model
     camera, made = exported.fitted(calibration, own if LENSES[own].giant else _LARGEST, ())
-    # GIANT has the change of the focal length with temperature: it is no loss.
+    # GIANT has the change of the focal length with temperature: nothing is lost.
     losses = tuple(loss for loss in made.losses if 'focal' not in loss.part)
     made = dataclasses.replace(made, losses=losses)
     named = zip(camera.parameter_names, camera.parameters.tolist(), strict=True)

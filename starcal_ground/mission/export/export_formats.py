@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Request:
     """
-    Inputs that a format may need besides the calibration.
+    Inputs of a format besides the calibration.
 
     ``names`` are None where the NAIF ID of the spacecraft is not given; ``table``: only the
     numbers of the calibration, for code that was compiled before; ``observations`` and ``kernels``

@@ -35,7 +35,7 @@ from starcal_ros.estimation.problem import camera_at
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 
-_LONGEST_NAME = 32  # of a pool variable or a frame: SPICE Required Reading, kernel.req, frames.req
+_LONGEST_NAME = 32  # pool variables and frames: SPICE Required Reading, kernel.req, frames.req
 _COMMENT_COLUMNS = 78  # longer lines are read, but NAIF asks for no more than 80
 _STRING_COLUMNS = 80  # longest string value of a pool variable
 

@@ -89,7 +89,7 @@ _SOURCES = (
             2000.0, _NONE, _of_2mass),
 )  # fmt: skip
 # Units, and ranges wider than the extremes of Gaia DR3 and within what a catalog file can hold.
-# Numbers that stand for none, as 99.99 or -999, are outside.
+# Marks of a missing number, such as 99.99 or -999, are outside.
 _RANGES = {
     'ra': ('deg', 0.0, 360.0),
     'dec': ('deg', -90.0, 90.0),
@@ -109,12 +109,12 @@ _MAS_RAD = 1e-3 * ARCSECOND_RAD
 _SAME_STAR_RAD = 3.0 * ARCSECOND_RAD
 _CLOSE_PAIR_MAGNITUDES = 5.0
 _OLD_JYEAR = 2008.0  # places without a motion are of Gaia after it, of about J2000 before
-_PLACE_DIGITS = 10**5  # of a degree, in the number of a star without one
+_PLACE_DIGITS = 10**5  # steps per degree in the number made for a star without one
 _NEAR_RAD = 30.0 * ARCSECOND_RAD  # to a star of the bundled catalog, with its proper motion
 _MOST_OFF_RAD = 0.3 * ARCSECOND_RAD  # median of the stars of both catalogs; right ones: 1 mas
 _MOST_TURN_RAD, _MOST_YEARS, _SIGMAS = 0.1 * ARCSECOND_RAD, 3.0, 5.0
 _FEWEST = 4  # stars that show an epoch and a rotation
-_ALIKE_MAG = 1.0  # of V by the colour and V of the bundled catalog
+_ALIKE_MAG = 1.0  # largest difference of V by the colour and V of the bundled catalog
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
     stars, bundled = table.stars, sky_catalog.load_catalog()
     checked = _check(path, table, bundled)
     kept = ~np.isin(bundled.id, stars['id'])
-    # Of stars without a number of Gaia, or with another one in the bundled catalog.
+    # Stars without a Gaia number, or with another one in the bundled catalog, match by place.
     apart, _ = cKDTree(_at(bundled, table.jyear)[0][kept]).query(_direction(stars))
     new = apart > _SAME_STAR_RAD
     values = {
@@ -288,7 +288,7 @@ def _epoch_and_turn(off: Floats, direction: Floats, motion: Floats) -> tuple[flo
         N = np.linalg.pinv(A.T @ (A * weight[:, None]), rcond=1e-9)
         x = N @ (A.T @ (weight * b))
         residual = b - A @ x
-        # Of three axes one is along the line of sight.
+        # The factor exceeds 1.48: one of three axes, along the line of sight, shows no error.
         sigma = max(2.0 * median(np.abs(residual)), 1e-3 * ARCSECOND_RAD)
         weight = 1.0 / (1.0 + (residual / (3.0 * sigma)) ** 2) ** 2
     turn = np.linalg.norm((A[:, 1:] @ x[1:]).reshape(-1, 3), axis=1)
@@ -452,7 +452,7 @@ def _table(path: Path) -> Any:
             start = file.readline(2**20)
         columns = start.count(b',') if path.suffix == '.csv' else 0
         with warnings.catch_warnings():
-            warnings.simplefilter('ignore')  # of units that VizieR spells in its own way
+            warnings.simplefilter('ignore')  # VizieR spells units in its own way
             if columns > _MOST_COLUMNS:
                 raise ValueError(f'more than {_MOST_COLUMNS} columns')
             if start.startswith(b'SIMPLE  ='):

@@ -29,7 +29,7 @@ _MAGIC = (_TEXT, b'DAF/', b'NAIF/DAF', b'DAS/', b'NAIF/DAS')
 # A CK is sampled beside each image too: a stamp offset of the camera may be applied later.
 _BESIDE_NS = (-NANOSECONDS_PER_SECOND, 0, NANOSECONDS_PER_SECOND)
 _KM = 1000.0
-_TEXT_BYTES = 1 << 26  # of a text kernel: the largest have 1 MB
+_TEXT_BYTES = 1 << 26  # longest text kernel that is read: the largest in use have 1 MB
 
 
 def is_kernel(path: Path) -> bool:
@@ -170,7 +170,7 @@ def _icrf_from_frame(spice: Any, frame: str, time_ns: int) -> Floats | None:
     except spice.NotFoundError:
         return None
     except spice.SpiceyError as error:
-        # Both stand for a CK without data at the time.
+        # Both mark a CK without data at the time.
         if error.short in ('SPICE(NOFRAMECONNECT)', 'SPICE(FRAMEDATANOTFOUND)'):
             return None
         raise ValueError(f'frame {frame}: {_short(error)}') from error

@@ -118,7 +118,7 @@ def in_order(time_ns: ArrayLike, xyzw: ArrayLike, notes: tuple[str, ...] = ()) -
         raise ValueError('no attitudes')
     quaternions = np.asarray(xyzw, np.float64)[first]
     norm = np.linalg.norm(quaternions, axis=1)
-    wrong = ~(np.abs(norm - 1.0) <= 1e-3)  # single precision keeps 1e-7; this is no rounding
+    wrong = ~(np.abs(norm - 1.0) <= 1e-3)  # rounding in single precision is 1e-7
     if wrong.any():
         raise ValueError(
             f'attitude {int(wrong.argmax()) + 1} is not a unit quaternion '
@@ -166,7 +166,7 @@ def _rows(
     lines = (match[0] for match in re.finditer(r'[^\r\n]+', text_of(path)))
     lines = (line for line in lines if not line.startswith('#'))
     header = next(lines, '')
-    mark = max(',;\t', key=header.count)  # of spreadsheets, which differ by country
+    mark = max(',;\t', key=header.count)  # spreadsheets use another mark in another country
     table = csv.DictReader(itertools.chain([header], lines), delimiter=mark)
     number = 1
     try:

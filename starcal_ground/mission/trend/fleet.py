@@ -44,7 +44,7 @@ from starcal_ros.records import StarObservations
 from starcal_ros.text import printable
 
 KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
-_ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
+_ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # in the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'

@@ -22,7 +22,7 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-_ETAGS = ('ETag', 'etag', 'md5Hash')  # of S3, Google and Azure
+_ETAGS = ('ETag', 'etag', 'md5Hash')  # names in S3, Google and Azure
 _TIMES = ('LastModified', 'last_modified', 'updated', 'mtime', 'created')
 _LONGEST_REASON = 200
 _TOGETHER = 100_000  # files that are listed at once: 0.2 GB in the clients of stores

@@ -38,8 +38,8 @@ from starcal_ros.text import printable
 RECORDED, COMPUTED, FAILED = 'recorded', 'computed', 'failed'
 _LONGEST = 20_000  # characters of a text: a path has 4096, each of up to four after `printable`
 _LONGEST_ERROR = 2000
-_LONGEST_NAME, _LONGEST_STAMP = 100, 16  # of a bag, in the name of a folder
-_MOST, _LEAST = 1e15, 1e-30  # of a number whose square and its inverse must stay finite
+_LONGEST_NAME, _LONGEST_STAMP = 100, 16  # characters of bag and stamp in the name of a folder
+_MOST, _LEAST = 1e15, 1e-30  # squares of numbers and their inverses must stay finite
 
 
 @dataclass(frozen=True)
@@ -328,7 +328,7 @@ class Table:
         """Raise errors of the block as ProductError in one line that names the file."""
         try:
             yield
-        # Of the disk, of rights, or of another run: the table itself is sound.
+        # The disk, the rights or another run are the cause: the table itself is sound.
         except (OSError, sqlite3.OperationalError) as error:
             words = getattr(error, 'strerror', '') or error
             raise ProductError(f'{self.path}: cannot be used: {words}') from error

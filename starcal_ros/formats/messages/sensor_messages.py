@@ -23,7 +23,7 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, LEAST_DEGC, MOST_DEGC, refused_image, StarObservations
 
-MOST_PIXELS = 2**27  # of an image: 256 MB of 16 bit
+MOST_PIXELS = 2**27  # the largest image takes 256 MB at 16 bit
 _SET_CHANNEL = 'is a colour image: set image_channel, e.g. to green'
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 CHANNELS = ('red', 'green', 'blue')
@@ -142,7 +142,7 @@ def _has_surplus(content: bytes, header: Header) -> bool:
 
     A megabyte of compressed data can hold a gigabyte: seconds for nothing.
     """
-    most = 2 * (2 * header.width * header.channels + 8) * header.height  # of 16 bit, interlaced
+    most = 2 * (2 * header.width * header.channels + 8) * header.height  # 16 bit, interlaced
     inflate, at, size = zlib.decompressobj(), 8, 0
     for _ in range(_PNG_MOST_CHUNKS):
         if at + _PNG_CHUNK.size > len(content):
