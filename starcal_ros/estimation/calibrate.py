@@ -75,17 +75,17 @@ from starcal_ros.estimation.unknowns import (
     ZENITH_SIGMA_RAD,
 )
 from starcal_ros.estimation.weights import (
-    agree,
     CentroidVariance,
+    damped,
     Data,
     degrees_of_freedom,
     FREE_FACTOR,
+    has_converged,
     judge,
-    Judged,
     sky_rotations,
-    towards,
     tracker_attitudes,
     weighted_attitudes,
+    Weighting,
 )
 from starcal_ros.records import (
     CameraGeometry,
@@ -242,7 +242,9 @@ def estimate_calibration(
 def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) -> Estimate:
     """Return the estimate from a start."""
     table = data.table
-    judged = Judged(CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None)
+    judged = Weighting(
+        CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None
+    )
     measurements = arrange(table, judged.kept, judged.covariance_px2(table))
     solution = _robust_search(problem, start, measurements)
     state, iterations = solution.state, solution.iterations
@@ -264,11 +266,13 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.posterior)
-        if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
+        if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and has_converged(
+            judged, after, table
+        ):
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
-            state, judged = last.after, towards(judged, after, share)
+            state, judged = last.after, damped(judged, after, share)
         # Where stars hardly show an unknown, whole steps overshoot to and fro, and so do weights:
         # the part of the step before that is left shows the share that ends in the minimum.
         if k:
@@ -303,7 +307,7 @@ def _round(
     data: Data,
     problem: Problem,
     state: State,
-    judged: Judged,
+    judged: Weighting,
     residual_px: Floats,
     shape_px: Floats | float,
     before: _Round | None,
@@ -439,7 +443,7 @@ def _result(
     data: Data,
     ensemble: Ensemble,
     last: _Round,
-    judged: Judged,
+    judged: Weighting,
     weights: Weights,
     iterations: int,
     termination: str,

@@ -220,7 +220,7 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Weighting:
     """Conclusions from the residuals of a round: the weights of the next one."""
 
     variance: CentroidVariance
@@ -423,10 +423,10 @@ def judge(
     from_sky: Floats,
     residual_px: Floats,
     freedom: Floats,
-    before: Judged,
+    before: Weighting,
     found: Posterior | None,
     attitudes: Attitudes | None = None,
-) -> Judged:
+) -> Weighting:
     """
     Return the weights that the residuals of a state ask for.
 
@@ -465,10 +465,10 @@ def judge(
         errors = shared_errors(
             residual_px, own_px2, kept, data.groups, from_sky, found.last_octave, floor
         )
-    return Judged(variance, errors, kept, attitudes)
+    return Weighting(variance, errors, kept, attitudes)
 
 
-def towards(one: Judged, other: Judged, share: float) -> Judged:
+def damped(one: Weighting, other: Weighting, share: float) -> Weighting:
     """
     Return other conclusions, with weights that are a share of the way from one to theirs.
 
@@ -495,7 +495,7 @@ def towards(one: Judged, other: Judged, share: float) -> Judged:
     return dataclasses.replace(other, variance=variance, attitudes=attitudes)
 
 
-def agree(one: Judged, other: Judged, table: StarTable) -> bool:
+def has_converged(one: Weighting, other: Weighting, table: StarTable) -> bool:
     """Return True if both lead to the same estimate."""
     if one.attitudes is None or other.attitudes is None:
         return False
