@@ -48,6 +48,7 @@ from starcal_ros.estimation.problem import (
     State,
     supported_terms,
 )
+from starcal_ros.estimation.refraction import Refraction, STATED_SITE_RAD, ZENITH_SIGMA_RAD
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.shared_errors import observation_groups, pixel_variance_px2
 from starcal_ros.estimation.star_equations import (
@@ -69,10 +70,8 @@ from starcal_ros.estimation.unknowns import (
     IMAGE_ROTATION,
     Layout,
     moved,
-    Refraction,
-    STATED_SITE_RAD,
+    readout_rms_s,
     unknowns_of,
-    ZENITH_SIGMA_RAD,
 )
 from starcal_ros.estimation.weights import (
     CentroidVariance,
@@ -101,9 +100,8 @@ _ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
 _ROUNDS = 24  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _LEAST_SHARE = 0.25  # of a step, so that it still arrives
-_IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')
 _SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
-_USUAL_M_S = 8000.0  # of orbits about the Earth
+_PLAUSIBLE_M_S = 8000.0  # of orbits about the Earth
 _UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
 _LENS_RESIDUAL_LOG_SIGMA = 1.5  # of a residual by a data sheet: it is of the ground, not of flight
 _READOUT_ERROR = 0.01  # of the time by a data sheet: the tolerance of a clock, and rounding
@@ -318,9 +316,9 @@ def _round(
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
     size = camera.width, camera.height
     readout_s = math.hypot(*data.assumed.readout_s)
-    if before and 'rates' in before.linear.layout and 'readout' in before.linear.layout:
-        at = before.linear.layout.places['readout'].start
-        readout_s = math.hypot(before.posterior.mean[at], before.posterior.working[at, at] ** 0.5)
+    if before:
+        last = before.posterior
+        readout_s = readout_rms_s(last.layout, last.mean, last.working, data.assumed)
     rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
     layout = unknowns_of(problem, state, rates, size, data.assumed)
     measurements = arrange(table, judged.kept, judged.working_px2(table))
@@ -329,7 +327,7 @@ def _round(
     found = posterior(sums, linear, shape_px, before.posterior if before else None)
     # What is not in the state, as a velocity, is at its mean: the images follow both.
     shared = found.mean.copy()
-    shared[layout.of(_IN_STATE)] *= share
+    shared[layout.in_state] *= share
     own = found.equations.own - found.equations.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
     left_px = residuals_px(problem, after, table, found, size)
@@ -340,11 +338,11 @@ def _round(
 
 def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
     """Return the priors of what is stated by the options and the observations."""
-    velocity_m_s, usual_m_s = options.velocity_sigma_m_s, math.inf
+    velocity_m_s, plausible_m_s = options.velocity_sigma_m_s, math.inf
     if velocity_m_s < 0:
         velocity_m_s = float(np.max([image.velocity_sigma_m_s for image in ensemble.images]))
         if not math.isfinite(velocity_m_s):
-            velocity_m_s, usual_m_s = _SPACE_VELOCITY_M_S, _USUAL_M_S
+            velocity_m_s, plausible_m_s = _SPACE_VELOCITY_M_S, _PLAUSIBLE_M_S
     readout_s = {
         'global': (0.0, 0.0),
         'rolling': (options.readout_s, _READOUT_ERROR * abs(options.readout_s)),
@@ -365,7 +363,7 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
         site_rad = STATED_SITE_RAD if is_stated else ZENITH_SIGMA_RAD
         refraction = Refraction(stamps, zenith, float(size), float(sigma), site_rad)
     stamp_s = options.stamp_sigma_s
-    return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, usual_m_s)
+    return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, plausible_m_s)
 
 
 def _colours(table: StarTable, colours_of: Callable[[Indices], Floats] | None) -> Floats | None:
@@ -379,7 +377,7 @@ def _colours(table: StarTable, colours_of: Callable[[Indices], Floats] | None) -
 
 def _step_sigma(found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
-    in_state = found.layout.of(_IN_STATE)
+    in_state = found.layout.in_state
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
     steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
     return np.asarray(steps)
@@ -397,7 +395,7 @@ def _check_not_mirrored(state: State) -> None:
 
 def _field_of(found: Posterior, size: tuple[int, int]) -> DetectorField:
     """Return the field of a posterior on a detector (width, height)."""
-    coefficients = found.mean[found.layout.places['field']].reshape(2, -1)
+    coefficients = found.mean[found.layout.field_at].reshape(2, -1)
     return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
@@ -425,7 +423,7 @@ def residuals_px(
         turn = np.zeros((3, len(table)))
         for entry in layout.entries:
             at = layout.places[entry.name]
-            if entry.camera is not None and entry.name not in _IN_STATE:
+            if entry.camera is not None and not entry.kind.in_state:
                 values = found.of_images[:, at] if entry.of_image else found.mean[None, at]
                 own += (entry.camera @ values[:, :, None])[:, :, 0]
             if entry.turn is not None:
@@ -463,8 +461,7 @@ def _result(
     geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
     covariance = _considered(found, problem)
     basic = layout.of(['camera', 'alignment'])
-    joint = layout.of(['camera', 'alignment', 'field'])
-    shared = layout.of(_IN_STATE)
+    joint, shared = layout.line_of_sight_at, layout.in_state
     names = tuple(layout.labels[k] for k in shared)
     asked = np.intersect1d(shared, found.estimated)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()

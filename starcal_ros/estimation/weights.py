@@ -379,7 +379,7 @@ def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Float
     values[:, stars], values[:, own] = found.mean[seen_by_stars(layout)], found.of_images
     values[:, rotation] = 0.0
     c = blocks[:, rotation, -1] - np.einsum('mij,mj->mi', blocks[:, rotation], values)
-    c = c - (found.mean[layout.of(['field'])] @ sums.field_cross)[:, rotation]
+    c = c - (found.mean[layout.field_at] @ sums.field_cross)[:, rotation]
     diagonal = np.einsum('mii->mi', C)
     seen: Mask = np.asarray((diagonal > 0).all(axis=1))
     scale = np.where(seen[:, None], 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
