@@ -45,7 +45,7 @@ from starcal_ros.records import Ensemble, GateCheck, StarObservations
 from starcal_ros.text import significant
 
 MAP, LINE_OF_SIGHT = 'map', 'line_of_sight'
-_GROUPS = 20  # of stars by magnitude
+_GROUPS = 20  # each group of neighbours in magnitude has a twentieth of the information
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
 _SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
 _AT_ONCE = 32  # candidates: their rows take some 10 MB
@@ -237,7 +237,7 @@ def _rows(
     whole = np.arange(layout.count), np.zeros(layout.count)
     for chunk, by_shared, by_own, _ in star_rows(linear, *whole):
         _, stars, b = by_own.shape
-        # Of the star tracker, and of the prior of the shape.
+        # The star tracker and the prior of the shape add rows to those of the stars.
         shared = np.pad(by_shared, ((0, 0), (0, b), (0, 0)))
         own = np.pad(by_own, ((0, 0), (0, b), (0, 0)))
         of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])

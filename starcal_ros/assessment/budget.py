@@ -24,7 +24,7 @@ import math
 import numpy as np
 from scipy.linalg import qr
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives, grid_derivatives
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -36,9 +36,9 @@ from starcal_ros.estimation.unknowns import CHANGE, Layout, NO_OPTION, Option, U
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, Statement, TOTAL
 from starcal_ros.text import significant
 
-_KNOWN_SHAPE_PX = 1e-7  # moves no pixel by a measurable amount
-_WORTH_STATING = 0.9  # of the sigma before
-_SHOWN = 3.0  # times its noise: a slow error of a star tracker that the images show
+_KNOWN_SHAPE_PX = 1e-7  # no star is measured to that
+_WORTH_STATING = 0.9  # a fall of the sigma by less than a tenth is not worth a statement
+_SHOWN = 3.0  # a slow error beyond three times the noise is in the images: no data sheet lowers it
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def sigma_budget(
     seen, of_pixel = _seen(estimate)
     in_root = seen.turned(errors.root)
     unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
-    rows = _rows(estimate)
+    rows = estimate.linear.layout.line_of_sight_at
     part = np.ix_(rows, rows)
     of_rows = seen.turned(np.eye(len(errors.root))[:, rows])
     covariance = estimate.map_covariance.matrix
@@ -198,8 +198,9 @@ def _seen(estimate: Estimate) -> tuple[_Seen, Floats]:
     common = common_rotation(camera, grid)
     means, of_pixel = mean_squares(estimate, grid)
     found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
-    J = np.zeros((len(found.J), 3, estimate.linear.layout.count))
-    J[:, :, _rows(estimate)] = np.nan_to_num(found.of_shape(camera, common))
+    layout = estimate.linear.layout
+    J = np.zeros((len(found.J), 3, layout.count))
+    J[:, :, layout.line_of_sight_at] = np.nan_to_num(found.of_shape(camera, common))
     by_pixel = np.nan_to_num((found.by_pixel**2).sum(axis=(1, 2)))
     return _Seen(means, J), np.concatenate([[of_pixel, of_pixel], by_pixel])
 
@@ -215,16 +216,11 @@ def mean_squares(estimate: Estimate, grid: Derivatives | None = None) -> tuple[F
     grid = grid or grid_derivatives(camera)
     common, seen = common_rotation(camera, grid), np.isfinite(grid.directions[:, 0])
     squares = np.zeros((2, layout.count, layout.count))
-    rows = _rows(estimate)
+    rows = estimate.linear.layout.line_of_sight_at
     for k, J in enumerate((grid.of_shape(camera, common), grid.J)):
         flat = J[seen].reshape(-1, len(rows))
         squares[k][np.ix_(rows, rows)] = flat.T @ flat / np.count_nonzero(seen)
     return squares, float((grid.by_pixel[seen] ** 2).sum() / np.count_nonzero(seen))
-
-
-def _rows(estimate: Estimate) -> Indices:
-    """Return the places of the numbers of `lookup.Derivatives` among the shared unknowns."""
-    return estimate.linear.layout.line_of_sight_at
 
 
 def _gain(errors: ErrorParts, T: Floats, seen: _Seen) -> Floats:

@@ -38,12 +38,12 @@ from starcal_ros.records import (
 from starcal_ros.text import p_value_text, significant
 from starcal_ros.untrusted import shown
 
-# Of the limit on the map: a prior is not as good as a calibration, and on a large detector that of
-# the lens moves the corners by more: a tenth of the half diagonal (`lens_prior`).
+# The limit on the map is looser when starting from a prior: five times, or a tenth of the half
+# diagonal, by which a prior of the lens is off in the corners (`lens_prior`).
 _PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX = 5.0, 0.01
-_PRIOR_ROTATION = 13.0  # of the limit on the rotation: 1.5 degrees, and 5 degrees in roll
-_DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
-_STEP_P_VALUE = 1e-6  # of a step of the detector among all places
+_PRIOR_ROTATION = 13.0  # drawings give a mounting to 1.5 degrees, and to 5 degrees in roll
+_DRIFT_P_VALUE = 1e-4  # false-alarm rate of the drift test; few images support no smaller one
+_STEP_P_VALUE = 1e-6  # false-alarm rate of the test for a step, over all places
 _NOT_BY_STARS = 'the stars alone do not determine it'
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
 

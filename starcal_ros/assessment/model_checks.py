@@ -25,7 +25,7 @@ from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, 
 
 _CLEAR_SIGMA = 5.0  # the default of the gate: a conflict that fails must be in the evidence too
 _INNER = (0.1, 0.9)  # nearer to the border too few stars lie on one side
-_STEPS = 97  # five places in the width of a strip: between them a step loses a tenth of its size
+_STEPS = 97  # five places in the width of a strip: a step between two loses a tenth of its size
 _STRIP = 1 / 24  # a quarter of the shortest wave of the field, which so takes no step
 
 
@@ -123,7 +123,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     for entry in layout.shared:
         at = layout.of([entry.name])
         tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
-        tested &= entry.widest > entry.sigma  # of any lens: nobody states it
+        tested &= entry.widest > entry.sigma  # nobody states a prior as wide as any lens needs
         test = entry.kind.tested
         if test is None or not tested.any():
             continue

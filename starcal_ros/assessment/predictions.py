@@ -122,11 +122,11 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
     )
 
 
-_BINS = 4  # of each kind: corners and faint stars stand apart, and each holds a quarter
-_FEWEST_STARS = 30  # of a bin: its normalised residual is known to 9 %
+_BINS = 4  # corners and faint stars stand apart, and each bin holds a quarter
+_FEWEST_STARS = 30  # they show the normalised residual of a bin to 9 %
 _FEWEST_IMAGES = 4  # three may determine no calibration without one of them
-_NO_EFFECT = 1e-3  # information on a coefficient times its prior variance
-_CELLS = 24  # of the detector along its width
+_NO_EFFECT = 1e-3  # coefficients of which the data know a thousandth say nothing of an image
+_CELLS = 24  # along the width: a cell is a quarter of the shortest wave of the field
 
 
 def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:

@@ -94,17 +94,17 @@ from starcal_ros.records import (
     TemperatureTerms,
 )
 
-_START_FLOOR_PX = 0.05  # until the residuals show it: of the order of what is left in good images
-_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
-_ROBUST_GAIN = 0.1  # a step of half a sigma: the posterior goes on from there
+_START_FLOOR_PX = 0.05  # good images leave about that much; the residuals replace it
+_ROBUST_SCALE = 3.0  # the Cauchy loss takes 5 % of the weight of normal noise there
+_ROBUST_GAIN = 0.1  # steps of less than half a sigma are left to the posterior
 _ROUNDS = 24  # three or four are usual; principal points that stars hardly show take ten
-_STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
-_LEAST_SHARE = 0.25  # of a step, so that it still arrives
-_SPACE_VELOCITY_M_S = 20000.0  # against the Earth, of orbits about it and about the Sun
-_PLAUSIBLE_M_S = 8000.0  # of orbits about the Earth
-_UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
-_LENS_RESIDUAL_LOG_SIGMA = 1.5  # of a residual by a data sheet: it is of the ground, not of flight
-_READOUT_ERROR = 0.01  # of the time by a data sheet: the tolerance of a clock, and rounding
+_STEP_SIGMA = 0.05  # a twentieth of a sigma changes no result: the state is at the minimum
+_LEAST_SHARE = 0.25  # smaller steps would not arrive within `_ROUNDS`
+_SPACE_VELOCITY_M_S = 20000.0  # against the Earth: orbits about both Earth and Sun have such
+_PLAUSIBLE_M_S = 8000.0  # orbits about the Earth are no faster
+_UNKNOWN_READOUT_S = 0.02  # a rolling shutter takes 5 to 50 ms a frame
+_LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states it on the ground; flight changes it
+_READOUT_ERROR = 0.01  # a data sheet rounds the time, and clocks have a tolerance
 
 
 @dataclass(frozen=True)
@@ -264,15 +264,14 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.posterior)
-        if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and has_converged(
-            judged, after, table
-        ):
+        is_settled = np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA
+        if is_settled and has_converged(judged, after, table):
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
             state, judged = last.after, damped(judged, after, share)
-        # Where stars hardly show an unknown, whole steps overshoot to and fro, and so do weights:
-        # the part of the step before that is left shows the share that ends in the minimum.
+        # Steps of unknowns that stars hardly show oscillate, and so do weights: the ratio of
+        # successive steps damps them.
         if k:
             of_before = max(float(before_sigma @ before_sigma), 1e-300)
             rest = float(step_sigma @ before_sigma) / of_before

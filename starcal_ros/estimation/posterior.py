@@ -47,7 +47,7 @@ from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
 
-_WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
+_WITHOUT = 1e3  # no wrong data sheet is off by a thousand sigmas of its prior
 LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
@@ -187,10 +187,10 @@ def without_prior(
 
     With ``held`` only that number of the entry, which is held, is free.
 
-    The amplitudes are found again: field and shapes may hide that a prior is wrong.  A trend keeps
-    its value of the posterior ``near`` with the prior, and its cost: together with a free velocity
-    it can be much that is of the lens.  The variance is that of the working weights; infinite
-    where stars show less than what is possible at all.
+    The amplitudes are estimated again: field and shapes may hide that a prior is wrong.  A free
+    trend and a free velocity would absorb errors of the lens, so the trend keeps its value of the
+    posterior ``near`` with the prior, and its cost.  The variance is that of the working weights;
+    infinite where stars show less than what is possible at all.
     """
     at_trend = linear.layout.trend_at
     trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
@@ -352,8 +352,8 @@ def common_shape(layout: Layout, common_px2: Floats) -> Floats:
 
 
 TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
-_KEPT = 1e-3  # of the sigma of a prior, by which an unknown stays at its mean
-_HELD = 0.05  # information on a mode times its variance, below which its prior holds it
+_KEPT = 1e-3  # a prior of a thousandth of its sigma keeps an unknown at its mean
+_HELD = 0.05  # modes of which the data give less than 5 % of the information follow their prior
 
 
 @dataclass(frozen=True)

@@ -294,7 +294,7 @@ def unknowns_in_state(problem: Problem, state: State) -> Layout:
         if q
         else np.broadcast_to(np.eye(p), (m, p, p))
     )
-    sigma = np.zeros(p)  # of parameters that are held
+    sigma = np.zeros(p)  # a held parameter has none
     sigma[problem.free] = problem.prior_sigma[problem.free]
     offset = state.parameters - problem.prior_parameters
     widest = np.where(problem.is_weak, sigma, np.inf)
@@ -512,18 +512,16 @@ def _velocity(given: Given) -> Unknown | None:
 
 def _refraction(given: Given) -> Unknown | None:
     """Return the entry of the size of refraction."""
-    air = given.assumed.refraction
-    if air is None:
+    if (air := given.assumed.refraction) is None:
         return None
-    by_size = functools.partial(air.by_size, given.camera_from_icrf)
-    sigma = np.array([air.sigma_arcsec])
-    return Unknown('refraction', ('refraction_arcsec',), sigma, np.zeros(1), turn=by_size)
+    label, sigma = ('refraction_arcsec',), np.array([air.sigma_arcsec])
+    turn = functools.partial(air.by_size, given.camera_from_icrf)
+    return Unknown('refraction', label, sigma, np.zeros(1), turn=turn)
 
 
 def _site(given: Given) -> Unknown | None:
     """Return the entry of latitude and sidereal times."""
-    air = given.assumed.refraction
-    if air is None:
+    if (air := given.assumed.refraction) is None:
         return None
     turn, q = functools.partial(air.by_site, given.camera_from_icrf), len(air.labels)
     sigma = np.full(q, air.site_sigma_rad)
@@ -541,9 +539,8 @@ def _colour(given: Given) -> Unknown | None:
 
 def _readout(given: Given) -> Unknown | None:
     """Return the entry of the time of read-out, which a camera that turns shows."""
-    height = given.size[1]
     labels, sigma, offset, by_time = _timing(given, 'readout', *given.assumed.readout_s)
-    turn = functools.partial(_by_readout, by_time, height)
+    turn = functools.partial(_by_readout, by_time, given.size[1])
     return Unknown('readout', labels, sigma, offset, turn=turn)
 
 
@@ -581,11 +578,11 @@ def _errors_of_rates(given: Given) -> Unknown | None:
 
     In units of their priors.
     """
-    rates, height = given.rates, given.size[1]
+    rates = given.rates
     turns = rates.readout_s * rates.root_rad_s
     if np.abs(turns).max() < _NO_TURN_RAD or not np.isfinite(rates.rad_s).all():
         return None
-    turn = functools.partial(_by_readout, turns, height)
+    turn = functools.partial(_by_readout, turns, given.size[1])
     labels = ('rate_error_x', 'rate_error_y', 'rate_error_z')
     return Unknown('rates', labels, np.ones(3), np.zeros(3), of_image=True, turn=turn)
 
@@ -644,18 +641,16 @@ def _field(given: Given) -> Unknown:
     sigma = 1.0 / np.sqrt(np.bincount(octave)[octave])
     sigma = np.concatenate([sigma, sigma])
     octave = np.concatenate([octave, octave])
-    value = np.zeros(len(labels))
-    term = _next_lens_term(width, height)
     return Unknown(
         'field',
         labels,
         sigma,
-        value,
+        np.zeros(len(labels)),
         functions=functions,
         products=products,
         octave=octave,
         log_px=given.assumed.lens_log_px,
-        term=term,
+        term=_next_lens_term(width, height),
     )
 
 
@@ -686,23 +681,17 @@ def _next_lens_term(width: int, height: int) -> Floats:
 Option = tuple[str, str, float]
 """Option that may be stated, a plausible value, and its variance over that of the prior."""
 NO_OPTION: Option = '', '', 1.0
+_NO_PRIOR = 'estimated, no prior'
 
 
 @dataclass(frozen=True)
 class PriorTest:
     """
-    How the prior of an unknown is tested: by an estimate without it.
+    Test of the prior of an unknown, by an estimate without it, in words.
 
-    Attributes
-    ----------
-    starts : tuple of str
-        Starts of the names that its numbers have in the checks.
-    remedy : str
-        What to do where the stars contradict it.
-    is_added : bool
-        True if the number is what the stars add to a value that is stated.
-    as_stated : mapping
-        Label -> name and unit of what an operator states, where that is not the label.
+    The names of its numbers in the checks begin with ``starts``: labels, or by ``as_stated`` name
+    and unit of what an operator states.  ``is_added``: the number is what the stars add to a value
+    that is stated.  The remedy is for a prior that the stars contradict.
     """
 
     starts: tuple[str, ...] = ()
@@ -742,9 +731,7 @@ class Kind:
     cause: str = ''
     line: int = 9
     of_tracker: bool = False
-    assumption: Callable[[Layout, Floats, CalibrationOptions], str] = lambda *_: (
-        'estimated, no prior'
-    )
+    assumption: Callable[[Layout, Floats, CalibrationOptions], str] = lambda *_: _NO_PRIOR
     option: Callable[[Layout, CalibrationOptions], Option] = lambda *_: NO_OPTION
     remedy: str = ''
     in_state: bool = False

@@ -62,17 +62,19 @@ from starcal_ros.records import CameraGeometry
 # Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
 # thousand times the stated one, and of a milliarcsecond.
 FREE_FACTOR, EXACT_RAD = 1e3, 1e-3 * ARCSECOND_RAD
-_SIGMA_PER_MEDIAN = 1.5  # of the sizes of normal errors
-_CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
-_SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
-_ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
+_SIGMA_PER_MEDIAN = 1.5  # half of all normal errors are below 1 / 1.5 of their sigma
+_CLIP_SIGMA = 4.5  # one in 25,000 normal residuals is longer
+_SCALE_LIMITS = (0.05, 400.0)  # simulations have no noise, and some covariances mean nothing
+_ALIKE = 1e-9  # smaller determinants are rounding: all variances are equal
 _ROUNDS = 12
 _SETTLED = 1e-3
-_NODES = 5  # of the function of brightness, at quantiles
-_BINS = 500  # of magnitudes, over which the function is constant to a hundredth
+_NODES = 5  # the factor is linear between five quantiles of the magnitude
+_BINS = 500  # within such a part of the magnitudes the factor changes by a hundredth
 _STARS_PER_NODE = 40
-_NODE_SIGMA = 0.5  # of the logarithm of the factor at a node, before the data
-_LEAST_FREEDOM = 0.1  # of two axes: one star of few in an image
+_NODE_SIGMA = 0.5  # before the data a factor by brightness is known to half of itself
+_LEAST_FREEDOM = (
+    0.1  # a fit of few stars leaves less, and would inflate their residuals without bound
+)
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ class Data:
     stated_rad: Floats  # (3,)
     prior: CameraGeometry
     options: CalibrationOptions
-    rates: Rates  # of the first star tracker in its frame
+    rates: Rates  # in the frame of the first star tracker
     assumed: Assumptions
     groups: tuple[Groups, ...]
 
