@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from random_pointings import estimated, of_random_pointings  # type: ignore[import-not-found]
 
+from starcal_ground.planning.plan import prospect, target
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats, Indices
@@ -67,7 +68,7 @@ def solved(monkeypatch: pytest.MonkeyPatch, sigma_arcsec: float) -> Estimate:
 
 
 def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is estimated, in the budget with its cause, and its prior is tested."""
+    """It is estimated and planned for, its cause is in the budget, and its prior is tested."""
     found, options = solved(monkeypatch, 3.0), CalibrationOptions()
     layout, at = found.linear.layout, found.linear.layout.of(['mass'])
     assert layout.field_at[-1] == layout.count - 1  # the field stays the last
@@ -84,6 +85,9 @@ def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     (row,) = statements((total, dataclasses.replace(total, cause=part.cause)), found, options)
     assert (row.option, row.after_arcsec) == ('deflection_arcsec', 0.0)
     assert check_of(found).passed
+    wanted, more = target(found, 'deflection_arcsec'), deflected(of_random_pointings(3)).images[:1]
+    now, after = prospect(found, more, options).variances([0], wanted.squares)
+    assert after < now == pytest.approx(sigma**2)
 
 
 def test_the_check_of_a_prior_of_an_added_unknown_names_its_remedy(
