@@ -32,10 +32,11 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import Problem, State, whitened_attitude_errors
+from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, Refraction, unknowns_of
+from starcal_ros.estimation.unknowns import IMAGE_ROTATION, like, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
@@ -44,11 +45,12 @@ from starcal_ros.records import Ensemble, GateCheck, StarObservations
 from starcal_ros.text import significant
 
 MAP, LINE_OF_SIGHT = 'map', 'line_of_sight'
-_GROUPS = 20  # groups of stars by magnitude
+_GROUPS = 20  # each group of neighbours in magnitude has a twentieth of the information
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
 _SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
 _AT_ONCE = 32  # candidates: their rows take some 10 MB
-_TOLD = 1e-3  # least gain of information: a direction where each candidate adds less is left out
+# A direction of which each candidate adds less than a thousandth of what is known does not count.
+_LEAST_INFORMATION_GAIN = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +88,7 @@ def target(estimate: Estimate, name: str) -> Target:
         squares = of_map if name == MAP else of_pointing
         return Target(f'{name}_arcsec', squares, unresolved, ARCSECOND_RAD)
     if name not in layout.labels:
-        allowed = ', '.join([LINE_OF_SIGHT, MAP, *layout.labels[: layout.places['field'].start]])
+        allowed = ', '.join([LINE_OF_SIGHT, MAP, *layout.labels[: layout.field_at[0]]])
         raise OptionError(f'{name!r} is not estimated; a sigma to lower is one of: {allowed}')
     of_name = np.equal(layout.labels, name).astype(np.float64)
     return Target(name, np.diag(of_name), 0.0, 1.0)
@@ -201,7 +203,7 @@ def prospect(
         for _, place, rows in _rows(estimate, part, options):
             told = np.maximum(told, np.square(rows @ root[place]).sum(axis=1).max(axis=0))
     root = root[:, np.argsort(-told)]
-    changed = root[:, : max(int(np.sum(told > _TOLD)), 1)]
+    changed = root[:, : max(int(np.sum(told > _LEAST_INFORMATION_GAIN)), 1)]
     information = np.zeros((len(candidates), *changed.shape[1:] * 2))
     for k, part in enumerate(parts):
         for image, place, rows in _rows(estimate, part, options):
@@ -221,16 +223,10 @@ def _rows(
     problem, state = _as_estimated(estimate, candidates, options)
     camera, known, count = estimate.geometry.camera, estimate.linear.layout, len(candidates)
     rates = Rates(np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)))  # a camera at rest
-    readout, stamps = (float(len(known.of([name])) > 1) for name in ('readout', 'stamps'))
-    if readout or stamps:  # three turns, since no image has a rate
-        rates = dataclasses.replace(rates, rad_s=np.full((count, 3), np.nan))
-    air = None
-    if len(known.of(['site'])) == 2:  # latitude and one clock
-        zenith = np.array([image.zenith_icrf for image in candidates])
-        size = float(candidates[0].refraction_arcsec[0])
-        air = Refraction(np.zeros(count, np.int64), zenith, size, 1.0)
-    # The columns of what is in the list; the information of its priors is in the estimate.
-    assumed = Assumptions(float('velocity' in known), (0.0, readout), stamps, air)
+    zenith = np.array([image.zenith_icrf for image in candidates])
+    size_arcsec = float(candidates[0].refraction_arcsec[0])
+    air = Refraction(np.zeros(count, np.int64), zenith, size_arcsec, 1.0)
+    rates, assumed = like(known, rates, air)
     layout = unknowns_of(problem, state, rates, (camera.width, camera.height), assumed)
     place = [known.labels.index(label) for label in layout.labels]
     table = star_table(candidates)
@@ -247,9 +243,7 @@ def _rows(
         of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])
         shared[:, of_tracker[:, None], turning] = -J[chunk.image] @ turns[chunk.image]
         own[:, of_tracker, IMAGE_ROTATION] = J[chunk.image]
-        own[:, of_shape, layout.places['shape']] = np.diag(
-            1.0 / estimate.posterior.shapes.sigma_px
-        )
+        own[:, of_shape, layout.shape_at] = np.diag(1.0 / estimate.posterior.shapes.sigma_px)
         Q = np.linalg.qr(own)[0]
         yield chunk.image, place, shared - Q @ (Q.transpose(0, 2, 1) @ shared)
 

@@ -12,9 +12,16 @@ import numpy as np
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import of_held, REMEDIES, requirement_answers, REQUIREMENTS
+from starcal_ros.assessment.gate import (
+    of_held,
+    REMEDIES,
+    remedy_against,
+    requirement_answers,
+    REQUIREMENTS,
+)
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
@@ -154,7 +161,7 @@ def _against_sigma(calibration: records.Calibration) -> list[str]:
     scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
     for scope, of in scopes if calibration.has_alignment else scopes[:1]:
         largest = max(causes, key=lambda part: getattr(part, of))
-        remedy = REMEDIES.get(largest.cause)
+        remedy = remedy_against(largest.cause)
         if remedy:
             steps.append(
                 f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
@@ -204,7 +211,7 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
             f'varies by {_px(checks.image_variation_px)} in a corner; the calibration is that of'
             f' the mean over the {significant(minutes, 2)} minutes of the images',
             '',
-            REMEDIES['change from image to image'],
+            remedy_against(CHANGE),
         ),
     ]
 

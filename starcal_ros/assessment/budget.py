@@ -24,7 +24,7 @@ import math
 import numpy as np
 from scipy.linalg import qr
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives, grid_derivatives
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -32,27 +32,13 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.posterior import common_shape, ErrorParts, TRACKER_NOISE, TRACKER_SLOW
-from starcal_ros.estimation.unknowns import Layout
+from starcal_ros.estimation.unknowns import CHANGE, Layout, NO_OPTION, Option, UNKNOWNS
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, Statement, TOTAL
 from starcal_ros.text import significant
 
-_KNOWN_SHAPE_PX = 1e-7  # moves no pixel by a measurable amount
-_UNKNOWNS = {
-    'velocity': ('velocity',),
-    'refraction': ('refraction', 'site'),
-    'read-out': ('readout',),
-    'stamps': ('stamps',),
-    'field': ('field',),
-    'mountings': ('mountings',),
-    'lateral colour': ('colour',),
-    'temperature': ('focal', 'rate'),
-}
-"""Entries of the list of unknowns by cause."""
-_SIGMAS = {'stamps': 'stamp_sigma_s', 'mountings': 'star_tracker_mounting_sigma_arcsec'}
-"""Options that are a sigma, by cause: a tenth may be stated."""
-_WORTH_STATING = 0.9  # a statement that lowers the sigma by less is not worth stating
-_SHOWN = 3.0  # times its noise: a slow error of a star tracker that the images show
-_OF_TRACKERS = (TRACKER_NOISE, TRACKER_SLOW, 'mountings', 'stamps')
+_KNOWN_SHAPE_PX = 1e-7  # no star is measured to that
+_WORTH_STATING = 0.9  # a fall of the sigma by less than a tenth is not worth a statement
+_SHOWN = 3.0  # a slow error beyond three times the noise is in the images: no data sheet lowers it
 
 
 @dataclass(frozen=True)
@@ -82,19 +68,20 @@ def sigma_budget(
     seen, of_pixel = _seen(estimate)
     in_root = seen.turned(errors.root)
     unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
-    rows = _rows(estimate)
+    rows = estimate.linear.layout.line_of_sight_at
     part = np.ix_(rows, rows)
     of_rows = seen.turned(np.eye(len(errors.root))[:, rows])
     covariance = estimate.map_covariance.matrix
     held = of_rows.variances(covariance - estimate.posterior.covariance[part])
     shapes = _of_shapes(estimate, errors)
+    by_cause = _names_by_cause(estimate.linear.layout)
     common = common_shape(estimate.linear.layout, estimate.posterior.shapes.common_px2)
     causes = [
         _Cause('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
         *_unknowns(estimate, options, errors, in_root),
         _Cause(
-            'change from image to image',
-            _gain(errors, _known(errors, estimate, ['trend'], shapes), in_root)
+            CHANGE,
+            _gain(errors, _known(errors, estimate, by_cause.get(CHANGE, []), shapes), in_root)
             + seen.variances(common),
             _estimated(
                 float(np.linalg.norm(estimate.posterior.shapes.sigma_px)),
@@ -112,7 +99,7 @@ def sigma_budget(
     return tuple(
         dataclasses.replace(part, pointing_arcsec=part.map_arcsec)
         for part in found
-        if part.cause not in _OF_TRACKERS
+        if part.cause not in _causes_of_trackers()
     )
 
 
@@ -125,7 +112,7 @@ def statements(
     The variance of a cause that the stars do not show is in proportion to that of its prior.
     """
     total = next(part for part in parts if part.cause == TOTAL)
-    has_alignment = any(part.cause in _OF_TRACKERS for part in parts)
+    has_alignment = any(part.cause in _causes_of_trackers() for part in parts)
     scopes = (('camera', 'map_arcsec'), ('pointing', 'pointing_arcsec'))[: 1 + has_alignment]
     rows = []
     for part in parts:
@@ -143,38 +130,35 @@ def statements(
     return tuple(by_option.values())
 
 
-def _to_state(
-    cause: str, estimate: Estimate, options: CalibrationOptions
-) -> tuple[str, str, float]:
-    """
-    Return an option that is not stated, a usual value, and its variance over that assumed.
+def _causes_of_trackers() -> set[str]:
+    """Return the causes that no calibration of the camera alone has."""
+    of_unknowns = {kind.cause for kind in UNKNOWNS.values() if kind.of_tracker}
+    return {TRACKER_NOISE, TRACKER_SLOW, *of_unknowns}
 
-    The option is empty where there is nothing to state.
-    """
-    layout = estimate.linear.layout
+
+def _names_by_cause(layout: Layout) -> dict[str, list[str]]:
+    """Return the names of the shared unknowns of each cause, in the order of their lines."""
+    found: dict[str, list[str]] = {}
+    for entry in sorted(layout.shared, key=lambda entry: entry.kind.line):
+        if entry.kind.cause:
+            found.setdefault(entry.kind.cause, []).append(entry.name)
+    return found
+
+
+def _to_state(cause: str, estimate: Estimate, options: CalibrationOptions) -> Option:
+    """Return an option that is not stated, with a plausible value, or `NO_OPTION`."""
     if cause == TRACKER_SLOW and not options.star_tracker_slow_arcsec:
         noise = options.star_tracker_sigma_arcsec
         if not tracker_sigma_is_given(options):
             noise = tuple(estimate.star_tracker_sigma_rad / ARCSECOND_RAD)
         if _slow(estimate) > _SHOWN * max(noise):
-            return '', '', 1.0  # the images contradict the usual value
-        usual = 0.5 * min(noise)
-        return 'star_tracker_slow_arcsec', significant(usual, 2), (usual / _slow(estimate)) ** 2
-    if cause == 'velocity' and options.velocity_sigma_m_s < 0:
-        velocity = 'observer_velocity_m_s, or record the topic velocity'
-        return velocity, 'known to 10 m/s', (10.0 / layout['velocity'].sigma[0]) ** 2
-    if cause == 'read-out' and len(layout['readout']) > 1:  # no image has a rate
-        rates = 'star_tracker_rate_rad_s of the images'
-        if options.shutter == 'unknown':
-            return f'shutter, or {rates}', 'global, or known', 0.0
-        return rates, 'known', 0.0
-    if cause == 'read-out' and options.shutter == 'unknown':
-        return 'shutter (and readout_s)', 'global, or rolling with a known readout_s', 0.0
-    if cause == 'refraction' and not _is_sited(layout):
-        return 'latitude_deg and longitude_deg', 'known', 0.0
-    if option := _SIGMAS.get(cause):
-        return option, significant(0.1 * getattr(options, option), 2), 0.01
-    return '', '', 1.0
+            return NO_OPTION  # the images contradict the plausible value
+        slow = 0.5 * min(noise)
+        return 'star_tracker_slow_arcsec', significant(slow, 2), (slow / _slow(estimate)) ** 2
+    layout = estimate.linear.layout
+    names = _names_by_cause(layout).get(cause, [])
+    given = (layout[name].kind.option(layout, options) for name in names)
+    return next((option for option in given if option is not NO_OPTION), NO_OPTION)
 
 
 def _part(cause: _Cause) -> SigmaPart:
@@ -214,8 +198,9 @@ def _seen(estimate: Estimate) -> tuple[_Seen, Floats]:
     common = common_rotation(camera, grid)
     means, of_pixel = mean_squares(estimate, grid)
     found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
-    J = np.zeros((len(found.J), 3, estimate.linear.layout.count))
-    J[:, :, _rows(estimate)] = np.nan_to_num(found.of_shape(camera, common))
+    layout = estimate.linear.layout
+    J = np.zeros((len(found.J), 3, layout.count))
+    J[:, :, layout.line_of_sight_at] = np.nan_to_num(found.of_shape(camera, common))
     by_pixel = np.nan_to_num((found.by_pixel**2).sum(axis=(1, 2)))
     return _Seen(means, J), np.concatenate([[of_pixel, of_pixel], by_pixel])
 
@@ -231,16 +216,11 @@ def mean_squares(estimate: Estimate, grid: Derivatives | None = None) -> tuple[F
     grid = grid or grid_derivatives(camera)
     common, seen = common_rotation(camera, grid), np.isfinite(grid.directions[:, 0])
     squares = np.zeros((2, layout.count, layout.count))
-    rows = _rows(estimate)
+    rows = estimate.linear.layout.line_of_sight_at
     for k, J in enumerate((grid.of_shape(camera, common), grid.J)):
         flat = J[seen].reshape(-1, len(rows))
         squares[k][np.ix_(rows, rows)] = flat.T @ flat / np.count_nonzero(seen)
     return squares, float((grid.by_pixel[seen] ** 2).sum() / np.count_nonzero(seen))
-
-
-def _rows(estimate: Estimate) -> Indices:
-    """Return the places of the numbers of `lookup.Derivatives` among the shared unknowns."""
-    return estimate.linear.layout.of(['camera', 'alignment', 'field'])
 
 
 def _gain(errors: ErrorParts, T: Floats, seen: _Seen) -> Floats:
@@ -282,7 +262,8 @@ def _of_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
 
 def _noise(estimate: Estimate, errors: ErrorParts, shapes: Floats, seen: _Seen) -> Floats:
     """Return the variances (k,) by the noise of the centroids, all other causes absent."""
-    T = _known(errors, estimate, ['trend', *itertools.chain(*_UNKNOWNS.values())], shapes)
+    names = itertools.chain(*_names_by_cause(estimate.linear.layout).values())
+    T = _known(errors, estimate, list(names), shapes)
     noise = np.eye(T.shape[1]) + T.T @ (errors.excess - sum(errors.shared.values())) @ T
     return seen.variances(T @ noise @ T.T)
 
@@ -291,28 +272,17 @@ def _unknowns(
     estimate: Estimate, options: CalibrationOptions, errors: ErrorParts, seen: _Seen
 ) -> list[_Cause]:
     """Return the causes that are unknowns with a prior, or without one."""
-    layout, field = estimate.linear.layout, estimate.posterior.field
-
-    def text(name: str) -> str:
-        sigma = float(layout[name].sigma[0])
-        ppm = significant(1e6 * float(estimate.posterior.mean[layout.places[name]][0]), 3)
-        return {
-            'velocity': _of_velocity(sigma, layout[name].usual, options),
-            'refraction': f'{"air at the site" if _is_sited(layout) else "site not given"}:'
-            f' {significant(sigma, 3)} arcsec at 45 degrees assumed',
-            'readout': _of_readout(layout[name].labels[0], sigma, options),
-            'stamps': _of_stamps(layout[name].labels[0], sigma),
-            'field': _estimated(_field_px(estimate), field.likelihood_ratio),
-            'colour': f'estimated: {ppm} ppm of the scale per mag of BP - RP',
-            'mountings': f'{significant(sigma / ARCSECOND_RAD, 3)}″ per angle assumed',
-        }.get(name, 'estimated, no prior')
-
+    layout, found = estimate.linear.layout, estimate.posterior
     causes = []
-    for cause, entries in _UNKNOWNS.items():
-        given = [name for name in entries if name in layout]
-        if given:
-            gained = _gain(errors, _known(errors, estimate, given), seen)
-            causes.append(_Cause(cause, gained, text(given[0])))
+    for cause, names in _names_by_cause(layout).items():
+        if cause == CHANGE:
+            continue
+        entry = layout[names[0]]
+        text = entry.kind.assumption(layout, found.mean, options)
+        if entry is layout.field:
+            text = _estimated(_field_px(estimate), found.field.likelihood_ratio)
+        gained = _gain(errors, _known(errors, estimate, names), seen)
+        causes.append(_Cause(cause, gained, text))
     return causes
 
 
@@ -353,7 +323,7 @@ def _estimated(rms_px: float, likelihood_ratio: float) -> str:
 
 def _field_px(estimate: Estimate) -> float:
     """Return the RMS of the field over the detector, what is not known of it included."""
-    place = estimate.linear.layout.places['field']
+    place = estimate.linear.layout.field_at
     square = estimate.posterior.mean[place] ** 2 + np.diag(estimate.posterior.covariance)[place]
     return math.sqrt(0.5 * float(square.sum()))
 
@@ -362,35 +332,6 @@ def _of_stars(estimate: Estimate) -> str:
     variance = estimate.covariance_px2[estimate.kept][:, [0, 2]].mean()
     rms_px = significant(math.sqrt(variance), 2)
     return f'estimated: {rms_px} px rms of {int(estimate.kept.sum())} centroids'
-
-
-def _is_sited(layout: Layout) -> bool:
-    """Return True if the site of a camera on the ground is stated."""
-    return 'site' in layout and layout['site'].sigma[0] < layout['site'].widest
-
-
-def _of_velocity(sigma_m_s: float, usual_m_s: float, options: CalibrationOptions) -> str:
-    size = (
-        f'{significant(sigma_m_s / 1e3, 3)} km/s'
-        if sigma_m_s >= 1e3
-        else f'{significant(sigma_m_s, 3)} m/s'
-    )
-    if options.velocity_sigma_m_s >= 0:
-        return f'{size} per axis stated'
-    given = 'given' if math.isinf(usual_m_s) else 'no barycentric one given'
-    return f'{given}: {size} per axis assumed'
-
-
-def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:
-    if options.shutter != 'unknown' and not label.endswith('_rad'):
-        return f'{significant(1e3 * sigma, 3)} ms stated'
-    return 'shutter unknown: ' * (options.shutter == 'unknown') + _of_stamps(label, sigma)
-
-
-def _of_stamps(label: str, sigma: float) -> str:
-    if label.endswith('_rad'):  # the rate is not known
-        return f'rate not known: {significant(sigma / ARCSECOND_RAD, 3)}″ per axis assumed'
-    return f'{significant(1e3 * sigma, 3)} ms assumed'
 
 
 def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:

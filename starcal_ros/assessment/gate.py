@@ -20,6 +20,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import camera_at
+from starcal_ros.estimation.unknowns import CHANGE, prior_test_of, remedy_of
 from starcal_ros.options import option
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import (
@@ -344,7 +345,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     wrong = [one.name for one in found.statements if one.passed is False]
     # A distance that the evidence does not decide on may be the cause all the same.
     wrong += [t.name for t in found.held if t.distance > options.max_held_term_sigma]
-    remedy = REMEDIES['change from image to image']
+    remedy = remedy_of(CHANGE)
     yield limit_check(
         options,
         'max_image_variation_px',
@@ -384,15 +385,10 @@ def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
 
 def of_held(term: HeldTerm) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
-    kind = f'assumed {term.name.replace(" ", "_").partition("_")[0]}'
+    test = prior_test_of(term.name)
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-    departures = 'velocity', 'stamp', 'mounting', 'latitude', 'clock'
-    is_departure = kind.removeprefix('assumed ') in departures
     note = f'{estimated} by the stars, {assumed} assumed'
-    return (
-        f'the stars add {estimated} to it' if is_departure else note,
-        REMEDIES.get(kind, 'estimate it, or widen its prior (estimate, prior_sigma)'),
-    )
+    return f'the stars add {estimated} to it' if test.is_added else note, test.remedy
 
 
 def _group(part: ResidualBin) -> str:
@@ -557,7 +553,7 @@ class Requirement:
             return of_map + turned * (self.quantity == LINE_OF_SIGHT)
 
         causes = [part for part in calibration.sigma_budget if part.cause != TOTAL]
-        return REMEDIES.get(max(causes, key=variance).cause, '') if causes else ''
+        return remedy_against(max(causes, key=variance).cause) if causes else ''
 
     def _over(self, sigma: Floats) -> float:
         """Upper limit of a sigma over the share; NaN where it has none."""
@@ -603,7 +599,11 @@ def requirement_answers(calibration: Calibration) -> tuple[str, ...]:
     )
 
 
-_OF_SITE = 'check site and UTC, or state observer: ground alone'
+def remedy_against(cause: str) -> str:
+    """Remedy that lowers the part of a sigma by a cause; empty where there is none."""
+    return remedy_of(cause) or REMEDIES.get(cause, '')
+
+
 REMEDIES: Mapping[str, str] = {
     # Reasons to refuse images (`IMAGE_REFUSALS`).
     'bad_encoding': 'record images of one channel, 8 or 16 bit, raw, as PNG or JPEG',
@@ -638,28 +638,14 @@ REMEDIES: Mapping[str, str] = {
     'mounting of the prior': 'check the alignment assumed (prior_alignment) and the mounting',
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
-    # Assumed values that the stars contradict, by the start of their label, and faults they show.
-    'assumed velocity': 'correct it so; on the ground state observer: ground',
-    'assumed latitude': _OF_SITE,
-    'assumed clock': _OF_SITE,
-    'assumed readout': 'check shutter and readout_s',
-    'assumed stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
-    'assumed mounting': 'check more_alignments',
+    # Faults that the stars show.
     'detector step': 'columns or rows are lost or shifted there: check the read-out',
-    # Causes of the sigma of a line of sight (`SigmaPart.cause`).
+    # Causes of the sigma of a line of sight (`SigmaPart.cause`) that are no unknowns.
     'stars': 'take more images',
-    'velocity': 'state the velocity (topic, observer_velocity_m_s; photographs: observer)',
-    'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
-    'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
-    'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'use temperatures or one focus; unstated air (observer:'
-    ' ground) changes it',
     'star places': 'take images of other star fields, with a catalog that has proper motions',
-    'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
-    'temperature': 'take images over a wider range of temperatures',
     'star tracker noise': 'take more images',
     'star tracker slow error': 'take images in more attitudes; try starcal diagnose',
     'held parameters': 'estimate the held parameters (estimate)',
 }
-"""Name -> remedy; that of a check of the gate which failed is in its note."""
+"""Name -> remedy; that of a check which failed is in its note, that of an unknown in its row."""

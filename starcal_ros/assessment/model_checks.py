@@ -20,18 +20,13 @@ from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
+from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
-from starcal_ros.sky.astrometry import SIDEREAL_RAD_S
 
-_STATED = ('camera', 'mountings', 'velocity', 'site', 'readout', 'stamps')  # entries with a prior
-_AS_STATED = {  # label -> name and unit of what an operator states
-    'latitude_rad': ('latitude_deg', math.degrees(1.0)),
-    'sidereal_time_1_rad': ('clock_offset_min', 1.0 / (60.0 * SIDEREAL_RAD_S)),
-}
-_CLEAR_SIGMA = 5.0  # from a prior, beyond which the evidence is asked: the default of the gate
-_INNER = (0.1, 0.9)  # part of the detector: nearer the edge too few stars lie on one side
-_STEPS = 97  # places along each axis at which a step is looked for
-_STRIP = 1 / 24  # in widths: a sixth of the shortest wave of the field
+_CLEAR_SIGMA = 5.0  # the default of the gate: a conflict that fails must be in the evidence too
+_INNER = (0.1, 0.9)  # nearer to the border too few stars lie on one side
+_STEPS = 97  # five places in the width of a strip: a step between two loses a tenth of its size
+_STRIP = 1 / 24  # in widths: a sixth of the shortest wave of the field, which so takes no step
 
 
 def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:
@@ -63,9 +58,7 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
             'px',
             found.term.likelihood_ratio,
         ),
-        Amplitude(
-            'change from image to image', shape, 'px', found.shapes.amplitudes.likelihood_ratio
-        ),
+        Amplitude(CHANGE, shape, 'px', found.shapes.amplitudes.likelihood_ratio),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)
             for error in estimate.weights.errors
@@ -87,7 +80,7 @@ def _image_variation_px(estimate: Estimate) -> float:
     """1-sigma change of the camera from image to image in a corner, px."""
     camera = estimate.geometry.camera
     corner_px = 0.5 * math.hypot(camera.width, camera.height)
-    trend_px = estimate.posterior.mean[estimate.linear.layout.of(['trend'])]
+    trend_px = estimate.posterior.mean[estimate.linear.layout.trend_at]
     sigma_px = np.append(trend_px, np.exp(estimate.posterior.shapes.amplitudes.log_px))
     # Those of the focal length grow to the corner; the decentring is that of the corner.
     sigma_px[: len(trend_px) + 3] *= corner_px / float(camera.parameters[0])
@@ -106,11 +99,11 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     """
     Return unknowns that are held or have a stated prior, with what the stars ask for.
 
-    A held parameter is tested by its estimate with it free, an unknown with a prior by that
-    without the prior: what contradicts it moves other unknowns, first the field and the shapes of
-    the images, and hardly its own.  Free unknowns also fit what is of the lens: more than
-    `_CLEAR_SIGMA` counts where the data are as much likelier without the prior, and otherwise as
-    much as they are.  What the stars alone do not determine is listed too, with NaN.
+    Each prior is tested by estimating again without it, a held parameter by estimating it: the
+    field and the shapes of the images absorb the conflict, the unknown itself hardly moves.  Free
+    unknowns also fit errors of the lens: more than `_CLEAR_SIGMA` counts where the data are as
+    much likelier without the prior, and otherwise as much as they are.  What the stars alone do
+    not determine is listed too, with NaN.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
@@ -122,12 +115,17 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         by_stars = held + float(means[own]) + 0.0 * shown
         terms.append(HeldTerm(layout.labels[k], held, by_stars, math.sqrt(shown)))
     total, working = np.diag(found.covariance), np.diag(found.working)
-    first = layout.places['mountings'].start if 'mountings' in layout else layout.count
+    mountings = {
+        f'star_tracker_{k}_{axis}': (f'mounting of {one.frame} {axis}_deg', math.degrees(1.0))
+        for k, one in enumerate(estimate.star_trackers, 1)
+        for axis in 'xyz'
+    }
     for entry in layout.shared:
         at = layout.of([entry.name])
         tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
-        tested &= entry.widest > entry.sigma  # a prior that holds for any lens states nothing
-        if entry.name not in _STATED or not tested.any():
+        tested &= entry.widest > entry.sigma  # nobody states a prior as wide as any lens needs
+        test = entry.kind.tested
+        if test is None or not tested.any():
             continue
         means, variances, log_evidence = without_prior(
             estimate.sums, estimate.linear, entry.name, found
@@ -137,19 +135,16 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             shown = _or_nan(variance)
             off = float(layout.prior_offset[k] + mean) + 0.0 * shown
             # Errors that observations share are in both variances.
-            prior2 = min(1.0 / layout.prior_precision[k], entry.usual**2)
+            prior2 = min(1.0 / layout.prior_precision[k], entry.plausible_sigma**2)
             sigma = math.sqrt(prior2 + shown * total[k] / working[k])
-            is_far = math.isinf(entry.usual) and abs(off) > _CLEAR_SIGMA * sigma
+            is_far = math.isinf(entry.plausible_sigma) and abs(off) > _CLEAR_SIGMA * sigma
             evidence = gained if is_far and not gained > 0.5 * _CLEAR_SIGMA**2 else math.nan
             # What is not in the state is zero there, so far from its prior mean.
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
             if k in camera:
                 prior = float(problem.prior_parameters[k - camera[0]])
-            name, unit = _AS_STATED.get(layout.labels[k], (layout.labels[k], 1.0))
-            head = (k - first) // 3 + 1
-            if 1 <= head < len(estimate.star_trackers):
-                frame = estimate.star_trackers[head].frame
-                name, unit = f'mounting of {frame} {name[-1]}_deg', math.degrees(1.0)
+            label = layout.labels[k]
+            name, unit = {**mountings, **test.as_stated}.get(label, (label, 1.0))
             terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma, evidence))
     return tuple(terms)
 

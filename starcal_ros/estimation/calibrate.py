@@ -48,6 +48,7 @@ from starcal_ros.estimation.problem import (
     State,
     supported_terms,
 )
+from starcal_ros.estimation.refraction import Refraction, STATED_SITE_RAD, ZENITH_SIGMA_RAD
 from starcal_ros.estimation.search import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.shared_errors import observation_groups, pixel_variance_px2
 from starcal_ros.estimation.star_equations import (
@@ -69,23 +70,21 @@ from starcal_ros.estimation.unknowns import (
     IMAGE_ROTATION,
     Layout,
     moved,
-    Refraction,
-    STATED_SITE_RAD,
+    readout_rms_s,
     unknowns_of,
-    ZENITH_SIGMA_RAD,
 )
 from starcal_ros.estimation.weights import (
-    agree,
     CentroidVariance,
+    damped,
     Data,
     degrees_of_freedom,
     FREE_FACTOR,
+    has_converged,
     judge,
-    Judged,
     sky_rotations,
-    towards,
     tracker_attitudes,
     weighted_attitudes,
+    Weighting,
 )
 from starcal_ros.records import (
     CameraGeometry,
@@ -95,18 +94,17 @@ from starcal_ros.records import (
     TemperatureTerms,
 )
 
-_START_FLOOR_PX = 0.05  # replaced by the residuals; the size of those in good images
+_START_FLOOR_PX = 0.05  # good images leave about that much; the residuals replace it
 _ROBUST_SCALE = 3.0  # Cauchy loss, sigma: normal noise loses 3 % of its information
-_ROBUST_GAIN = 0.1  # the search ends at a step of half a sigma, where the posterior goes on
+_ROBUST_GAIN = 0.1  # steps of less than half a sigma are left to the posterior
 _ROUNDS = 24  # three or four are usual; principal points that stars hardly show take ten
-_STEP_SIGMA = 0.05  # converged when no unknown moves by more than this part of its sigma
-_LEAST_SHARE = 0.25  # smallest share of a step: a damped estimate must still arrive
-_IN_STATE = ('camera', 'focal', 'alignment', 'rate', 'mountings')
-_SPACE_VELOCITY_M_S = 20000.0  # 1-sigma per axis against the Earth: orbits about it and the Sun
-_USUAL_M_S = 8000.0  # low orbit about the Earth; stars that show five times it ask for a statement
-_UNKNOWN_READOUT_S = 0.02  # rolling shutters usually take 5 to 50 ms a frame
-_LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states the residual on the ground, not in flight
-_READOUT_ERROR = 0.01  # relative error of a stated time: tolerance of a clock, and rounding
+_STEP_SIGMA = 0.05  # a twentieth of a sigma changes no result: the state is at the minimum
+_LEAST_SHARE = 0.25  # smaller steps would not arrive within `_ROUNDS`
+_SPACE_VELOCITY_M_S = 20000.0  # against the Earth: orbits about both Earth and Sun have such
+_PLAUSIBLE_M_S = 8000.0  # orbits about the Earth are no faster
+_UNKNOWN_READOUT_S = 0.02  # a rolling shutter takes 5 to 50 ms a frame
+_LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states it on the ground; flight changes it
+_READOUT_ERROR = 0.01  # a data sheet rounds the time, and clocks have a tolerance
 
 
 @dataclass(frozen=True)
@@ -242,7 +240,9 @@ def estimate_calibration(
 def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) -> Estimate:
     """Return the estimate from a start."""
     table = data.table
-    judged = Judged(CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None)
+    judged = Weighting(
+        CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None
+    )
     measurements = arrange(table, judged.kept, judged.covariance_px2(table))
     solution = _robust_search(problem, start, measurements)
     state, iterations = solution.state, solution.iterations
@@ -264,13 +264,14 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.posterior)
-        if np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA and agree(judged, after, table):
+        is_settled = np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA
+        if is_settled and has_converged(judged, after, table):
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
-            state, judged = last.after, towards(judged, after, share)
-        # Where stars hardly show an unknown, whole steps overshoot to and fro, and so do weights:
-        # the part of the step before that is left shows the share that ends in the minimum.
+            state, judged = last.after, damped(judged, after, share)
+        # Steps of unknowns that stars hardly show oscillate, and so do weights: the ratio of
+        # successive steps damps them.
         if k:
             of_before = max(float(before_sigma @ before_sigma), 1e-300)
             rest = float(step_sigma @ before_sigma) / of_before
@@ -303,7 +304,7 @@ def _round(
     data: Data,
     problem: Problem,
     state: State,
-    judged: Judged,
+    judged: Weighting,
     residual_px: Floats,
     shape_px: Floats | float,
     before: _Round | None,
@@ -314,9 +315,9 @@ def _round(
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
     size = camera.width, camera.height
     readout_s = math.hypot(*data.assumed.readout_s)
-    if before and 'rates' in before.linear.layout and 'readout' in before.linear.layout:
-        at = before.linear.layout.places['readout'].start
-        readout_s = math.hypot(before.posterior.mean[at], before.posterior.working[at, at] ** 0.5)
+    if before:
+        last = before.posterior
+        readout_s = readout_rms_s(last.layout, last.mean, last.working, data.assumed)
     rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
     layout = unknowns_of(problem, state, rates, size, data.assumed)
     measurements = arrange(table, judged.kept, judged.working_px2(table))
@@ -325,7 +326,7 @@ def _round(
     found = posterior(sums, linear, shape_px, before.posterior if before else None)
     # Unknowns outside the state, such as a velocity, take their mean; the images follow both.
     shared = found.mean.copy()
-    shared[layout.of(_IN_STATE)] *= share
+    shared[layout.in_state] *= share
     own = found.equations.own - found.equations.back @ shared
     after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
     left_px = residuals_px(problem, after, table, found, size)
@@ -335,12 +336,12 @@ def _round(
 
 
 def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
-    """Return the priors that the options and the observations state."""
-    velocity_m_s, usual_m_s = options.velocity_sigma_m_s, math.inf
+    """Return the priors of what is stated by the options and the observations."""
+    velocity_m_s, plausible_m_s = options.velocity_sigma_m_s, math.inf
     if velocity_m_s < 0:
         velocity_m_s = float(np.max([image.velocity_sigma_m_s for image in ensemble.images]))
         if not math.isfinite(velocity_m_s):
-            velocity_m_s, usual_m_s = _SPACE_VELOCITY_M_S, _USUAL_M_S
+            velocity_m_s, plausible_m_s = _SPACE_VELOCITY_M_S, _PLAUSIBLE_M_S
     readout_s = {
         'global': (0.0, 0.0),
         'rolling': (options.readout_s, _READOUT_ERROR * abs(options.readout_s)),
@@ -361,7 +362,7 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
         site_rad = STATED_SITE_RAD if is_stated else ZENITH_SIGMA_RAD
         refraction = Refraction(stamps, zenith, float(size), float(sigma), site_rad)
     stamp_s = options.stamp_sigma_s
-    return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, usual_m_s)
+    return Assumptions(velocity_m_s, readout, stamp_s, refraction, lens, plausible_m_s)
 
 
 def _colours(table: StarTable, colours_of: Callable[[Indices], Floats] | None) -> Floats | None:
@@ -375,7 +376,7 @@ def _colours(table: StarTable, colours_of: Callable[[Indices], Floats] | None) -
 
 def _step_sigma(found: Posterior) -> Floats:
     """Return the steps of the shared unknowns of the state, in their sigmas."""
-    in_state = found.layout.of(_IN_STATE)
+    in_state = found.layout.in_state
     sigma = np.sqrt(np.diag(found.covariance)[in_state])
     steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
     return np.asarray(steps)
@@ -393,7 +394,7 @@ def _check_not_mirrored(state: State) -> None:
 
 def _field_of(found: Posterior, size: tuple[int, int]) -> DetectorField:
     """Return the field of a posterior on a detector (width, height)."""
-    coefficients = found.mean[found.layout.places['field']].reshape(2, -1)
+    coefficients = found.mean[found.layout.field_at].reshape(2, -1)
     return DetectorField(*size, FIELD_OCTAVES, coefficients)
 
 
@@ -421,7 +422,7 @@ def residuals_px(
         turn = np.zeros((3, len(table)))
         for entry in layout.entries:
             at = layout.places[entry.name]
-            if entry.camera is not None and entry.name not in _IN_STATE:
+            if entry.camera is not None and not entry.kind.in_state:
                 values = found.of_images[:, at] if entry.of_image else found.mean[None, at]
                 own += (entry.camera @ values[:, :, None])[:, :, 0]
             if entry.turn is not None:
@@ -439,7 +440,7 @@ def _result(
     data: Data,
     ensemble: Ensemble,
     last: _Round,
-    judged: Judged,
+    judged: Weighting,
     weights: Weights,
     iterations: int,
     termination: str,
@@ -459,8 +460,7 @@ def _result(
     geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
     covariance = _considered(found, problem)
     basic = layout.of(['camera', 'alignment'])
-    joint = layout.of(['camera', 'alignment', 'field'])
-    shared = layout.of(_IN_STATE)
+    joint, shared = layout.line_of_sight_at, layout.in_state
     names = tuple(layout.labels[k] for k in shared)
     asked = np.intersect1d(shared, found.estimated)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()

@@ -172,8 +172,8 @@ def star_rows(
     """
     layout = linear.layout
     E = chain(linear.problem, layout, linear.measurements.image_count).transpose(0, 2, 1)
-    at, field = seen_by_stars(layout), layout.of(['field'])
-    functions = layout['field'].functions
+    at, field = seen_by_stars(layout), layout.field_at
+    functions = layout.field.functions
     assert functions is not None
     (seen, to), (of_u, to_u), (of_v, to_v) = (
         (places := np.flatnonzero(np.isin(of, part)), np.searchsorted(part, of[places]))
@@ -215,9 +215,9 @@ def weighted_rows_by(
     layout = linear.layout
     E, at = chain(linear.problem, layout, linear.measurements.image_count), seen_by_stars(layout)
     by_root = E[:, :, : len(at)] @ root[at] + E[:, :, len(at) : -1] @ of_images
-    functions, r = layout['field'].functions, root.shape[1]
+    functions, r = layout.field.functions, root.shape[1]
     assert functions is not None
-    of_field = np.concatenate(np.split(root[layout.places['field']], 2), axis=1)
+    of_field = np.concatenate(np.split(root[layout.field_at], 2), axis=1)
     for chunk, Z in star_columns(linear):
         m, _, n = chunk.direction_icrf.shape
         wuu, wuv, wvv = chunk.whitener
@@ -295,8 +295,8 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
     C, c = blocks[:, own, own].copy(), blocks[:, own, -1].copy()
     B: Floats = np.zeros((m, C.shape[1], P))
     B[:, :, at] = blocks[:, own, stars]
-    if 'field' in layout:
-        field = np.arange(P)[layout.places['field']]
+    field = layout.field_at
+    if len(field):
         A[np.ix_(field, field)] = sums.field_information
         A[np.ix_(field, at)] = of_field[:, stars]
         A[np.ix_(at, field)] = A[np.ix_(field, at)].T

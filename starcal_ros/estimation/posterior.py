@@ -45,7 +45,7 @@ from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
-from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
+from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
 
 _WITHOUT = 1e3  # factor that removes a prior: no data sheet is off by so many sigma
 LEAST_SHAPE_PX = 1e-4  # to begin with
@@ -145,7 +145,7 @@ def posterior(
         At a state near this one: the search of amplitudes begins with its own.
     """
     layout = linear.layout
-    before = np.broadcast_to(before, len(layout['shape']))
+    before = np.broadcast_to(before, len(layout.shape))
     normal = arrow(sums, linear.problem, linear.state, layout)
     start = eliminated(normal, layout, before)
     solver = _Solver(layout)
@@ -187,12 +187,12 @@ def without_prior(
 
     With ``held`` only that number of the entry, which is held, is free.
 
-    The amplitudes are found again: field and shapes may hide that a prior is wrong.  A free trend
-    and a free velocity together would absorb errors of the lens, so the trend is held at its value
-    in ``near``, the posterior with the prior, with its cost.  The variance is that of the working
-    weights; infinite where it is larger than any possible one.
+    The amplitudes are estimated again: field and shapes may hide that a prior is wrong.  A free
+    trend and a free velocity would absorb errors of the lens, so the trend keeps its value of the
+    posterior ``near`` with the prior, and its cost.  The variance is that of the working weights;
+    infinite where stars show less than what is possible at all.
     """
-    at_trend = linear.layout.of(['trend'])
+    at_trend = linear.layout.trend_at
     trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
     cost = 0.5 * float(
         (stated * trend**2 - np.log(stated * np.diag(near.working)[at_trend])).sum()
@@ -201,8 +201,9 @@ def without_prior(
     for entry in linear.layout.entries:
         if entry.name == name:
             entry = dataclasses.replace(entry, sigma=_without_prior(entry, held))
-        elif entry.name == 'trend':
-            entry = dataclasses.replace(entry, sigma=_KEPT * entry.sigma, offset=-trend)
+        elif entry.kind.cause == CHANGE and not entry.of_image:
+            kept = near.mean[linear.layout.places[entry.name]]
+            entry = dataclasses.replace(entry, sigma=_KEPT * entry.sigma, offset=-kept)
         entries.append(entry)
     wide = Layout(tuple(entries))
     linear = dataclasses.replace(linear, layout=wide)
@@ -235,10 +236,10 @@ class _Solver:
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
         self.precision = layout.prior_precision
-        self.field = layout.of(['field'])
+        self.field = layout.field_at
         self.free = np.setdiff1d(np.flatnonzero(np.isfinite(self.precision)), self.field)
         self.estimated = np.concatenate([self.free, self.field])
-        field = layout['field']
+        field = layout.field
         assert field.octave is not None and field.term is not None
         self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
         self.first = field.log_px
@@ -318,17 +319,17 @@ def _shape_sums(
     columns = np.arange(blocks.shape[1])
     others = columns[rotation]
     weak = np.where(size > 0, 1e-9 * size, 1.0)[:, None] * np.ones(3)
-    if 'rates' in layout:
-        rates = columns[own][layout.places['rates']]
-        others = np.concatenate([others, rates])
-        weak = np.concatenate([weak, np.ones((len(weak), len(rates)))], axis=1)
+    for entry in layout.of_image:
+        if entry is not layout.shape:
+            others = np.concatenate([others, columns[own][layout.places[entry.name]]])
+            weak = np.concatenate([weak, np.tile(entry.sigma**-2.0, (len(weak), 1))], axis=1)
     C = blocks[:, others[:, None], others] + weak[:, :, None] * np.eye(len(others))
     back = np.linalg.solve(C, blocks[:, others])
     left = blocks - blocks[:, others].transpose(0, 2, 1) @ back
-    shape, total = columns[own][layout.places['shape']], left.sum(axis=0)
+    shape, total = columns[own][layout.shape_at], left.sum(axis=0)
     at = seen_by_stars(layout)  # the first columns
     precision, offset = solver.precision[at], layout.prior_offset[at]
-    free = np.flatnonzero(np.isfinite(precision) & ~np.isin(at, layout.of(['trend'])))
+    free = np.flatnonzero(np.isfinite(precision) & ~np.isin(at, layout.trend_at))
     return ShapeSums(
         left[:, shape[:, None], shape],
         left[:, shape, -1],
@@ -341,7 +342,7 @@ def _shape_sums(
 
 def common_shape(layout: Layout, common_px2: Floats) -> Floats:
     """Return the covariance (P, P) of the shapes that all images share, by the camera."""
-    camera, shapes = layout.places['camera'], layout['shape'].camera
+    camera, shapes = layout.places['camera'], layout.shape.camera
     assert shapes is not None
     free = np.isfinite(layout.prior_precision[camera])
     modes = shapes[0] * free[:, None]
@@ -407,7 +408,7 @@ def _root(
     M has the modes of the field that priors hold: errors of the observations move no mode that
     the observations do not determine.
     """
-    field = np.arange(layout.count)[layout.places['field']]
+    field = layout.field_at
     others = np.setdiff1d(estimated, field)
     values, vectors = np.linalg.eigh(covariance[np.ix_(field, field)])
     values, vectors = values[values > 0], vectors[:, values > 0]

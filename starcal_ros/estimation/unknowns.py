@@ -14,36 +14,27 @@ one for each.  There are three forms of derivative:
 An unknown may also turn the camera relative to the star tracker of an image (``tracker``): the
 alignment does, and the rotation of an image.
 
-To add an unknown, add its entry in `unknowns_of`.
-
-Refraction has three: its size, the latitude of the site and the sidereal time of each image.  They
-are there where the observations state a zenith, by a site and its clock or by the stars
-(`sky.astrometry`).  All images are of one site: their zeniths have one declination.  Where the
-site is stated, or they run as the stamps do, the sidereal times have one error.
+`UNKNOWNS` has a row for each: how its entry is made, its line in the budget of the sigma, and how
+its prior is tested.  To add an unknown, add its row.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
 from starcal_ros.camera.lens import LENSES
-from starcal_ros.constants import (
-    ARCSECOND_RAD,
-    FASTEST_M_S,
-    NANOSECONDS_PER_SECOND,
-    SPEED_OF_LIGHT_M_S,
-)
+from starcal_ros.constants import ARCSECOND_RAD, FASTEST_M_S, SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.amplitudes import UNSTATED
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import (
     image_alignment,
     mounting_errors_rad,
@@ -54,9 +45,11 @@ from starcal_ros.estimation.problem import (
     turn_derivatives,
     turns_chain,
 )
+from starcal_ros.estimation.refraction import Refraction, ZENITH_SIGMA_RAD
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.records import ALIGNMENT_NAMES
-from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
+from starcal_ros.sky.astrometry import SIDEREAL_RAD_S
+from starcal_ros.text import significant
 
 Turn = Callable[[Floats, Floats, Indices], Floats]
 """Small rotations (3, q, n) of stars by q unit unknowns, from pixels (2, n), directions in the
@@ -72,12 +65,13 @@ _FOCAL_MODES = {
     'shear_px': (0.0, 1.0, 0.0),
 }
 """Changes of fx, skew and fy."""
-_DECENTRING = ('p1', 'p2')  # an equidistant lens has none
-_TREND = 1e-4  # relative, rms over the images: a lens that warms by some degrees
-_SCALE_BY_COLOUR = 3e-4  # relative, per mag of BP - RP: 0.5 px in a corner, blue to red
-_NO_TURN_RAD = 1e-8  # within an image: 2 milliarcseconds
+_DECENTRING = ('p1', 'p2')  # lens models without them have no decentring
+_TREND = 1e-4  # a lens that warms by some degrees changes its focal length by that share, rms
+_SCALE_BY_COLOUR = 3e-4  # per mag of BP - RP: blue and red stars are 0.5 px apart in a corner
+_NO_TURN_RAD = 1e-8  # 2 milliarcseconds within an image move no estimate
 FIELD_OCTAVES = 3  # to a quarter of the width; a fourth takes 3.4 times as long (experiments.md)
-_SHOWN = 1e-2  # least singular value over the largest: none that only a border shows
+_SHOWN = 1e-2  # singular values below that share of the largest are shown by a border alone
+CHANGE = 'change from image to image'  # one line of the budget for the shapes and their trend
 
 
 @dataclass(frozen=True)
@@ -117,8 +111,8 @@ class Unknown:
         Rotation of the camera, as the star tracker of each image predicts it.
     widest : float or (q,)
         Largest 1-sigma that is possible at all, whatever a data sheet says.
-    usual : float
-        1-sigma of what is usual: what stars show to be much farther has to be stated.
+    plausible_sigma : float
+        What stars show to be much farther than this 1-sigma has to be stated.
     """
 
     name: str
@@ -136,7 +130,12 @@ class Unknown:
     term: Floats | None = None
     tracker: Floats | None = None
     widest: Floats | float = np.inf
-    usual: float = np.inf
+    plausible_sigma: float = np.inf
+
+    @property
+    def kind(self) -> Kind:
+        """Row of `UNKNOWNS`."""
+        return UNKNOWNS[self.name]
 
     def __len__(self) -> int:
         """Return the number of unknowns of the entry."""
@@ -158,7 +157,8 @@ class Layout:
     @functools.cached_property
     def shared(self) -> tuple[Unknown, ...]:
         """Entries with one value for all images; the field last."""
-        return tuple(entry for entry in self.entries if not entry.of_image)
+        shared = [entry for entry in self.entries if not entry.of_image]
+        return tuple(sorted(shared, key=lambda entry: entry.functions is not None))
 
     @functools.cached_property
     def of_image(self) -> tuple[Unknown, ...]:
@@ -205,6 +205,41 @@ class Layout:
         places = [np.arange(self.count)[self.places[name]] for name in names if name in self]
         return np.concatenate([np.empty(0, np.int64), *places])
 
+    @property
+    def field(self) -> Unknown:
+        """Entry of the field over the detector."""
+        return self['field']
+
+    @functools.cached_property
+    def field_at(self) -> Indices:
+        """Places of the coefficients of the field; none in a list without it."""
+        return self.of(['field'])
+
+    @property
+    def shape(self) -> Unknown:
+        """Entry of the changes of the camera from image to image."""
+        return self['shape']
+
+    @property
+    def shape_at(self) -> slice:
+        """Place of the shape among the unknowns of an image."""
+        return self.places['shape']
+
+    @functools.cached_property
+    def trend_at(self) -> Indices:
+        """Places of shared unknowns that change the camera from image to image."""
+        return self.of([entry.name for entry in self.shared if entry.kind.cause == CHANGE])
+
+    @functools.cached_property
+    def in_state(self) -> Indices:
+        """Places of the shared unknowns that the search moves."""
+        return self.of([entry.name for entry in self.shared if entry.kind.in_state])
+
+    @functools.cached_property
+    def line_of_sight_at(self) -> Indices:
+        """Places of the shared unknowns on which lines of sight depend."""
+        return self.of(['camera', 'alignment', 'field'])
+
     @functools.cached_property
     def prior_precision(self) -> Floats:
         """Diagonal (count,) of the prior's information on the shared unknowns."""
@@ -235,8 +270,8 @@ class Assumptions:
         About a zenith that is not known exactly; None: in space, or corrected.
     lens_log_px : float, float
         Logarithm of the residual of the lens: mean and 1-sigma.
-    usual_m_s : float
-        Usual velocity against the Earth where none is given.
+    plausible_m_s : float
+        Plausible velocity against the Earth where none is given.
     colour : (n,) or None
         Colour of the star of each observation, mag from their mean; None: not known.
     """
@@ -246,7 +281,7 @@ class Assumptions:
     stamp_s: float
     refraction: Refraction | None = None
     lens_log_px: tuple[float, float] = UNSTATED
-    usual_m_s: float = np.inf
+    plausible_m_s: float = np.inf
     colour: Floats | None = None
 
 
@@ -356,11 +391,27 @@ def moved(
     # The camera follows what the star tracker predicts, by large angles too.
     by = np.zeros_like(rotations)
     for entry in layout.shared:
-        if entry.tracker is not None and entry.name in ('alignment', 'rate', 'mountings'):
+        if entry.tracker is not None and entry.kind.in_state:
             by += np.einsum('mij,j->mi', entry.tracker, shared[places[entry.name]])
     predicted = image_alignment(problem, after) * image_alignment(problem, state).inv()
     own = Rotation.from_rotvec(by - rotations) * predicted * state.camera_from_icrf
     return dataclasses.replace(after, camera_from_icrf=own)
+
+
+@dataclass(frozen=True)
+class Given:
+    """Inputs of the entries: rates in the frame of the camera, size of the detector, px."""
+
+    problem: Problem
+    state: State
+    rates: Rates
+    size: tuple[int, int]
+    assumed: Assumptions
+
+    @property
+    def camera_from_icrf(self) -> Floats:
+        """Rotations (m, 3, 3) of the images."""
+        return np.asarray(self.state.camera_from_icrf.as_matrix())
 
 
 def unknowns_of(
@@ -380,114 +431,160 @@ def unknowns_of(
     size : (width, height)
         Of the detector, px.
     """
-    width, height = size
-    entries = [*unknowns_in_state(problem, state).entries, *_trend(problem, state)]
-    if assumed.velocity_m_s > 0:
-        entries.append(
-            Unknown(
-                'velocity',
-                ('velocity_x_m_s', 'velocity_y_m_s', 'velocity_z_m_s'),
-                np.full(3, assumed.velocity_m_s),
-                np.zeros(3),
-                turn=functools.partial(_by_velocity, state.camera_from_icrf.as_matrix()),
-                widest=FASTEST_M_S,
-                usual=assumed.usual_m_s,
-            )
-        )
-    if assumed.refraction is not None:
-        entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
-    if assumed.colour is not None:
-        label, sigma = ('scale_by_colour_per_mag',), np.array([_SCALE_BY_COLOUR])
-        turn = functools.partial(_by_scale, problem.model)
-        colour = Unknown('colour', label, sigma, np.zeros(1), turn=turn, of_star=assumed.colour)
-        entries.append(colour)
-    entries += _of_timing(rates, height, assumed)
-    entries.append(dataclasses.replace(_field(width, height), log_px=assumed.lens_log_px))
-    entries.append(_shape(problem, state, size))
-    entries += _errors_of_rates(rates, height)
-    return Layout(tuple(entry for entry in entries if len(entry)))
+    given = Given(problem, state, rates, size, assumed)
+    made = (kind.make(given) for kind in UNKNOWNS.values() if kind.make is not None)
+    entries = *unknowns_in_state(problem, state).entries, *made
+    return Layout(tuple(entry for entry in entries if entry is not None and len(entry)))
 
 
-def _shape(problem: Problem, state: State, size: tuple[int, int]) -> Unknown:
+def like(layout: Layout, rates: Rates, air: Refraction | None) -> tuple[Rates, Assumptions]:
+    """
+    Return rates and assumptions that give images at rest the columns of a list.
+
+    The sigmas are of no account: the information of the priors is in the list already.
+    """
+    readout, stamps = (float(len(layout.of([name])) > 1) for name in ('readout', 'stamps'))
+    if readout or stamps:  # three turns, since no image has a rate
+        rates = dataclasses.replace(rates, rad_s=np.full_like(rates.rad_s, np.nan))
+    air = air if len(layout.of(['site'])) == 2 else None  # latitude and one clock
+    return rates, Assumptions(float('velocity' in layout), (0.0, readout), stamps, air)
+
+
+def readout_rms_s(layout: Layout, mean: Floats, covariance: Floats, assumed: Assumptions) -> float:
+    """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
+    if not {'rates', 'readout'} <= set(layout.places):
+        return math.hypot(*assumed.readout_s)
+    at = layout.places['readout'].start
+    return math.hypot(mean[at], covariance[at, at] ** 0.5)
+
+
+def _shape(given: Given) -> Unknown:
     """
     Return the entry of the changes of the camera from image to image.
 
     A lens that warms changes its scale, one that sags or is turned its decentring, by p1 and p2
     where the lens model has them: 1 px displaces stars as far out as the corners by 1 to 3 px.
     """
+    problem, state = given.problem, given.state
     names = problem.parameter_names
     decentring = [name for name in _DECENTRING if name in names]
     labels = (*_FOCAL_MODES, *(f'{name}_px' for name in decentring))
     modes = np.zeros((problem.camera_count, len(labels)))
     modes[:3, :3] = np.array(list(_FOCAL_MODES.values())).T
     for k, name in enumerate(decentring, 3):
-        modes[names.index(name), k] = 4.0 * abs(state.parameters[0]) / math.hypot(*size) ** 2
+        modes[names.index(name), k] = 4.0 * abs(state.parameters[0]) / math.hypot(*given.size) ** 2
     count, m = len(labels), len(state.camera_from_icrf)
     camera = np.broadcast_to(modes, (m, *modes.shape))
     return Unknown('shape', labels, np.ones(count), np.zeros(count), of_image=True, camera=camera)
 
 
-def _trend(problem: Problem, state: State) -> list[Unknown]:
+def _trend(given: Given) -> Unknown | None:
     """
     Return the entry of a scale that changes in proportion to time, as that of a lens that warms.
 
     Changes that each image has by itself do not explain it as well as a velocity does where the
     line of sight turns slowly.  Where temperatures are given, the scale changes with them.
     """
+    problem, state = given.problem, given.state
     if len(state.focal) or not problem.time_s.any():
-        return []
+        return None
     late = problem.time_s / np.sqrt((problem.time_s**2).mean())
     modes = np.zeros((len(late), problem.camera_count, 1))
     modes[:, :3, 0] = np.outer(late, _FOCAL_MODES['scale_px'])
     sigma = np.array([_TREND * abs(float(state.parameters[0]))])
-    return [Unknown('trend', ('scale_trend_px',), sigma, np.zeros(1), camera=modes)]
+    return Unknown('trend', ('scale_trend_px',), sigma, np.zeros(1), camera=modes)
 
 
-def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:
-    """Return the entries of the size of refraction and of the site."""
-    sizes, q = np.array([air.sigma_arcsec]), len(air.labels)
-    by_size = functools.partial(air.by_size, camera_from_icrf)
-    by_site = functools.partial(air.by_site, camera_from_icrf)
-    site = np.full(q, air.site_sigma_rad)
-    return [
-        Unknown('refraction', ('refraction_arcsec',), sizes, np.zeros(1), turn=by_size),
-        Unknown('site', air.labels, site, np.zeros(q), turn=by_site, widest=ZENITH_SIGMA_RAD),
-    ]
+def _velocity(given: Given) -> Unknown | None:
+    """Return the entry of the velocity of the observer."""
+    if not given.assumed.velocity_m_s > 0:
+        return None
+    return Unknown(
+        'velocity',
+        ('velocity_x_m_s', 'velocity_y_m_s', 'velocity_z_m_s'),
+        np.full(3, given.assumed.velocity_m_s),
+        np.zeros(3),
+        turn=functools.partial(_by_velocity, given.camera_from_icrf),
+        widest=FASTEST_M_S,
+        plausible_sigma=given.assumed.plausible_m_s,
+    )
 
 
-def _of_timing(rates: Rates, height: int, assumed: Assumptions) -> list[Unknown]:
-    """Return the entries of the read-out and of the stamps: what a camera that turns shows."""
-    (mean, readout), stamps = assumed.readout_s, assumed.stamp_s
-    by_time = rates.rad_s[:, :, None]
-    labels: tuple[tuple[str, ...], ...] = ('readout_s',), ('stamp_offset_s',)
-    if not np.isfinite(by_time).all():  # the turns by one rate that all images may have
-        rate_rad_s = float(np.linalg.norm(rates.root_rad_s[0, 0]))
+def _refraction(given: Given) -> Unknown | None:
+    """Return the entry of the size of refraction."""
+    if (air := given.assumed.refraction) is None:
+        return None
+    label, sigma = ('refraction_arcsec',), np.array([air.sigma_arcsec])
+    turn = functools.partial(air.by_size, given.camera_from_icrf)
+    return Unknown('refraction', label, sigma, np.zeros(1), turn=turn)
+
+
+def _site(given: Given) -> Unknown | None:
+    """Return the entry of latitude and sidereal times."""
+    if (air := given.assumed.refraction) is None:
+        return None
+    turn, q = functools.partial(air.by_site, given.camera_from_icrf), len(air.labels)
+    sigma = np.full(q, air.site_sigma_rad)
+    return Unknown('site', air.labels, sigma, np.zeros(q), turn=turn, widest=ZENITH_SIGMA_RAD)
+
+
+def _colour(given: Given) -> Unknown | None:
+    """Return the entry of a scale that changes with the colour of the star."""
+    if given.assumed.colour is None:
+        return None
+    label, sigma = ('scale_by_colour_per_mag',), np.array([_SCALE_BY_COLOUR])
+    turn = functools.partial(_by_scale, given.problem.model)
+    return Unknown('colour', label, sigma, np.zeros(1), turn=turn, of_star=given.assumed.colour)
+
+
+def _readout(given: Given) -> Unknown | None:
+    """Return the entry of the time of read-out, which a camera that turns shows."""
+    labels, sigma, offset, by_time = _timing(given, 'readout', *given.assumed.readout_s)
+    turn = functools.partial(_by_readout, by_time, given.size[1])
+    return Unknown('readout', labels, sigma, offset, turn=turn)
+
+
+def _stamps(given: Given) -> Unknown | None:
+    """Return the entry of the offset of the stamps, which a camera that turns shows."""
+    labels, sigma, offset, by_time = _timing(given, 'stamp_offset', 0.0, given.assumed.stamp_s)
+    return Unknown('stamps', labels, sigma, offset, tracker=by_time)
+
+
+def _timing(
+    given: Given, name: str, mean_s: float, sigma_s: float
+) -> tuple[tuple[str, ...], Floats, Floats, Floats]:
+    """
+    Return labels, 1-sigma (q,), offset (q,) and turns (m, 3, q) of a time that is not known.
+
+    Without rates they are three turns, by one rate that all images may have.  Without labels the
+    camera turns in no image, or the time is known.
+    """
+    labels: tuple[str, ...] = (f'{name}_s',)
+    by_time = given.rates.rad_s[:, :, None]
+    if not np.isfinite(by_time).all():
+        rate_rad_s = float(np.linalg.norm(given.rates.root_rad_s[0, 0]))
         by_time = np.broadcast_to(np.eye(3), (len(by_time), 3, 3))
-        mean, readout, stamps = 0.0, rate_rad_s * math.hypot(mean, readout), rate_rad_s * stamps
-        labels = tuple(tuple(f'{of}_{k}_rad' for k in 'xyz') for of in ('readout', 'stamp_offset'))
-    if not by_time.any():
-        return []
-    entries, one = [], np.ones(by_time.shape[2])
-    if readout > 0:
-        turn = functools.partial(_by_readout, by_time, height)
-        entries.append(Unknown('readout', labels[0], readout * one, -mean * one, turn=turn))
-    if stamps > 0:
-        entries.append(Unknown('stamps', labels[1], stamps * one, 0.0 * one, tracker=by_time))
-    return entries
+        mean_s, sigma_s = 0.0, rate_rad_s * math.hypot(mean_s, sigma_s)
+        labels = tuple(f'{name}_{k}_rad' for k in 'xyz')
+    if not (by_time.any() and sigma_s > 0):
+        labels = ()
+    one = np.ones(len(labels))
+    return labels, sigma_s * one, -mean_s * one, by_time
 
 
-def _errors_of_rates(rates: Rates, height: int) -> list[Unknown]:
+def _errors_of_rates(given: Given) -> Unknown | None:
     """
     Return the entry of the errors of the rates: three turns of each image over its read-out.
 
     In units of their priors.
     """
+    rates = given.rates
     turns = rates.readout_s * rates.root_rad_s
     if np.abs(turns).max() < _NO_TURN_RAD or not np.isfinite(rates.rad_s).all():
-        return []
-    turn = functools.partial(_by_readout, turns, height)
+        return None
+    turn = functools.partial(_by_readout, turns, given.size[1])
     labels = ('rate_error_x', 'rate_error_y', 'rate_error_z')
-    return [Unknown('rates', labels, np.ones(3), np.zeros(3), of_image=True, turn=turn)]
+    return Unknown('rates', labels, np.ones(3), np.zeros(3), of_image=True, turn=turn)
 
 
 def _by_velocity(
@@ -525,12 +622,13 @@ def _by_readout(
     return np.asarray(np.take(turns.transpose(1, 2, 0), image, axis=2) * late)
 
 
-def _field(width: int, height: int) -> Unknown:
+def _field(given: Given) -> Unknown:
     """
     Return the entry of the field over the detector: coefficients of cosines.
 
     An amplitude of 1 px of an octave is its RMS over the detector along each axis.
     """
+    width, height = given.size
     terms, octave = cosine_terms(width, height, FIELD_OCTAVES)
 
     def functions(pixels: Floats) -> Floats:
@@ -543,17 +641,16 @@ def _field(width: int, height: int) -> Unknown:
     sigma = 1.0 / np.sqrt(np.bincount(octave)[octave])
     sigma = np.concatenate([sigma, sigma])
     octave = np.concatenate([octave, octave])
-    value = np.zeros(len(labels))
-    term = _next_lens_term(width, height)
     return Unknown(
         'field',
         labels,
         sigma,
-        value,
+        np.zeros(len(labels)),
         functions=functions,
         products=products,
         octave=octave,
-        term=term,
+        log_px=given.assumed.lens_log_px,
+        term=_next_lens_term(width, height),
     )
 
 
@@ -581,76 +678,233 @@ def _next_lens_term(width: int, height: int) -> Floats:
     return coefficients
 
 
-ZENITH_SIGMA_RAD = 1.0  # latitude and sidereal time unknown: anywhere above the horizon
-STATED_SITE_RAD = 0.01  # accuracy of a stated site and clock: 60 km, and two minutes
-_ONE_CLOCK_RAD = 1e-6
-_MOST_TIMES = 40  # images beyond it share the error of a sidereal time with their neighbours
+Option = tuple[str, str, float]
+"""Option that may be stated, a plausible value, and its variance over that of the prior."""
+NO_OPTION: Option = '', '', 1.0
+_NO_PRIOR = 'estimated, no prior'
 
 
 @dataclass(frozen=True)
-class Refraction:
+class PriorTest:
     """
-    Stamps (m,) and zeniths (m, 3) of images, and the size of refraction with its 1-sigma.
+    Test of the prior of an unknown, by an estimate without it, in words.
 
-    The size is that at a zenith distance of 45 degrees; ``site_sigma_rad`` is the 1-sigma of
-    latitude and sidereal time.
+    The names of its numbers in the checks begin with ``starts``: labels, or by ``as_stated`` name
+    and unit of what an operator states.  ``is_added``: the number is what the stars add to a value
+    that is stated.  The remedy is for a prior that the stars contradict.
     """
 
-    time_ns: NDArray[np.int64]
-    zenith_icrf: Floats
-    size_arcsec: float
-    sigma_arcsec: float
-    site_sigma_rad: float = ZENITH_SIGMA_RAD
-
-    @functools.cached_property
-    def times(self) -> Indices:
-        """Number (m,) of the error of the sidereal time of each image."""
-        m = len(self.zenith_icrf)
-        right_ascension = np.arctan2(self.zenith_icrf[:, 1], self.zenith_icrf[:, 0])
-        late_s = (self.time_ns - self.time_ns[0]) / NANOSECONDS_PER_SECOND
-        off = np.exp(1j * (right_ascension - right_ascension[0] - SIDEREAL_RAD_S * late_s))
-        is_stated = self.site_sigma_rad < ZENITH_SIGMA_RAD
-        if is_stated or np.abs(off - 1.0).max() < _ONE_CLOCK_RAD:
-            return np.zeros(m, np.int64)
-        return np.arange(m) * min(m, _MOST_TIMES) // m
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the unknowns of the site."""
-        times = range(int(self.times[-1]) + 1)
-        return ('latitude_rad', *(f'sidereal_time_{k + 1}_rad' for k in times))
-
-    def by_size(
-        self, camera_from_icrf: Floats, pixels: Floats, directions: Floats, image: Indices
-    ) -> Floats:
-        """Small rotations (3, 1, n) of stars by the size of refraction, per arcsec."""
-        del pixels
-        zenith = np.einsum('mij,mj->im', camera_from_icrf, self.zenith_icrf)[:, image]
-        turn = np.cross(zenith, directions, axis=0) / _cosine(zenith, directions)
-        return np.asarray(ARCSECOND_RAD * turn[:, None])
-
-    def by_site(
-        self, camera_from_icrf: Floats, pixels: Floats, directions: Floats, image: Indices
-    ) -> Floats:
-        """Small rotations (3, q, n) of stars by latitude and sidereal times, per rad."""
-        del pixels
-        pole = np.array([0.0, 0.0, 1.0])
-        east = np.cross(pole, self.zenith_icrf)
-        north = np.cross(self.zenith_icrf, east)
-        north /= np.maximum(np.linalg.norm(north, axis=1, keepdims=True), 1e-9)
-        zenith, by_latitude, by_time = (
-            np.einsum('mij,mj->im', camera_from_icrf, axis)[:, image]
-            for axis in (self.zenith_icrf, north, east)
-        )
-        cosine = _cosine(zenith, directions)
-        turns = np.zeros((3, len(self.labels), directions.shape[1]))
-        for row, change in ((0, by_latitude), (1 + self.times[image], by_time)):
-            moved = change - zenith * (np.sum(change * directions, axis=0) / cosine)
-            turn = np.cross(moved, directions, axis=0) / cosine
-            turns[:, row, np.arange(len(cosine))] = turn
-        return self.size_arcsec * ARCSECOND_RAD * turns
+    starts: tuple[str, ...] = ()
+    remedy: str = 'estimate it, or widen its prior (estimate, prior_sigma)'
+    is_added: bool = False
+    as_stated: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
 
 
-def _cosine(zenith: Floats, directions: Floats) -> Floats:
-    """Cosines (n,) of zenith distances, at least `LEAST_COSINE`."""
-    return np.asarray(np.maximum(np.sum(zenith * directions, axis=0), LEAST_COSINE))
+@dataclass(frozen=True)
+class Kind:
+    """
+    Row of `UNKNOWNS`: all that is known of an unknown before any data.
+
+    Attributes
+    ----------
+    make : callable or None
+        Returns its entry, or None where it has no effect.  None: `unknowns_in_state` makes it.
+    cause : str
+        Line of the budget of the sigma; empty: its variance is in that of the stars.
+    line : int
+        Place of that line among those of the unknowns.
+    of_tracker : bool
+        True if there is no such line without a star tracker.
+    assumption : callable
+        Text of that line by the list, the posterior mean (P,) and the options.
+    option : callable
+        What may be stated to lower the sigma, by the list and the options.
+    remedy : str
+        What else lowers it.
+    in_state : bool
+        True if the search moves it; otherwise it is zero in the state.
+    tested : PriorTest or None
+        None: the data do not test its prior.
+    """
+
+    make: Callable[[Given], Unknown | None] | None = None
+    cause: str = ''
+    line: int = 9
+    of_tracker: bool = False
+    assumption: Callable[[Layout, Floats, CalibrationOptions], str] = lambda *_: _NO_PRIOR
+    option: Callable[[Layout, CalibrationOptions], Option] = lambda *_: NO_OPTION
+    remedy: str = ''
+    in_state: bool = False
+    tested: PriorTest | None = None
+
+
+def _is_sited(layout: Layout) -> bool:
+    """Return True if the site of a camera on the ground is stated."""
+    return bool(layout['site'].sigma[0] < ZENITH_SIGMA_RAD)
+
+
+def _size(entry: Unknown, unit: str, size: float = 1.0) -> str:
+    return f'{significant(float(entry.sigma[0]) / size, 3)}{unit}'
+
+
+def _angle(entry: Unknown) -> str:
+    return _size(entry, '″', ARCSECOND_RAD)
+
+
+def _velocity_text(layout: Layout, _: Floats, options: CalibrationOptions) -> str:
+    entry = layout['velocity']
+    is_fast = entry.sigma[0] >= 1e3
+    size = f'{_size(entry, " km/s", 1e3) if is_fast else _size(entry, " m/s")} per axis'
+    if options.velocity_sigma_m_s >= 0:
+        return f'{size} stated'
+    is_given = math.isinf(entry.plausible_sigma)
+    return f'{"given" if is_given else "no barycentric one given"}: {size} assumed'
+
+
+def _velocity_option(layout: Layout, options: CalibrationOptions) -> Option:
+    if options.velocity_sigma_m_s >= 0:
+        return NO_OPTION
+    left = (10.0 / layout['velocity'].sigma[0]) ** 2
+    return 'observer_velocity_m_s, or record the topic velocity', 'known to 10 m/s', left
+
+
+def _refraction_text(layout: Layout, *_: object) -> str:
+    of_site = 'air at the site' if _is_sited(layout) else 'site not given'
+    return f'{of_site}: {_size(layout["refraction"], " arcsec")} at 45 degrees assumed'
+
+
+def _site_option(layout: Layout, _: CalibrationOptions) -> Option:
+    return NO_OPTION if _is_sited(layout) else ('latitude_deg and longitude_deg', 'known', 0.0)
+
+
+def _colour_text(layout: Layout, mean: Floats, _: CalibrationOptions) -> str:
+    ppm = significant(1e6 * float(mean[layout.places['colour']][0]), 3)
+    return f'estimated: {ppm} ppm of the scale per mag of BP - RP'
+
+
+def _readout_text(layout: Layout, _: Floats, options: CalibrationOptions) -> str:
+    entry = layout['readout']
+    if options.shutter == 'unknown':
+        return f'shutter unknown: {_time_text(entry)}'
+    return _time_text(entry) if len(entry) > 1 else f'{_size(entry, " ms", 1e-3)} stated'
+
+
+def _time_text(entry: Unknown) -> str:
+    if len(entry) > 1:  # three turns, where no rate is known
+        return f'rate not known: {_angle(entry)} per axis assumed'
+    return f'{_size(entry, " ms", 1e-3)} assumed'
+
+
+def _readout_option(layout: Layout, options: CalibrationOptions) -> Option:
+    is_unknown, rates = options.shutter == 'unknown', 'star_tracker_rate_rad_s of the images'
+    if len(layout['readout']) > 1 and is_unknown:  # no image has a rate
+        return f'shutter, or {rates}', 'global, or known', 0.0
+    if len(layout['readout']) > 1:
+        return rates, 'known', 0.0
+    known = 'global, or rolling with a known readout_s'
+    return ('shutter (and readout_s)', known, 0.0) if is_unknown else NO_OPTION
+
+
+def _a_tenth_of(option: str) -> Callable[[Layout, CalibrationOptions], Option]:
+    """Return that a tenth of an option that is a sigma may be stated."""
+    return lambda _, options: (option, significant(0.1 * getattr(options, option), 2), 0.01)
+
+
+UNKNOWNS: dict[str, Kind] = {
+    'camera': Kind(in_state=True, tested=PriorTest()),
+    'focal': Kind(
+        in_state=True,
+        cause='temperature',
+        line=8,
+        remedy='take images over a wider range of temperatures',
+    ),
+    'alignment': Kind(in_state=True),
+    'rate': Kind(in_state=True, cause='temperature', line=8),
+    'mountings': Kind(
+        in_state=True,
+        cause='mountings',
+        line=6,
+        of_tracker=True,
+        assumption=lambda layout, *_: f'{_angle(layout["mountings"])} per angle assumed',
+        option=_a_tenth_of('star_tracker_mounting_sigma_arcsec'),
+        remedy='state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
+        tested=PriorTest(('mounting',), 'check more_alignments', is_added=True),
+    ),
+    'trend': Kind(_trend, cause=CHANGE, line=0),
+    'velocity': Kind(
+        _velocity,
+        cause='velocity',
+        line=1,
+        assumption=_velocity_text,
+        option=_velocity_option,
+        remedy='state the velocity (topic, observer_velocity_m_s; photographs: observer)',
+        tested=PriorTest(
+            ('velocity',), 'correct it so; on the ground state observer: ground', is_added=True
+        ),
+    ),
+    'refraction': Kind(_refraction, cause='refraction', line=2, assumption=_refraction_text),
+    'site': Kind(
+        _site,
+        cause='refraction',
+        line=2,
+        option=_site_option,
+        tested=PriorTest(
+            ('latitude', 'clock'),
+            'check site and UTC, or state observer: ground alone',
+            is_added=True,
+            as_stated={
+                'latitude_rad': ('latitude_deg', math.degrees(1.0)),
+                'sidereal_time_1_rad': ('clock_offset_min', 1.0 / (60.0 * SIDEREAL_RAD_S)),
+            },
+        ),
+    ),
+    'colour': Kind(_colour, cause='lateral colour', line=7, assumption=_colour_text),
+    'readout': Kind(
+        _readout,
+        cause='read-out',
+        line=3,
+        assumption=_readout_text,
+        option=_readout_option,
+        remedy='state the shutter and its read-out time (shutter, readout_s)',
+        tested=PriorTest(('readout',), 'check shutter and readout_s'),
+    ),
+    'stamps': Kind(
+        _stamps,
+        cause='stamps',
+        line=4,
+        of_tracker=True,
+        assumption=lambda layout, *_: _time_text(layout['stamps']),
+        option=_a_tenth_of('stamp_sigma_s'),
+        remedy='state the uncertainty of the time stamps (stamp_sigma_s)',
+        tested=PriorTest(
+            ('stamp',),
+            'check stamp_offset_s and the clocks of camera and star tracker',
+            is_added=True,
+        ),
+    ),
+    'field': Kind(
+        _field,
+        cause='field',
+        line=5,
+        remedy='take more images with stars at other places on the detector',
+    ),
+    'shape': Kind(
+        _shape,
+        cause=CHANGE,
+        remedy='use temperatures or one focus; unstated air (observer: ground) changes it',
+    ),
+    'rates': Kind(_errors_of_rates),
+}
+"""Name -> row, in the order of the list: those in the state first."""
+
+
+def remedy_of(cause: str) -> str:
+    """Return the remedy against a cause that is an unknown; empty where there is none."""
+    remedies = (kind.remedy for kind in UNKNOWNS.values() if kind.cause == cause)
+    return next(filter(None, remedies), '')
+
+
+def prior_test_of(name: str) -> PriorTest:
+    """Return how a prior is tested that a check names so; a camera parameter where none fits."""
+    tests = (kind.tested for kind in UNKNOWNS.values() if kind.tested is not None)
+    return next((test for test in tests if name.startswith(test.starts)), PriorTest())

@@ -220,7 +220,7 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Weighting:
     """Conclusions from the residuals of a round: the weights of the next one."""
 
     variance: CentroidVariance
@@ -379,7 +379,7 @@ def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Float
     values[:, stars], values[:, own] = found.mean[seen_by_stars(layout)], found.of_images
     values[:, rotation] = 0.0
     c = blocks[:, rotation, -1] - np.einsum('mij,mj->mi', blocks[:, rotation], values)
-    c = c - (found.mean[layout.of(['field'])] @ sums.field_cross)[:, rotation]
+    c = c - (found.mean[layout.field_at] @ sums.field_cross)[:, rotation]
     diagonal = np.einsum('mii->mi', C)
     seen: Mask = np.asarray((diagonal > 0).all(axis=1))
     scale = np.where(seen[:, None], 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
@@ -423,10 +423,10 @@ def judge(
     from_sky: Floats,
     residual_px: Floats,
     freedom: Floats,
-    before: Judged,
+    before: Weighting,
     found: Posterior | None,
     attitudes: Attitudes | None = None,
-) -> Judged:
+) -> Weighting:
     """
     Return the weights that the residuals of a state ask for.
 
@@ -465,10 +465,10 @@ def judge(
         errors = shared_errors(
             residual_px, own_px2, kept, data.groups, from_sky, found.last_octave, floor
         )
-    return Judged(variance, errors, kept, attitudes)
+    return Weighting(variance, errors, kept, attitudes)
 
 
-def towards(one: Judged, other: Judged, share: float) -> Judged:
+def damped(one: Weighting, other: Weighting, share: float) -> Weighting:
     """
     Return the other conclusions, with weights a share of the way from one to the other.
 
@@ -495,7 +495,7 @@ def towards(one: Judged, other: Judged, share: float) -> Judged:
     return dataclasses.replace(other, variance=variance, attitudes=attitudes)
 
 
-def agree(one: Judged, other: Judged, table: StarTable) -> bool:
+def has_converged(one: Weighting, other: Weighting, table: StarTable) -> bool:
     """Return True if both lead to the same estimate."""
     if one.attitudes is None or other.attitudes is None:
         return False

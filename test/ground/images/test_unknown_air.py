@@ -30,7 +30,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.unknowns import Refraction
+from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import CameraGeometry, Ensemble, HeldTerm, StarObservations
 from starcal_ros.sky.astrometry import (

@@ -12,6 +12,7 @@ from sample_records import calibration  # type: ignore[import-not-found]
 from starcal_ros.assessment.gate import (
     reasons_of,
     REMEDIES,
+    remedy_against,
     Requirement,
     requirement_checks,
     requirements_of,
@@ -19,6 +20,7 @@ from starcal_ros.assessment.gate import (
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
+from starcal_ros.estimation.unknowns import UNKNOWNS
 from starcal_ros.records import Calibration, CameraGeometry, DetectorMaps, SigmaPart
 
 CAMERA = CameraModel(640, 512, np.r_[1800.0, 0.0, 1801.0, 319.5, 255.5, np.zeros(5)])
@@ -91,24 +93,25 @@ def test_what_is_missed_names_what_lowers_that_sigma_most() -> None:
     )
     texts = 'map=1e-3arcsec', 'line_of_sight=1arcsec', 'f=1e-3px', 'pointing=0.1arcsec'
     notes = [check.note.partition('; ')[2] for check in requirement_checks(found, texts)]
-    slow = REMEDIES['star tracker slow error']
+    slow = remedy_against('star tracker slow error')
     assert notes == ['take more images', 'take more images', 'take more images', slow]
     # A calibration of an earlier version has no causes at pixels.
     parts = [dataclasses.replace(part, map_over_detector_arcsec=()) for part in found.sigma_budget]
     without = dataclasses.replace(found, sigma_budget=tuple(parts))
     notes = [check.note.partition('; ')[2] for check in requirement_checks(without, texts)]
-    assert notes == [REMEDIES['read-out'], slow, REMEDIES['read-out'], slow]
+    assert notes == [remedy_against('read-out'), slow, remedy_against('read-out'), slow]
 
 
 def test_the_reason_that_a_requirement_is_missed_has_at_most_200_characters() -> None:
     maps = DetectorMaps(np.ones((10, 10), np.int64), 1234.5 * CELLS, 123.45 * CELLS)
     texts = 'line_of_sight=1234arcsec', 'map=123.4arcsec@99.5%', 'pointing=1.234arcsec'
     causes = list(REMEDIES)[list(REMEDIES).index('stars') :]
-    for cause in (*causes, 'colour'):  # the last has no remedy
+    causes += {kind.cause for kind in UNKNOWNS.values() if kind.cause}
+    for cause in (*causes, 'other'):  # some have no remedy
         parts = with_causes(SigmaPart(cause, 1.0, 9.0, ''))
         reasons = reasons_of(requirement_checks(dataclasses.replace(parts, maps=maps), texts))
         assert len(reasons) == 3 and max(map(len, reasons)) <= 200
-        assert all(reason.endswith(REMEDIES.get(cause, 'arcsec')) for reason in reasons)
+        assert all(reason.endswith(remedy_against(cause) or 'arcsec') for reason in reasons)
 
 
 @pytest.mark.parametrize('held', [0, 2])

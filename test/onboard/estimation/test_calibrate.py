@@ -462,15 +462,15 @@ def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
     none = np.zeros((table.image_count, 3))
     attitudes = Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, ())
 
-    def judged(variance_px2: float, stars: Indices) -> weights.Judged:
+    def judged(variance_px2: float, stars: Indices) -> weights.Weighting:
         share_px2 = np.full(len(stars), variance_px2)
         error = SharedError('star places', stars, share_px2, 0.0, True, 1.0)
-        return weights.Judged(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
+        return weights.Weighting(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
 
     once = dataclasses.replace(table, star=np.arange(len(table)))
-    assert weights.agree(judged(4e-6, once.star), judged(2e-6, once.star), once)
+    assert weights.has_converged(judged(4e-6, once.star), judged(2e-6, once.star), once)
     often = dataclasses.replace(table, star=np.zeros(len(table), np.int64))
-    assert not weights.agree(judged(4e-6, often.star), judged(2e-6, often.star), often)
+    assert not weights.has_converged(judged(4e-6, often.star), judged(2e-6, often.star), often)
 
 
 def test_images_follow_a_velocity_in_a_partial_step(monkeypatch: pytest.MonkeyPatch) -> None:
