@@ -234,18 +234,18 @@ def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
         np.testing.assert_allclose(number, numbers_of(written)[name], rtol=1e-9, err_msg=name)
 
 
-def test_an_inspection_reads_as_a_calibration(
+def test_a_diagnosis_reads_as_a_calibration(
     bag: Path, expected: Calibration, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before the images that matched nothing are measured again."""
     capsys.readouterr()
-    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), '--json']) == 0
-    shown = capsys.readouterr()
-    contents = json.loads(shown.out)
+    main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), '--json'])
+    shown = json.loads(capsys.readouterr().out)
+    contents = shown['contents']
     unmatched = {group['reason']: group['count'] for group in contents['refused']}
     assert set(unmatched) <= {'no_match'}
-    assert contents['status']['images'] + sum(unmatched.values()) == expected.images_used
-    assert ('prior_alignment is not given: found [' in shown.err) == (not unmatched)
+    assert len(contents['stars_per_image']) + sum(unmatched.values()) == expected.images_used
+    assert (shown['cause'] == 'prior_alignment') == (not unmatched)
 
 
 @pytest.mark.parametrize(
@@ -255,10 +255,10 @@ def test_an_inspection_reads_as_a_calibration(
         (('--observations-topic', 'other'), 'no topic other of type'),
     ],
 )
-def test_an_inspection_lists_the_topics_where_one_is_wrong(
+def test_a_diagnosis_lists_the_topics_where_one_is_wrong(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, str], problem: str
 ) -> None:
     bag = unaligned(tmp_path)
-    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
+    assert main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
     shown = capsys.readouterr().out
     assert '/opnav/image_raw' in shown and problem in shown
