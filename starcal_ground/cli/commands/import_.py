@@ -22,7 +22,6 @@ from pathlib import Path
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
-from starcal_ground.file_kinds import matching
 from starcal_ros.errors import OptionError
 from starcal_ros.text import counted
 
@@ -123,6 +122,8 @@ def _names(paths: Sequence[Path]) -> str:
 
 def _expanded(patterns: Sequence[str]) -> list[Path]:
     """Files of patterns, each once, in order of their names."""
+    from starcal_ground.file_kinds import matching
+
     files: dict[Path, None] = {}
     for pattern in patterns:
         if not (found := matching(Path(pattern))):
