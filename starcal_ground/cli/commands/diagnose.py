@@ -44,14 +44,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.images.first_setup import first_setup
+    from starcal_ground.images.first_setup import source_of
     from starcal_ground.source_diagnosis import examine, without_setup
 
     given = arguments.given(args)
-    setup, _ = given.checked()
+    _ = given.checked  # a bad option is bad input; a set-up that is not found is diagnosed
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         try:
-            first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
+            first = source_of(given, Path(name), Path(name), arguments.print_notes)
         except (NotFromStars, OptionError, BagError) as error:
             if given.photographs:
                 raise

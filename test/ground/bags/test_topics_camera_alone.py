@@ -12,7 +12,8 @@ import yaml
 
 from starcal_ground import calibrate_bag
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.bags import reader
+from starcal_ground.bags import reader, topics
+from starcal_ground.bags.topics import Topics
 from starcal_ground.cli.main import main
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.errors import BagError
@@ -25,6 +26,7 @@ from starcal_ros.formats.messages.message_codec import (
 )
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
+from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
@@ -153,8 +155,10 @@ def test_the_camera_alone_is_calibrated_where_it_is_requested(
     assert not repeated.has_alignment
     name = 'observations_sha256'
     assert repeated.provenance[name] == made.provenance[name]
+    assert calibrate_bag(out, TINY / 'params.yaml').provenance[name] == made.provenance[name]
+    recorded, setup = Topics(observations='/observations'), read_setup(TINY / 'params.yaml')
     with pytest.raises(BagError, match='of a camera alone, where a star tracker is set up'):
-        calibrate_bag(out, TINY / 'params.yaml')
+        list(topics.read([Path(out)], recorded, setup))
 
 
 @pytest.mark.parametrize('command', ['diagnose', 'diagnose --params', 'calibrate --params'])
