@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from starcal_ground.api import (
         calibrate,
         calibrate_bag,
+        calibrate_images,
         calibrate_with_residuals,
         observations_of,
         write_calibration,
     )
     from starcal_ground.comparison import compare
-    from starcal_ground.images.night_sky import calibrate_images
     from starcal_ground.products import read_residuals
     from starcal_ground.report.page import plot
     from starcal_ros import (
@@ -74,7 +74,7 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
     _MODULES = {
         'calibrate': 'api',
         'calibrate_bag': 'api',
-        'calibrate_images': 'images.night_sky',
+        'calibrate_images': 'api',
         'calibrate_with_residuals': 'api',
         'compare': 'comparison',
         'observations_of': 'api',

@@ -12,13 +12,14 @@ from collections.abc import Iterable, Sequence
 import dataclasses
 import hashlib
 from pathlib import Path
+import tempfile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcal_ground.bags import reader
-from starcal_ground.bags.topics import Topics, without_attitudes
-from starcal_ground.campaign import calibrate_bags
+from starcal_ground import campaign
+from starcal_ground.bags.topics import Topics
+from starcal_ground.images.first_setup import Given, source_of
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.predictions import Residuals
@@ -28,7 +29,7 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.products import product_files
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, read_values
+from starcal_ros.pipeline.setup import load_setup, read_values
 from starcal_ros.pipeline.solve import inputs_of
 from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
 from starcal_ros.records import Calibration, CameraGeometry, StarObservations
@@ -243,7 +244,8 @@ def calibrate_bag(
     bags : path or sequence of paths
         Files or folders of bags.
     params : path
-        ROS parameter file with the prior camera, the prior alignment and all other options.
+        ROS parameter file with the prior camera, the prior alignment and all other options; what
+        it does not state is found by the stars.
     image_topic, attitude_topic, velocity_topic, temperature_topic, observations_topic : str
         Needed where a bag has more than one topic of the type.
 
@@ -267,12 +269,54 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
-    if without_attitudes(paths, requested, read_values(Path(params))):
+    given = Given(paths, requested, read_values(Path(params)), Path(params))
+    if given.is_by_stars:
         raise OptionError(f'{paths[0]}: no attitudes; starcal_ground.calibrate_images needs none')
-    setup = read_setup(Path(params))
-    named = files_of(setup.frames).values()
-    inputs = inputs_of((*reader.mcap_files(paths), Path(params), *named))
-    return calibrate_bags(paths, setup, requested, inputs).calibration
+    return _calibrated(given)
+
+
+def calibrate_images(
+    images: Path | str | Sequence[Path | str], *, image_topic: str = '', **options: object
+) -> Calibration:
+    """
+    Calibration of a camera from images of the sky alone; nothing is written.
+
+    Parameters
+    ----------
+    images : path or sequence of paths
+        FITS, JPEG, PNG or TIFF files, folders of them, or patterns; or MCAP bags, whose attitudes
+        are not used.
+    image_topic : str
+        Needed where a bag has more than one topic of images.
+    **options
+        Options of a parameter file by name.
+
+    Returns
+    -------
+    Calibration
+        Of the camera alone: ``has_alignment`` is False.
+
+    Raises
+    ------
+    StarcalError
+        One line that names the cause, and the images to take.
+
+    Examples
+    --------
+    >>> import starcal_ground
+    >>> calibration = starcal_ground.calibrate_images('bags/tiny')  # its attitudes are not used
+    >>> calibration.has_alignment, calibration.images_used
+    (False, 10)
+    """
+    paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
+    return _calibrated(Given(paths, Topics(image=image_topic), options, camera_alone=True))
+
+
+def _calibrated(given: Given) -> Calibration:
+    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
+        first = source_of(given, Path(name), Path(name))
+        observed = campaign.observe(campaign.chosen(first.source))
+        return campaign.calibrate(observed, inputs_of(first.files)).calibration
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:

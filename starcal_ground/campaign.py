@@ -234,13 +234,3 @@ def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:
             detail = f' ({group.detail})' if group.detail else ''
             count = f'{group.count} of {counted(len(observations), "image")}'
             yield f'{count} refused, {group.reason}: {group.meaning}{detail}'
-
-
-def calibrate_bags(
-    bags: Sequence[Path],
-    setup: Setup,
-    requested: Topics,
-    inputs: Mapping[str, str] | None = None,
-) -> Campaign:
-    """Calibration of bags by `chosen`, `observe` and `calibrate`, with their errors."""
-    return calibrate(observe(chosen(Source(tuple(bags), requested, setup))), inputs)

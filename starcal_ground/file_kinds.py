@@ -17,7 +17,7 @@ from starcal_ros.untrusted import regular_file
 _START_BYTES = 64
 IMAGES_READ = 'FITS, TIFF, PNG, JPEG, camera raw'
 _OF_IMAGES = (
-    ': starcal calibrate, inspect, diagnose and plan take images alone; starcal import makes a bag'
+    ': starcal calibrate, diagnose and plan take images alone; starcal import makes a bag'
     ' of image files and attitudes'
 )
 _NOR_IMAGES = f', nor images ({IMAGES_READ}), which calibrate takes'

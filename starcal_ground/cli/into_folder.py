@@ -170,8 +170,8 @@ def _drawn(
 
 def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ground.diagnosis.bags import of_most, refusals
-    from starcal_ground.planning.inspect import cause_of
+    from starcal_ground.diagnosis.bags import refusals
+    from starcal_ground.source_diagnosis import cause_of_refusals
 
     source, count = observed.source, len(observed.observations)
     groups = refusals(observed.observations)
@@ -181,9 +181,7 @@ def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
     named = tuple(map(str, source.bags))
-    cause = None
-    if of_most(groups, count):
-        cause = cause_of(source.bags, source.topics, source.setup, groups, count)
+    cause = cause_of_refusals(observed)
     if cause is None:
         return NotCalibrated(words, named, refused)
     command = 'starcal diagnose' if source.setup.has_tracker else ''

@@ -25,7 +25,7 @@ from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import missing_package, StarcalError
 
 COMMANDS = (
-    *('demo', 'calibrate', 'inspect', 'diagnose', 'compare', 'plan', 'report', 'lookup'),
+    *('demo', 'calibrate', 'diagnose', 'compare', 'plan', 'report', 'lookup'),
     *('play', 'monitor', 'simulate', 'export', 'import', 'catalog', 'trend'),
 )
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
@@ -54,6 +54,8 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with status 2."""
+        if "invalid choice: 'inspect'" in message:  # a command of development versions
+            message = 'inspect: no such command: starcal diagnose lists the contents of a bag'
         unknown = re.search(r'unrecognized arguments: --([^ =]+)', message)
         name = unknown[1].replace('-', '_') if unknown else ''
         if self.has_set and name in _options():

@@ -104,7 +104,8 @@ class Given:
                 return options_of(self.options) if self.camera_alone else None
         return None
 
-    def checked(self) -> tuple[Setup | None, list[Path]]:
+    @functools.cached_property
+    def checked(self) -> tuple[Setup | None, tuple[Path, ...]]:
         """
         The setup of bags with attitudes where the camera is stated, and the files of the options.
 
@@ -126,7 +127,7 @@ class Given:
             else:
                 setup = load_setup(self.options)
                 frames = setup.frames
-        return setup, [*filter(None, [self.params]), *files_of(frames).values()]
+        return setup, (*filter(None, [self.params]), *files_of(frames).values())
 
     @contextlib.contextmanager
     def with_place(self) -> Iterator[None]:
@@ -213,15 +214,14 @@ def _in_a_line(value: object) -> str:
     return yaml.safe_dump([value], default_flow_style=True, width=math.inf).strip()[1:-1]
 
 
-def first_setup(
+def source_of(
     given: Given,
-    stated: Setup | None,
     folder: Path,
     bag_folder: Path,
     on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
 ) -> FirstSetup:
     """
-    Set-up of what is given; ``stated`` is that of `Given.checked`.
+    Source and set-up of any inputs: bags with attitudes or without, observations, photographs.
 
     A camera that is found is written to a folder, bags of images and of the attitudes of their
     stars to ``bag_folder``; ``on_notes`` is told of files that are left out, before the search.
@@ -229,20 +229,22 @@ def first_setup(
     Raises NotFromStars when the stars give no camera. Raises BagError when a bag cannot be read,
     or several topics have a type. Raises OptionError for options that do not go together.
     """
-    files = list(filter(None, [given.params]))
-    if given.is_by_stars:
-        from starcal_ground.images import night_sky  # the search of the sky is seldom needed, slow
-
-        with given.with_place():
-            source, images = night_sky.from_images(
-                given.paths, given.topics, given.options, bag_folder, given.lens, on_notes
-            )
-        return FirstSetup(given, source, (*images, *files))
-    read = (*reader.mcap_files(given.paths), *files)
+    setup, stated = given.checked
     with given.with_place():
-        setup, found = (stated, ()) if stated else _of_attitudes(given, folder)
-    source = Source(tuple(given.paths), given.topics, setup, air_of(setup), found)
-    return FirstSetup(given, source, read)
+        if not given.is_by_stars:
+            setup, found = (setup, ()) if setup else _of_attitudes(given, folder)
+            source = Source(tuple(given.paths), given.topics, setup, air_of(setup), found)
+            return FirstSetup(given, source, (*reader.mcap_files(given.paths), *stated))
+        from starcal_ground.images import night_sky  # the search of the sky is slow to load
+
+        if not given.photographs:
+            of_bags = given.paths, given.topics, given.options, bag_folder, given.lens
+            source = night_sky.from_bags(*of_bags)
+            return FirstSetup(given, source, (*reader.mcap_files(given.paths), *stated))
+        photographs, notes = night_sky.photographs_of(given.photographs, *given.lens)
+        on_notes(notes)
+        source = night_sky.from_photographs(photographs, given.options, bag_folder)
+        return FirstSetup(given, source, (*(one.path for one in photographs), *stated))
 
 
 def air_of(setup: Setup) -> ThroughAir | None:
@@ -258,7 +260,7 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     """Setup of bags with attitudes whose camera is not stated, and sentences on it."""
     from starcal_ground.diagnosis.bags import diagnose_bags
     from starcal_ground.diagnosis.diagnose import found_alignment
-    from starcal_ground.images import from_stars, night_sky  # as in `first_setup`
+    from starcal_ground.images import from_stars, night_sky  # as in `source_of`
 
     if choose_topics(given.paths, given.topics).observations:
         raise OptionError(

@@ -8,13 +8,12 @@ calibration of these bags is the same as that of any bag.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 import functools
 import itertools
 import math
 from pathlib import Path
-import tempfile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +22,7 @@ from starcal_ground.bags import reader
 from starcal_ground.bags.topics import choose_image_topic, stated_tracker, Topics
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.images import FEWEST_SOURCES
-from starcal_ground.campaign import calibrate, chosen, observe, Source
+from starcal_ground.campaign import Source
 from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.images import from_stars as by_stars
 from starcal_ground.images import photographs as image_files
@@ -35,8 +34,7 @@ from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.setup import load_setup, option_groups
-from starcal_ros.pipeline.solve import inputs_of
-from starcal_ros.records import Calibration, CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.robust_statistics import MAD_TO_SIGMA
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
@@ -83,31 +81,6 @@ def _in_words_of_stars(stars: by_stars.FromStars, one: StarObservations) -> Star
     else:
         return one
     return refused_image(one.time_ns, one.width, one.height, reason, detail)
-
-
-def from_images(
-    paths: Sequence[Path],
-    topics: Topics,
-    values: Mapping[str, object],
-    folder: Path,
-    lens: tuple[float, float] = (0.0, 0.0),
-    on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
-) -> tuple[Source, list[Path]]:
-    """
-    Source of a calibration of photographs or of bags without attitudes, and the files it reads.
-
-    Its topics are those requested, with the attitudes of the stars in place of any in the bags.
-    ``lens`` is the focal length (mm) and the pixel size (um), 0 where not given.
-    ``on_notes`` is told of files that are left out, before the search.  Raises NotFromStars when
-    the stars give no camera.
-    """
-    option_groups(values)  # before a long search
-    photographs = image_files.image_paths(paths)
-    if not photographs:
-        return from_bags(paths, topics, values, folder, lens), reader.mcap_files(paths)
-    chosen, notes = photographs_of(photographs, *lens)
-    on_notes(notes)
-    return from_photographs(chosen, values, folder), [one.path for one in chosen]
 
 
 def photographs_of(
@@ -303,8 +276,9 @@ def camera_of_bags(
     lens: tuple[float, float] = (0.0, 0.0),
 ) -> by_stars.FromStars:
     """
-    Camera and rotations of the images of bags, at most the first few; ``lens`` as `from_images`.
+    Camera and rotations of the images of bags, at most the first few.
 
+    ``lens`` is the focal length (mm) and the pixel size (um), 0 where not given.
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
     read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
@@ -392,42 +366,3 @@ def _set_up(
     is_located = is_located and (setup.site.observer == 'space' or setup.site.is_known)
     through_air = functools.partial(_through_air, stars, setup.site, is_located)
     return Source((*bags, attitudes), topics, setup, through_air, tuple(notes))
-
-
-def calibrate_images(
-    images: Path | str | Sequence[Path | str], *, image_topic: str = '', **options: object
-) -> Calibration:
-    """
-    Calibration of a camera from images of the sky alone; nothing is written.
-
-    Parameters
-    ----------
-    images : path or sequence of paths
-        FITS, JPEG, PNG or TIFF files, folders of them, or patterns; or MCAP bags, whose attitudes
-        are not used.
-    image_topic : str
-        Needed where a bag has more than one topic of images.
-    **options
-        Options of a parameter file by name.
-
-    Returns
-    -------
-    Calibration
-        Of the camera alone: ``has_alignment`` is False.
-
-    Raises
-    ------
-    StarcalError
-        One line that names the cause, and the images to take.
-
-    Examples
-    --------
-    >>> import starcal_ground
-    >>> calibration = starcal_ground.calibrate_images('bags/tiny')  # its attitudes are not used
-    >>> calibration.has_alignment, calibration.images_used
-    (False, 10)
-    """
-    paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
-    with tempfile.TemporaryDirectory(prefix='starcal_') as name:
-        source, files = from_images(paths, Topics(image=image_topic), options, Path(name))
-        return calibrate(observe(chosen(source)), inputs_of(files)).calibration

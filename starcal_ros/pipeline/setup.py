@@ -5,8 +5,7 @@ Setup of a calibration: options of every stage, with the files they name loaded.
 The files are the prior camera, the catalog, and dark frame, flat field and bad pixels.
 
 Implausible options raise `OptionError` in one line that names the likely mistake and its remedy,
-wherever a setup is loaded: by a node at its start, by `starcal calibrate`, `inspect` and
-`diagnose`.
+wherever a setup is loaded: by a node at its start, by `starcal calibrate` and `diagnose`.
 
 The options that only the nodes use are declared here too: one parameter file serves nodes and
 tool, and the tool must distinguish a parameter of a node from a misspelt name.

@@ -21,7 +21,6 @@ from starcal_ground import campaign
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.reader import read_observations, Topics
 from starcal_ground.cli.main import main
-from starcal_ground.images.night_sky import calibrate_images
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.trend_table import Row
@@ -125,10 +124,6 @@ def test_all_entrances_give_one_calibration(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     given = (bag, capsys) if entrance is by_plan else (bag,)
-    if entrance is by_python and is_unsited(bag):  # what flies does not find the air
-        with pytest.raises(starcal_ground.OptionError, match='observer: ground needs the site'):
-            entrance(*given)
-        return
     for name, number in entrance(*given).items():
         # JSON and Parquet keep all digits; the process has solved it with one BLAS thread.
         np.testing.assert_allclose(number, numbers_of(expected)[name], rtol=1e-9, err_msg=name)
@@ -207,7 +202,12 @@ def test_a_calibration_refused_for_want_of_stars_finds_those_of_a_right_prior(
     camera = bag / 'camera.yaml'
     camera.write_text(camera.read_text().replace('data: [-0.045, 0.08,', 'data: [1.0, 0.0,'))
     wrong = read_setup(bag / 'params.yaml')
-    found, expected = (campaign.calibrate_bags([bag], setup, Topics()) for setup in (wrong, right))
+    found, expected = (
+        campaign.calibrate(
+            campaign.observe(campaign.chosen(campaign.Source((bag,), Topics(), setup)))
+        )
+        for setup in (wrong, right)
+    )
     assert found.notes == ('the calibration lacked stars at first: 13 more are found with it',)
     assert found.calibration.accepted and not expected.notes
     assert found.calibration.stars_used == expected.calibration.stars_used
@@ -226,7 +226,7 @@ def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
     by_tool = ['calibrate', str(bag), '--params', str(params), '-o', str(tmp_path / 'out')]
     assert main([*by_tool, '--no-report']) in (0, 3)
     written = starcal_ground.read_calibration(tmp_path / 'out')
-    calibration = calibrate_images(bag, observer='space')
+    calibration = starcal_ground.calibrate_images(bag, observer='space')
     assert not calibration.has_alignment
     with pytest.raises(starcal_ground.OptionError, match='starcal_ground.calibrate_images'):
         starcal_ground.calibrate_bag(bag, params)
@@ -234,18 +234,18 @@ def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
         np.testing.assert_allclose(number, numbers_of(written)[name], rtol=1e-9, err_msg=name)
 
 
-def test_an_inspection_reads_as_a_calibration(
+def test_a_diagnosis_reads_as_a_calibration(
     bag: Path, expected: Calibration, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before the images that matched nothing are measured again."""
     capsys.readouterr()
-    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), '--json']) == 0
-    shown = capsys.readouterr()
-    contents = json.loads(shown.out)
+    main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), '--json'])
+    shown = json.loads(capsys.readouterr().out)
+    contents = shown['contents']
     unmatched = {group['reason']: group['count'] for group in contents['refused']}
     assert set(unmatched) <= {'no_match'}
-    assert contents['status']['images'] + sum(unmatched.values()) == expected.images_used
-    assert ('prior_alignment is not given: found [' in shown.err) == (not unmatched)
+    assert len(contents['stars_per_image']) + sum(unmatched.values()) == expected.images_used
+    assert (shown['cause'] == 'prior_alignment') == (not unmatched)
 
 
 @pytest.mark.parametrize(
@@ -255,10 +255,10 @@ def test_an_inspection_reads_as_a_calibration(
         (('--observations-topic', 'other'), 'no topic other of type'),
     ],
 )
-def test_an_inspection_lists_the_topics_where_one_is_wrong(
+def test_a_diagnosis_lists_the_topics_where_one_is_wrong(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, str], problem: str
 ) -> None:
     bag = unaligned(tmp_path)
-    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
+    assert main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
     shown = capsys.readouterr().out
     assert '/opnav/image_raw' in shown and problem in shown

@@ -143,7 +143,7 @@ def test_an_image_in_place_of_a_bag_is_named_with_the_commands_that_take_it(
     with pytest.raises(BagError) as error:
         reader.topics([tmp_path if in_a_folder else tmp_path / name])
     said = explained(error.value)
-    assert f'{kind}: starcal calibrate, inspect, diagnose and plan take images' in said
+    assert f'{kind}: starcal calibrate, diagnose and plan take images' in said
     assert in_a_folder == ('no .mcap files in the folder, but' in said)
 
 

@@ -46,14 +46,14 @@ def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str
         ['--version'],
         # The lens is stated, so that the search for the camera, whose modules count too, is short.
         [
-            *('inspect', 'BAG'),
+            *('diagnose', 'BAG'),
             *('--focal-length-mm', '18', '--pixel-size-um', '10'),
         ],
         [
             *('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml'),
         ],
     ],
-    ids=['version', 'inspect', 'trend'],
+    ids=['version', 'diagnose', 'trend'],
 )
 def test_modules_of_the_current_folder_are_not_run(
     hostile: Path, few_images: Path, start: list[str], arguments: list[str]

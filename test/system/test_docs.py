@@ -273,7 +273,7 @@ def test_the_commands_of_a_document_run(
 def test_readme_and_tutorial_run() -> None:
     assert {path.name for path in RUNNING} >= {'README.md', 'tutorial.md'}
     ran = {line.words[1] for line in TOOL_LINES if line.runs}
-    assert ran >= {'inspect', 'calibrate', 'compare'}
+    assert ran >= {'diagnose', 'calibrate', 'compare'}
 
 
 def test_subcommands_in_the_interface_document_are_those_of_the_tool() -> None:

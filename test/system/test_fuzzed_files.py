@@ -206,6 +206,6 @@ def test_observations() -> None:
 def test_pipes_in_a_folder_are_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ('metadata.yaml', 'a.mcap'):
         os.mkfifo(tmp_path / name)
-    assert main.main(['inspect', str(tmp_path)]) == 2
+    assert main.main(['diagnose', str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert 'no .mcap files in the folder' in error and error.count('\n') == 1

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING
@@ -108,9 +107,8 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
 
     requirements_of(args.require or ())
     given = arguments.given(args, **({'requirements': args.require} if args.require else {}))
-    setup, files = given.checked()
-    named = tuple(files)
-    files += given.photographs
+    setup, stated = given.checked
+    files = [*stated, *given.photographs]
     folders = [path for path in given.paths if path.is_dir()]
     if given.photographs and same_as_one_of(args.output, folders):
         raise OptionError(f'{args.output}: holds the images; choose another folder (-o)')
@@ -126,8 +124,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
             arguments.print_notes(notes)
 
     with failure_recorded(args.output, given.paths, NotFromStars):
-        first = first_setup.first_setup(given, setup, args.output, bag_folder, note)
-    first = replace(first, files=tuple(dict.fromkeys((*first.files, *named))))
+        first = first_setup.source_of(given, args.output, bag_folder, note)
     with failure_recorded(args.output, given.paths, OptionError):  # no alignment was found
         source = chosen(first.source)
     note(source.notes)

@@ -57,15 +57,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.bags import reader
     from starcal_ground.campaign import calibrate, chosen, observe
-    from starcal_ground.images.first_setup import first_setup
+    from starcal_ground.images.first_setup import source_of
     from starcal_ground.planning.plan import Cone, plan_pointings, Request
     from starcal_ros.formats.products.product_files import write_atomically
 
     given = arguments.given(args)
-    setup, files = given.checked()
+    _, stated = given.checked
     if args.output:
-        files += given.photographs or reader.files_of_bags(given.paths)
-        arguments.check_file(args.output, [*files, *filter(None, [args.pointings])])
+        read = given.photographs or reader.files_of_bags(given.paths)
+        files = [*stated, *read, *filter(None, [args.pointings])]
+        arguments.check_file(args.output, files)
     request = Request(
         args.images,
         args.minimise,
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         args.slew,
     )
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
-        first = first_setup(given, setup, Path(name), Path(name), arguments.print_notes)
+        first = source_of(given, Path(name), Path(name), arguments.print_notes)
         campaign = calibrate(observe(chosen(first.source)))
     arguments.print_notes(campaign.notes)
     plan = plan_pointings(campaign.ensemble, campaign.setup, request)

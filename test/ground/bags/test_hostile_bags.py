@@ -40,9 +40,9 @@ def write_bag(
         writer.finish()
 
 
-def inspect(path: Path) -> None:
+def diagnose(path: Path) -> None:
     """The tool reads the bag or refuses it."""
-    assert main.main(['inspect', str(path)]) in (0, 2, 3)
+    assert main.main(['diagnose', str(path)]) in (0, 2, 3)
 
 
 def nested(count: int, suffix: str = '', fields: int = 1) -> str:
@@ -86,7 +86,7 @@ def test_huge_recursive_or_false_definitions(name: str, tmp_path: Path) -> None:
     path = tmp_path / 'bag.mcap'
     for data in (HEAD + b'\1' * 400, HEAD + b'\xff' * 4):
         write_bag(path, DEFINITIONS[name], data=data)
-        inspect(path)
+        diagnose(path)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_huge_recursive_or_false_definitions(name: str, tmp_path: Path) -> None:
 def test_channels_of_another_kind(definition: str, how: dict, tmp_path: Path) -> None:
     path = tmp_path / 'bag.mcap'
     write_bag(path, definition, **how)
-    inspect(path)
+    diagnose(path)
 
 
 def test_changed_definitions(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_changed_definitions(tmp_path: Path) -> None:
             )  # fmt: skip
         data = HEAD + draw.choice([bytes(400), draw.randbytes(400), b'\xff' * 60])
         write_bag(path, '\n'.join(changed), data=data)
-        inspect(path)
+        diagnose(path)
 
 
 @pytest.mark.parametrize(
@@ -142,6 +142,6 @@ def test_names_that_act_on_a_terminal_are_escaped(
         (text, text),
     ):
         write_bag(path, 'int8 x\n', type_name, topic=topic)
-        inspect(path)
+        diagnose(path)
         printed = ''.join(capsys.readouterr())
         assert all(c.isprintable() or c == '\n' for c in printed)

@@ -113,7 +113,7 @@ def with_topics(folder: Path, kinds: dict[str, str]) -> list[Path]:
 def test_the_topic_of_the_attitudes_follows_from_the_types(
     tmp_path: Path, kinds: dict[str, str], asked: str, chosen: str
 ) -> None:
-    """Without a setup too, as for `starcal inspect`."""
+    """Without a setup too, as for `starcal diagnose` where none is found."""
     bags = with_topics(tmp_path / 'bag', kinds)
     for setup in (setup_with(), None):
         assert topics.choose_topics(bags, Topics(attitude=asked), setup).attitude == chosen

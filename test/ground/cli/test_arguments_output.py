@@ -273,7 +273,7 @@ def test_what_starcal_did_not_write_is_not_replaced(
 )
 @pytest.mark.parametrize('bag', [BAG, '/none'])
 def test_standard_streams_that_are_closed_full_or_abandoned(bag: object, ends: str) -> None:
-    line = f'inspect {bag} --params {BAG}/params.yaml'  # without, it is a search for the camera
+    line = f'diagnose {bag} --params {BAG}/params.yaml'  # without, it is a search for the camera
     command = f'{sys.executable} -m starcal_ground.cli.main {line} {ends}'
     done = subprocess.run(['bash', '-c', command], capture_output=True, text=True)
     assert 'Traceback' not in done.stdout + done.stderr
@@ -284,7 +284,7 @@ def test_ctrl_c_in_the_first_two_seconds() -> None:
     """No traceback of starcal: while Python itself starts, its own cannot be prevented."""
     draw = random.Random(15)
     code = 'import sys; from starcal_ground.cli.entry_point import main; sys.exit(main())'
-    command = [sys.executable, '-c', code, 'inspect', str(BAG)]
+    command = [sys.executable, '-c', code, 'diagnose', str(BAG)]
     for _ in range(many(6)):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         try:

@@ -77,7 +77,6 @@ COMMANDS = (
         ),
     ),
     Command('trend', ('in', '-o', 'out'), is_repeatable=False),
-    Command('inspect', ('in/bag', '--params', 'in/bag/params.yaml')),
     Command('diagnose', ('in/bag', '--params', 'in/bag/params.yaml')),
 )
 

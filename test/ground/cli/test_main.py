@@ -75,7 +75,7 @@ def test_help_is_there_at_once() -> None:
         [sys.executable, '-X', 'importtime', '-m', 'starcal_ground.cli.main', '--help'],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
+    for command in ('demo', 'diagnose', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
         assert command in done.stdout
     # Half a second of imports would be felt at each press of the tab key.
     numbers = ('numpy', 'scipy', 'cv2', 'mcap', 'rosbags')
@@ -95,10 +95,11 @@ def test_a_command_line_imports_its_command_alone() -> None:
     ('arguments', 'words'),
     [
         (['fly'], ["'fly'"]),
+        (['inspect', 'a.mcap'], ['inspect: no such command', 'starcal diagnose lists']),
         (['calibrat'], ["'calibrat'", 'calibrate']),
-        (['inspect', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'inspect --help']),
-        (['inspect', 'none.mcap'], ['none.mcap', 'no such bag']),
-        (['inspect', ''], ['empty path']),
+        (['diagnose', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'diagnose --help']),
+        (['diagnose', 'none.mcap'], ['none.mcap', 'no such bag']),
+        (['diagnose', ''], ['empty path']),
         (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
         (
             ['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'],
@@ -429,7 +430,7 @@ def examples() -> list[tuple[str, list[str]]]:
 def test_each_command_has_examples_that_it_takes() -> None:
     shown = Counter(name for name, _ in examples())
     assert all(
-        shown[name] >= 2 for name in ('inspect', 'calibrate', 'compare', 'simulate', 'play')
+        shown[name] >= 2 for name in ('diagnose', 'calibrate', 'compare', 'simulate', 'play')
     )
     assert set(shown) == {'', *COMMANDS}
     files = {
@@ -475,10 +476,10 @@ def test_what_needs_ros_names_it(
     ('line', 'expected'),
     [
         ('starcal ca', ['calibrate', 'catalog']),
-        ('starcal inspect --ima', ['--image-topic']),
+        ('starcal diagnose --ima', ['--image-topic']),
         ('starcal simulate --scenario ', ['narrow', 'paper', 'small', 'tiny']),
         ('starcal import --channel g', ['green']),
-        (f'starcal inspect {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
+        (f'starcal diagnose {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],
 )
 def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:
@@ -587,7 +588,7 @@ def test_a_ctrl_c_whose_error_has_lost_its_cause_is_one() -> None:
     code = """
 import os, signal, sys, time
 from starcal_ground.cli import entry_point
-from starcal_ground.cli.commands import inspect
+from starcal_ground.cli.commands import diagnose
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 
@@ -599,8 +600,8 @@ def interrupted(_args):
         pass
     raise ModuleNotFoundError('Error importing numpy')
 
-inspect.run = interrupted
-sys.argv = ['starcal', 'inspect', 'x']
+diagnose.run = interrupted
+sys.argv = ['starcal', 'diagnose', 'x']
 sys.exit(entry_point.main())
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)

@@ -47,13 +47,13 @@ _IMPORT = (
     ' --attitude HERE/frames/attitude.csv -o HERE/o'
 )
 FILES = {
-    'BAG': 'inspect FILE',
+    'BAG': 'diagnose FILE',
     'BAG of calibrate': 'calibrate FILE --params HERE/bag/params.yaml -o HERE/o',
-    'file of a bag': 'inspect HERE/bag/metadata.yaml',
-    '--params': 'inspect HERE/bag --params FILE',
+    'file of a bag': 'diagnose HERE/bag/metadata.yaml',
+    '--params': 'diagnose HERE/bag --params FILE',
     '--params of calibrate': 'calibrate HERE/bag --params FILE -o HERE/o',
-    'camera_info_url': 'inspect HERE/bag --params HERE/params.yaml',
-    'catalog': 'inspect HERE/bag --params HERE/params.yaml',
+    'camera_info_url': 'diagnose HERE/bag --params HERE/params.yaml',
+    'catalog': 'diagnose HERE/bag --params HERE/params.yaml',
     '--pointings': 'plan HERE/bag --params HERE/bag/params.yaml --pointings FILE',
     'A': 'compare FILE HERE/out',
     'B': 'compare HERE/out FILE',

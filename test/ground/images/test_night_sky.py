@@ -19,6 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.night_sky import calibrated, camera_of, off_arcsec
+from starcal_ground.api import calibrate_images
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.search import SkyMatch
@@ -33,7 +34,6 @@ from starcal_ground.images.from_stars import (
 from starcal_ground.images.night_sky import (
     _through_air,
     _tone_curve,
-    calibrate_images,
     from_photographs,
     photographs_of,
 )

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""A mistake of the set-up is named with its remedy by `calibrate`, `inspect` and `diagnose`."""
+"""A mistake of the set-up is named with its remedy by `calibrate` and `diagnose`."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def said(
     tmp_path: Path,
     path: Path,
     parameters: Path,
-    commands: Sequence[str] = ('calibrate', 'diagnose', 'inspect'),
+    commands: Sequence[str] = ('calibrate', 'diagnose'),
 ) -> dict[str, str]:
     """Return what each command says of a bag; checks that it is one line and no success."""
     more = {'calibrate': ['-o', str(tmp_path / 'out'), '--no-report']}
@@ -111,11 +111,9 @@ def said(
         if status == 2:
             found[command] = text.err
             assert text.err.count('\n') == 1
-        elif command == 'diagnose':
+        else:
             content = json.loads(text.out)
             found[command] = ' '.join([content['sentence'], *content['mend']])
-        else:
-            found[command] = ' '.join(json.loads(text.out)['problems'])
     return found
 
 
@@ -164,7 +162,7 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(
 def test_a_focal_length_of_other_pixels(
     scale: float, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The search takes a command 7 s; `inspect` shows what `diagnose` finds, as above."""
+    """The search takes a command 7 s."""
     parameters = params_with(tmp_path, camera_info_url=str(rescaled_camera(tmp_path, scale)))
     path = bag(tmp_path / 'bag.mcap', _raw)
     for text in said(capsys, tmp_path, path, parameters, [command]).values():
@@ -203,12 +201,12 @@ def test_an_uncertainty_of_the_mounting_that_is_too_small(
     assert 'Set prior_alignment: [' in found
 
 
-def test_inspect_names_the_remedy_without_parameters(
+def test_the_remedy_is_named_without_parameters(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', _bmp)
-    assert main.main(['inspect', str(path)]) == 3
-    assert 'is not a PNG or JPEG' in capsys.readouterr().out.splitlines()[-1]
+    assert main.main(['diagnose', str(path)]) == 3
+    assert 'is not a PNG or JPEG' in capsys.readouterr().out.partition('Cannot be calibrated')[2]
 
 
 @pytest.mark.parametrize('start', ['2030-01-01T00:00:00', '+5000'])
@@ -227,7 +225,7 @@ def test_a_folder_of_image_files_is_imported(
     night = tmp_path / 'night'
     night.mkdir()
     (night / '001.fits').write_bytes(b'SIMPLE  =                    T')
-    for command in (['calibrate', '-o', str(tmp_path / 'out')], ['inspect']):
+    for command in (['calibrate', '-o', str(tmp_path / 'out')], ['diagnose']):
         for path in (night, night / '001.fits'):
             # What is stated of a star tracker has to be there.
             stated = [*command, str(path), '--params', str(TINY / 'params.yaml')]
@@ -243,10 +241,9 @@ def test_a_bag_without_attitudes_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', _raw, None)
-    for command in ('inspect', 'diagnose'):
-        main.main([command, str(path), '--params', str(params_with(tmp_path))])
-        text = ' '.join(capsys.readouterr())
-        assert 'attitudes of the star tracker' in text and 'starcal import' in text
+    main.main(['diagnose', str(path), '--params', str(params_with(tmp_path))])
+    text = ' '.join(capsys.readouterr())
+    assert 'attitudes of the star tracker' in text and 'starcal import' in text
 
 
 @pytest.mark.parametrize('top', [False, True])
@@ -256,7 +253,7 @@ def test_parameters_outside_a_section(
     values = {'camera_info_url': str(TINY / 'camera.yaml')}
     path = tmp_path / 'params.yaml'
     path.write_text(yaml.safe_dump({'ros__parameters': values} if top else values))
-    assert main.main(['inspect', str(TINY), '--params', str(path)]) == 2
+    assert main.main(['diagnose', str(TINY), '--params', str(path)]) == 2
     wanted = 'write /**: above' if top else 'write /**: and ros__parameters: above'
     assert wanted in capsys.readouterr().err
 

@@ -4,24 +4,27 @@
 from __future__ import annotations
 
 from collections import Counter
+import contextlib
 import json
 import math
 from pathlib import Path
 
 import cv2
 from mission_files import images as tiny_images  # type: ignore[import-not-found]
-from mission_files import TINY
+from mission_files import params_with, TINY
 import numpy as np
 import pytest
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader, topics
 from starcal_ground.bags.topics import Topics
+from starcal_ground.campaign import Source
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_REFUSED
 from starcal_ground.diagnosis.bags import refusals
-from starcal_ground.planning import inspect
 from starcal_ground.simulation import simulated_bag
+from starcal_ground.source_diagnosis import Contents, examine, without_setup
+from starcal_ros.errors import BagError, OptionError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
@@ -54,6 +57,11 @@ def test_the_sky_that_a_catalog_lacks_is_named(step_deg: float, words: str) -> N
     images = [refused_image(k, 8, 8, 'not_in_catalog', detail) for k, detail in enumerate(details)]
     (group,) = refusals(images)
     assert words in group.detail
+
+
+def contents_of(path: Path) -> Contents:
+    """Contents of a bag of which nothing is stated, and whose camera is not found."""
+    return without_setup([path], ASKED, OptionError('not found')).contents
 
 
 def write_spoilt(path: Path, images: list[Image]) -> None:
@@ -93,27 +101,29 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
 def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
-    quick = inspect.inspect([path], ASKED)
+    quick = contents_of(path)
     assert {r.reason: r.count for r in quick.refused} == {
         'no_attitude': 2,
         'attitude_gap': 1,
         'bad_attitude': 1,
         'out_of_order': 1,
     }
-    assert quick.images == 12 and not quick.problems and not quick.measured
+    assert quick.images == quick.looked_at == 12 and not quick.stars_per_image
     seen = []
-    full = inspect.inspect([path], ASKED, setup, lambda: seen.append(1))
+    progress = lambda count: contextlib.nullcontext(lambda: seen.append(count))  # noqa: E731
+    examined = examine(Source((path,), ASKED, setup), progress)
+    full = examined.contents
     by_reason = {r.reason: r.count for r in full.refused}
     # With the stars and the camera, two more: the dark image and the cut one.
     expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
-    assert len(seen) == full.images == 12
+    assert seen == 12 * [12] and full.images == full.looked_at == 12
     observed = list(topics.read([path], Topics(IMAGE, ATTITUDE), setup))
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')
     assert gap.first_ns == tiny_images()[1].time_ns and 'over 2 s' in gap.detail
-    assert full.status is not None and full.status.images == 5
+    assert len(full.stars_per_image) == 5 and examined.diagnosis.cause == 'none'
     assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
 
 
@@ -125,17 +135,17 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(
     with BagWriter(path) as writer:
         writer.write_image(IMAGE, tiny_images()[0], 'camera')
         writer.write_attitude(ATTITUDE, 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
-    assert math.isnan(inspect.inspect([path], ASKED).longest_attitude_gap_s)
-    assert main.main(['inspect', str(path), '--json']) == EXIT_REFUSED
-    assert json.loads(capsys.readouterr().out)['longest_attitude_gap_s'] is None
-    assert main.main(['inspect', str(path)]) == EXIT_REFUSED
+    assert math.isnan(contents_of(path).longest_attitude_gap_s)
+    assert main.main(['diagnose', str(path), '--json']) == EXIT_REFUSED
+    assert json.loads(capsys.readouterr().out)['contents']['longest_attitude_gap_s'] is None
+    assert main.main(['diagnose', str(path)]) == EXIT_REFUSED
     assert 'longest attitude gap' not in capsys.readouterr().out
 
 
 def test_the_topics_are_told(tmp_path: Path) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
-    attitude, image = sorted(inspect.inspect([path], ASKED).topics, key=lambda t: -t.bad)
+    attitude, image = sorted(contents_of(path).topics, key=lambda t: -t.bad)
     assert (attitude.name, attitude.bad) == (ATTITUDE, 4)
     assert attitude.rate_hz == pytest.approx(2.0) and attitude.count == 34
     assert image.name == IMAGE and image.count == 12 and image.bad == 0
@@ -151,12 +161,15 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
         for k in (0, 2, 1):
             writer.write_temperature('/lens', 10**18 + k * 10**9, 20.0, 'camera')
             writer.write_velocity('/velocity', 10**18 + k * 10**9, np.zeros(3), 'icrf')
-    found = inspect.inspect([path], ASKED)
-    lens, velocity = found.topics
+    with pytest.raises(BagError) as error:
+        topics.choose_topics([path], ASKED)
+    found = without_setup([path], ASKED, error.value)
+    lens, velocity = found.contents.topics
     assert (lens.name, velocity.name) == ('/lens', '/velocity')
     assert lens.backward == 1 and lens.rate_hz == pytest.approx(1.0)
-    assert found.problems and 'no topic of type sensor_msgs/msg/Image' in found.problems[0]
-    assert 'starcal import' in found.problems[0] and '/lens' in found.problems[0]
+    sentence = found.diagnosis.sentence
+    assert 'no topic of type sensor_msgs/msg/Image' in sentence
+    assert 'starcal import' in sentence and '/lens' in sentence
 
 
 def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
@@ -175,7 +188,7 @@ def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
         for raw in reader.read_raw([TINY], [ATTITUDE]):
             time_ns, xyzw = attitude_from_message(reader.decode(raw))
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
-    found = inspect.inspect([path], ASKED)
+    found = contents_of(path)
     (image,) = (t for t in found.topics if t.name == '/image')
     kinds = {'PNG 640 x 512': 1, 'JPEG 640 x 512': 1, 'bmp, not a PNG or JPEG': 1}
     assert image.kinds == kinds
@@ -186,17 +199,22 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     cut = tmp_path / 'cut.mcap'
     write_spoilt(cut, tiny_images())
     cut.write_bytes(cut.read_bytes()[:-10_000])  # in the second chunk
-    found = inspect.inspect([cut], ASKED)
+    found = contents_of(cut)
     (damage,) = found.damage
     assert 'truncated' in damage
     (images,) = (t.count for t in found.topics if t.name == IMAGE)
     assert 0 < images < 10 and found.images == images
 
 
-def test_recorded_observations_need_no_parameters(tiny_products: Path) -> None:
-    found = inspect.inspect([tiny_products / 'observations.mcap'], ASKED)
-    assert found.measured and found.images == 10 and not found.refused
+def test_recorded_observations_need_no_parameters(
+    tiny_products: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny_products / 'observations.mcap'
+    found = contents_of(path)
+    assert found.stars_per_image and found.images == 10 and not found.refused
     assert found.chosen == Topics(observations='/observations')
+    assert main.main(['diagnose', str(path), '--params', str(PARAMS)]) == 0
+    assert 'nothing to diagnose in recorded observations.' in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -205,14 +223,13 @@ def test_the_tool_says_it_to_people_and_programs(
 ) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
-    assert main.main(['inspect', str(path)]) == 0
+    assert main.main(['diagnose', str(path)]) == 0
     out = capsys.readouterr().out
     assert '5 of 12 images' in out and 'attitude_gap' in out
     assert 'over 2 s' in out and 'too far apart' in out  # this image's, and what it means
-    assert main.main(['inspect', str(path), '--json', '--params', str(PARAMS)]) == 0
-    made = json.loads(capsys.readouterr().out)
-    assert made['images'] == 12 and made['measured'] is True
-    assert len(made['status']['predicted_sigma']) == len(made['status']['parameter_names'])
+    assert main.main(['diagnose', str(path), '--json', '--params', str(PARAMS)]) == 0
+    made = json.loads(capsys.readouterr().out)['contents']
+    assert made['images'] == 12 and len(made['stars_per_image']) == 5
     assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
 
 
@@ -224,9 +241,9 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
         for image in tiny_images()[:2]:
             writer.write_image(IMAGE, image, 'camera')
         writer.write_attitude(ATTITUDE, 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
-    assert main.main(['inspect', str(path)]) == 3
+    assert main.main(['diagnose', str(path)]) == 3
     out = capsys.readouterr().out
-    assert 'cannot be calibrated: 2 different images, 3 are needed' in out and 'no_attitude' in out
+    assert 'Cannot be calibrated: 2 different images, 3 are needed' in out and 'no_attitude' in out
     few = tmp_path / 'few.mcap'
     with BagWriter(few) as writer:
         for raw in reader.read_raw([TINY], [ATTITUDE]):
@@ -234,7 +251,29 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
         for image in tiny_images()[:2]:
             writer.write_image(IMAGE, image, 'camera')
-    assert main.main(['inspect', str(few)]) == 3
+    assert main.main(['diagnose', str(few)]) == 3
     assert '2 different images, 3 are needed' in capsys.readouterr().out
-    assert main.main(['inspect', str(few), '--params', str(PARAMS)]) == 3
-    assert 'only 2 usable images, 3 needed (min_images)' in capsys.readouterr().out
+    assert main.main(['diagnose', str(few), '--params', str(PARAMS)]) == 3
+    assert '1 more image (2 of 3 collected)' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('direction', 'cause', 'words'),
+    [
+        ('st_to_inertial', 'none', '10 of 12 images'),
+        ('inertial_to_st', 'attitude_direction', '0 of the first 10 of 12 images'),
+    ],
+)
+def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
+    direction: str, cause: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, last = tmp_path / 'more.mcap', tiny_images()[-1]
+    with BagWriter(path) as writer:
+        for k in (1, 2):
+            writer.write_image(IMAGE, Image(last.time_ns + k * 10**11, last.pixels), 'camera')
+    given = ['--params', str(params_with(tmp_path, attitude_direction=direction))]
+    assert main.main(['diagnose', str(TINY), str(path), *given]) == (3 if cause != 'none' else 0)
+    assert words in ' '.join(capsys.readouterr().out.split())
+    assert main.main(['diagnose', str(TINY), str(path), *given, '--json']) in (0, 3)
+    assert json.loads(capsys.readouterr().out)['cause'] == cause
