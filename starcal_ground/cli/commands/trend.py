@@ -41,8 +41,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--params', default='', metavar='FILE', help=what)
     what = "pattern with the names of spacecraft and cameras, e.g. '{spacecraft}/{camera}/*.mcap'"
     add('--cameras', default='', metavar='PATTERN', help=what)
-    what = 'write the table as trend.parquet too, for other tools'
-    add('--parquet', action='store_true', help=what)
     where = command.add_mutually_exclusive_group()
     what = 'worker processes (default: 0, in-process)'
     where.add_argument(
@@ -82,8 +80,6 @@ def run(args: argparse.Namespace) -> int:
     failures = [*done.unreachable, *(f'{row.path}: {row.error}' for row in page.failures)]
     for failure in failures[:_FAILURES_SHOWN]:
         terminal.print_text(f'failed: {failure}')
-    if args.parquet:
-        terminal.print_text(f'written to {table.write_parquet()}')
     terminal.print_text(f'calibrations: {page.calibrations}; look at {page.path}')
     if done.silent == fleet.MOST_SILENT:
         arguments.complain(

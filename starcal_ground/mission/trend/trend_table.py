@@ -25,12 +25,12 @@ import weakref
 
 import numpy as np
 
-from starcal_ros import files, untrusted
+from starcal_ros import untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, software_version
-from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.errors import ProductError
 from starcal_ros.record_fields import check_shape, Finite, json_object, read_record, Stamp
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable
 from starcal_ros.text import printable
@@ -183,7 +183,7 @@ def _boresight_sigma(calibration: Calibration) -> Floats:
     return np.asarray(np.sqrt(np.diag(covariance)[[1, 0]]) / ARCSECOND_RAD)
 
 
-TABLE_FILE, PARQUET_FILE = 'trend.sqlite', 'trend.parquet'
+TABLE_FILE = 'trend.sqlite'
 _WAIT_S = 60.0  # for the transaction of another run
 _COLUMNS: dict[str, Any] = get_type_hints(Row)
 _TYPES = {int: 'integer', bool: 'integer', float: 'real', str: 'text'}
@@ -284,25 +284,6 @@ class Table:
         """All rows, in order of time."""
         rows = (row for rows in self.cameras() for row in rows)
         return sorted(rows, key=lambda row: (row.time_ns, row.stamp))
-
-    def write_parquet(self) -> Path:
-        """Write the rows as a Parquet file beside the table, a row group for each camera."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        types = {str: pa.string(), int: pa.int64(), bool: pa.bool_(), float: pa.float64()}
-        types[tuple[str, ...]] = pa.list_(pa.string())
-        types[tuple[float, ...]] = pa.list_(pa.float64())
-        schema = pa.schema([(name, types[kind]) for name, kind in _COLUMNS.items()])
-        path = self.path.with_name(PARQUET_FILE)
-        with (
-            errors_as(ProductError, path, 'written'),
-            files.replacing(path) as file,
-            pq.ParquetWriter(file, schema) as writer,
-        ):
-            for rows in self.cameras():
-                writer.write_table(pa.Table.from_pylist(list(map(json_object, rows)), schema))
-        return path
 
     def _schema(self) -> set[str]:
         statements = self._db.execute('SELECT sql FROM sqlite_master WHERE sql IS NOT NULL')
