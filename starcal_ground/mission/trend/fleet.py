@@ -427,8 +427,8 @@ def _by_dask(tasks: Sequence[Task], workers: int, address: str) -> Generator[Ans
     except (RuntimeError, OSError, ValueError, CancelledError, asyncio.CancelledError) as error:
         words = printable(' '.join(str(error).split())).rstrip('.')
         raise OptionError(
-            f'{option}: Dask ended ({words}; no scheduler, or out of memory?): run again to continue'
-            ' after the last row, or without workers'
+            f'{option}: Dask ended ({words}; no scheduler, or out of memory?): run again to'
+            ' continue after the last row, or without workers'
         ) from error
     finally:
         # Dask sets the variables of its workers in this process, for good.
