@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from trend_rows import made  # type: ignore[import-not-found]
 
-from starcal_ground.mission.trend.series import Active, Change, overview_of
-from starcal_ground.mission.trend.trend_page import verdict_of, write_page
+from starcal_ground.mission.trend.series import Active, Change
+from starcal_ground.mission.trend.trend_page import attention_of, verdict_of, write_page
 
 # Days of calibrations, which one is active, change of each later one (px); then the verdict.
 VERDICTS: Mapping[str, tuple[Sequence[int], int | None, Sequence[float], bool | None, str]] = {
@@ -33,8 +33,7 @@ def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
     is_stable, (judged, found) = verdict_of(rows, rows, active, new, [])
     assert is_stable is expected and words in judged
     assert found == f'Steps and drifts need 6 calibrations; there are {len(rows)}.'
-    overview = overview_of('camera', [], is_stable)
-    assert overview.needs_attention is (expected is False)
+    assert attention_of([], is_stable) == ('changed' if expected is False else '')
 
 
 def test_steps_are_looked_for_in_many() -> None:
