@@ -351,10 +351,9 @@ def update(
     root : str
         Place of all files; it is asked for after each file that cannot be reached.
     """
-    done, failures = Done(), table.failures()
-    new: list[Task] = []
+    done, listed, new = Done(), set(), []
     for task in tasks:
-        failures.discard(task.stamp)
+        listed.add(task.stamp)
         if table.has(task.stamp, task.spacecraft, task.camera):
             done.known += 1
         else:
@@ -374,7 +373,7 @@ def update(
                     raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), root)
             on_row()
     # A file that was repaired or removed is no longer among the tasks.
-    table.forget(failures)
+    table.forget_failures(but=listed)
     return done
 
 

@@ -223,14 +223,14 @@ class Table:
 
     def has(self, stamp: str, spacecraft: str, camera: str) -> bool:
         """True for the row of a stamp and camera, recorded or made by this version."""
+        of_task = stamp, spacecraft, camera, RECORDED, f'starcal {software_version()}'
         with self._naming():
-            return bool(
-                self._db.execute(
-                    'SELECT 1 FROM calibration WHERE stamp = ? AND spacecraft = ? AND camera = ? '
-                    'AND (kind = ? OR software = ?)',
-                    (stamp, spacecraft, camera, RECORDED, f'starcal {software_version()}'),
-                ).fetchone()
+            found = self._db.execute(
+                'SELECT 1 FROM calibration WHERE stamp = ? AND spacecraft = ? AND camera = ? '
+                'AND (kind = ? OR software = ?)',
+                of_task,
             )
+            return found.fetchone() is not None
 
     def add(self, row: Row) -> None:
         """Add a row; it replaces that of its stamp, of another version or name of the camera."""
@@ -242,22 +242,13 @@ class Table:
                 f'INSERT OR REPLACE INTO calibration ({_NAMES}) VALUES ({places})', values
             )
 
-    def failures(self) -> set[str]:
-        """Stamps of failures."""
+    def forget_failures(self, but: Iterable[str]) -> None:
+        """Remove the failures of all stamps but some."""
         with self._naming():
-            return {
-                stamp
-                for (stamp,) in self._db.execute(
-                    'SELECT stamp FROM calibration WHERE kind = ?', (FAILED,)
-                )
-            }
-
-    def forget(self, stamps: Iterable[str]) -> None:
-        """Remove the failures of some stamps."""
-        with self.transaction():
-            self._db.executemany(
-                "DELETE FROM calibration WHERE stamp = ? AND kind = 'failed'",
-                zip(stamps, strict=True),
+            self._db.execute(
+                'DELETE FROM calibration WHERE kind = ? AND stamp NOT IN '
+                '(SELECT value FROM json_each(?))',
+                (FAILED, json.dumps([*but])),
             )
 
     def names(self) -> list[tuple[str, str]]:
@@ -292,17 +283,9 @@ class Table:
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
         """Write what is added in the block at once, or nothing of it."""
-        if self._db.in_transaction:
-            yield
-            return
-        with self._naming():
+        with self._naming(), self._db:
             self._db.execute('BEGIN IMMEDIATE')
-            try:
-                yield
-                self._db.execute('COMMIT')
-            finally:
-                if self._db.in_transaction:
-                    self._db.execute('ROLLBACK')
+            yield
 
     @contextlib.contextmanager
     def _naming(self) -> Iterator[None]:
