@@ -56,7 +56,7 @@ class _Judged:
     shown: Sequence[trends.Series]
     px: float
     is_stable: bool | None
-    verdict: tuple[str, str]
+    verdict: tuple[str, ...]
     attention: str
 
 
@@ -82,9 +82,8 @@ def write_page(
             one = _judged(name, group, max_p_value)
             calm = 'too few to tell' if one.is_stable is None else 'sound'
             newest = utc_text(one.rows[-1].time_ns)[:10]
-            lines.append(
-                (name, one.attention, calm, len(one.rows), newest, one.px, one.verdict[1])
-            )
+            found = one.verdict[1]
+            lines.append((name, one.attention, calm, len(one.rows), newest, one.px, found))
             drawn = sorted(
                 [*drawn, one], key=lambda one: (not one.attention, -len(one.group), one.name)
             )[:_DRAWN]
@@ -110,20 +109,24 @@ def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
     shown, new = trends.series_of(rows, max_p_value), trends.changes(group, active[-1:])
     is_stable, verdict = verdict_of(rows, group, active, new, shown)
     px = new[-1].line_of_sight_px if new else math.nan
-    return _Judged(
-        name, group, rows, shown, px, is_stable, verdict, attention_of(shown, is_stable)
-    )
+    missed = tuple(text for text in rows[-1].requirements if not text.endswith(': met'))
+    attention = attention_of(shown, is_stable, missed)
+    sentences = *verdict, *(f'Missed by the newest: {text}.' for text in missed)
+    return _Judged(name, group, rows, shown, px, is_stable, sentences, attention)
 
 
-def attention_of(shown: Sequence[trends.Series], is_stable: bool | None) -> str:
+def attention_of(
+    shown: Sequence[trends.Series], is_stable: bool | None, missed: Sequence[str] = ()
+) -> str:
     """
-    Why a camera needs attention: drifting, stepped, changed since the active calibration.
+    Why a camera needs attention: drifting, stepped, changed, misses a requirement.
 
     Empty if it needs none.  Temperature asks for nothing to be done.
     """
     kinds = {term.kind for series in shown for term in series.trend.terms}
     reasons = [word for kind, word in _ATTENTION.items() if kind in kinds]
-    return ', '.join(reasons + ['changed'] * (is_stable is False))
+    reasons += ['changed'] * (is_stable is False)
+    return ', '.join(reasons + ['misses a requirement'] * bool(missed))
 
 
 @np.errstate(all='ignore')

@@ -27,6 +27,7 @@ import numpy as np
 
 from starcal_ros import untrusted
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.gate import requirement_answers
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, software_version
@@ -52,6 +53,7 @@ class Row:
     ``stamp`` is the digest of name, size and time, or etag, of the file when it was read.
     ``kind`` is ``recorded`` (read from a file), ``computed`` (from a bag) or ``failed``.  Times
     are of the middle, first and last image; ``active_since_ns`` is 0 where it was not activated.
+    ``requirements`` are a sentence on each requirement, with its answer.
     ``sigmas`` has those of ``values``, then of three alignment angles (rad);
     ``boresight_sigma_arcsec`` is about x and y of the camera, of the middle of the detector, in
     the star tracker frame.
@@ -70,6 +72,7 @@ class Row:
     accepted: bool = False
     forced: bool = False
     reasons: str = ''
+    requirements: tuple[str, ...] = ()
     parent_frame: str = ''
     child_frame: str = ''
     lens_model: str = ''
@@ -133,6 +136,7 @@ def row_of(
         accepted=calibration.accepted,
         forced=calibration.forced,
         reasons='; '.join(calibration.reasons),
+        requirements=requirement_answers(calibration),
         parent_frame=calibration.parent_frame,
         child_frame=calibration.child_frame,
         lens_model=camera.model,
