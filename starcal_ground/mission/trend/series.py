@@ -125,7 +125,7 @@ def _candidates(
     if np.isfinite(temperature_degc).all() and np.ptp(temperature_degc) > 0:
         kinds.append((_TEMPERATURE, -1))
         columns.append(temperature_degc - temperature_degc.mean())
-    # Of many measurements each second one and so on: the memory grows with their product.
+    # Long series are tested at each second place and so on: the memory grows with the square.
     places = range(_STEP_SIDE - 1, n - _STEP_SIDE, 1 + n // _MOST_PLACES)
     steps = np.arange(n)[:, None] > np.array(places)
     trials = np.repeat([1.0, len(places)], [len(kinds), len(places)])
