@@ -33,7 +33,7 @@ FEWEST = 6  # measurements; with fewer, a step and a drift are one
 MAX_P_VALUE = 1e-3  # with a dozen series on a page, one false finding in a hundred pages
 _DRIFT, _TEMPERATURE, _STEP = 'drift', 'temperature', 'step'
 _STEP_SIDE = 2  # measurements on each side of a step: one alone is an outlier
-_MOST_PLACES = 1000  # of steps that are tested: 0.3 s for as many measurements
+_MOST_PLACES = 1000  # places of a step that are tested: 0.3 s for as many measurements
 SECONDS_PER_YEAR = 365.25 * 86400.0  # Julian year, IAU
 
 
