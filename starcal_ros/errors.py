@@ -16,9 +16,7 @@ from pathlib import Path
 import sys
 
 # Modules of the extras in setup.cfg.
-_OF_EXTRAS = (
-    'astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'rawpy', 'spiceypy',
-)  # fmt: skip
+_OF_EXTRAS = ('astropy', 'cryptography', 'dask', 'distributed', 'fsspec', 'rawpy', 'spiceypy')
 _OF_STORES = ('adlfs', 'gcsfs', 's3fs')  # the URL decides which of them is needed
 # Packages of the plain install that rosdep does not bring, by their names in PyPI.
 _NEEDED = {

@@ -23,7 +23,6 @@ from pathlib import Path
 
 from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import OptionError
-from starcal_ros.text import counted
 
 _FAILURES_SHOWN = 5
 
@@ -41,8 +40,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--params', default='', metavar='FILE', help=what)
     what = "pattern with the names of spacecraft and cameras, e.g. '{spacecraft}/{camera}/*.mcap'"
     add('--cameras', default='', metavar='PATTERN', help=what)
-    what = 'write the table as trend.parquet too, for other tools'
-    add('--parquet', action='store_true', help=what)
     where = command.add_mutually_exclusive_group()
     what = 'worker processes (default: 0, in-process)'
     where.add_argument(
@@ -62,17 +59,13 @@ def run(args: argparse.Namespace) -> int:
     with _reading(args.root):
         if not places.exists(root):
             raise OptionError(f'{args.root}: no such folder')
-
-    def tasks() -> Iterator[fleet.Task]:
-        with _reading(args.root):
-            yield from fleet.find(root, cameras)
-
     folder = Path(places.absolute(args.output))
     make_folder(folder)
     check_outputs([folder / trend_page.TREND_FILE])
     table = trend_table.Table(folder)
-    with terminal.progress_bar(None, 'calibrations') as advance:
-        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance)
+    with terminal.progress_bar(None, 'calibrations') as advance, _reading(args.root):
+        found = fleet.find(root, cameras)
+        done = fleet.update(table, found, args.workers, args.scheduler, advance, root)
     if done == fleet.Done():
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
@@ -82,15 +75,7 @@ def run(args: argparse.Namespace) -> int:
     failures = [*done.unreachable, *(f'{row.path}: {row.error}' for row in page.failures)]
     for failure in failures[:_FAILURES_SHOWN]:
         terminal.print_text(f'failed: {failure}')
-    if args.parquet:
-        terminal.print_text(f'written to {table.write_parquet()}')
     terminal.print_text(f'calibrations: {page.calibrations}; look at {page.path}')
-    if done.silent == fleet.MOST_SILENT:
-        arguments.complain(
-            f'{args.root}: the last {counted(done.silent, "file")} not readable; run again when'
-            ' the store answers: the others are left for that run'
-        )
-        return arguments.EXIT_REFUSED
     return arguments.EXIT_ACCEPTED if page.calibrations else arguments.EXIT_REFUSED
 
 

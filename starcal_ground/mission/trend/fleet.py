@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 import errno
 import functools
 import hashlib
-import itertools
 import logging
 import math
 import os
@@ -48,13 +47,12 @@ _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # in the state folde
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
-MOST_SILENT = 5  # files in turn that a store does not give, before it is asked if it answers
-_CONNECT_S = 10.0
-_AHEAD = 8  # tasks submitted ahead for each thread of a cluster: cancelling 100,000 is slow
+_BATCH = 1000  # tasks in a message to the scheduler: Dask warns of one over 10 MB
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
-# A task whose worker ends is tried again here, alone.
+# A task whose worker ends is tried again here, alone; none waits on a worker meanwhile.
 _SETTINGS = {
     'distributed.scheduler.allowed-failures': 0,
+    'distributed.scheduler.worker-saturation': 1.0,
     'logging': {'distributed': 'critical'},
 }
 
@@ -148,7 +146,7 @@ def _task(
     spacecraft, camera = map(printable, cameras.of(name))
     text = f'{[(entry.name, entry.identity) for entry in files]!r} {settings}'
     return Task(
-        url=places.join(root, name),
+        url=posixpath.join(root, name),
         stamp=hashlib.sha256(text.encode()).hexdigest(),
         files=tuple(entry.url for entry in (*files, *filter(None, [beside]))),
         size=sum(entry.size for entry in files) if all(e.size >= 0 for e in files) else -1,
@@ -243,7 +241,7 @@ class Answer:
 def compute(task: Task) -> Answer:
     """Answer to a task; for one that fails, the row with its error."""
     try:
-        if task.size >= 0 and not places.exists(task.url):
+        if task.size >= 0 and not (places.is_remote(task.url) or os.path.exists(task.url)):
             raise FileNotFoundError(errno.ENOENT, _NOT_SEEN, task.url)
         # The result must not depend on the threads of BLAS.
         with places.fetched(task.url, task.files, task.size) as path, processes.one_blas_thread():
@@ -314,30 +312,13 @@ class Done:
     """
     How many tasks were computed, failed, or have a row in the table.
 
-    ``unreachable``: the reasons of those that failed and have no row; ``silent``: how many files
-    in turn a store did not give in the end.
+    ``unreachable``: the reasons of those that failed and have no row.
     """
 
     computed: int = 0
     failed: int = 0
     known: int = 0
     unreachable: list[str] = field(default_factory=list)
-    silent: int = 0
-
-    def count(self, table: trend_table.Table, task: Task, answer: Answer) -> None:
-        """Put an answer into the table, and count it."""
-        row = answer.row
-        self.silent = 0 if row or not places.is_remote(task.url) else self.silent + 1
-        self.failed += not row or bool(row.error)
-        if row is None:
-            self.unreachable.append(answer.unreachable)
-            return
-        if answer.calibration:
-            folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
-            products.make_folder(folder)
-            product_files.write_atomically(folder / CALIBRATION_FILE, answer.calibration)
-        table.add(row)
-        self.computed += not row.error
 
 
 def update(
@@ -346,17 +327,17 @@ def update(
     workers: int = 0,
     scheduler: str = '',
     on_row: Callable[[], None] = lambda: None,
+    root: str = os.sep,
 ) -> Done:
     """
-    Add the rows of the tasks that the table does not have; a task is taken when it is submitted.
+    Add the rows of the tasks that the table does not have.
 
     A task that ends its worker process, also alone, becomes the row of a failure; the others go
-    on.  A file that cannot be reached has no row, so the next run tries it again.  The run ends
-    early, and the next one continues, once a store has not given 5 files in turn and does not say
-    whether the last one exists.
+    on.  A file that cannot be reached has no row, so the next run tries it again.
     The calibration of a bag is written beside the table before its row, and each row is on disk
     before the next, so a run that was stopped starts where it stopped.
-    Raises OptionError when no scheduler answers at the address.
+    Raises OptionError when Dask ends or no scheduler answers, OSError when the root cannot be
+    reached any more.
 
     Parameters
     ----------
@@ -367,135 +348,105 @@ def update(
         no process is started.
     on_row : callable
         Called after each answer.
+    root : str
+        Place of all files; it is asked for after each file that cannot be reached.
     """
-    done, failures = Done(), table.failures()
-    with contextlib.closing(
-        _answers(_not_known(table, tasks, done, failures), workers, scheduler)
-    ) as answers:
-        for task, answer in answers:
-            done.count(table, task, answer)
-            on_row()
-            if done.silent == MOST_SILENT:
-                if not places.is_answered(task.url):
-                    return done
-                done.silent = 0  # by these files only
-    # A file that was repaired or removed is no longer among the tasks.
-    table.forget(failures)
-    return done
-
-
-def _not_known(
-    table: trend_table.Table, tasks: Iterable[Task], done: Done, failures: set[str]
-) -> Iterator[Task]:
-    """Tasks without a row, which are then no longer among the failures; others are counted."""
+    done, listed, new = Done(), set(), []
     for task in tasks:
-        failures.discard(task.stamp)
+        listed.add(task.stamp)
         if table.has(task.stamp, task.spacecraft, task.camera):
             done.known += 1
         else:
-            yield task
-
-
-def _answers(
-    tasks: Iterator[Task], workers: int, scheduler: str
-) -> Generator[tuple[Task, Answer], None, None]:
-    """Tasks with their answers, in any order."""
-    first = list(itertools.islice(tasks, 1))
-    tasks = itertools.chain(first, tasks)
-    if first and (workers or scheduler):
-        try:
-            with _cluster(workers, scheduler) as (client, ahead):
-                yield from _as_completed(client, ahead, tasks)
-        # A worker that is killed while it starts, or a scheduler that is lost.
-        except (RuntimeError, OSError, CancelledError, asyncio.CancelledError) as error:
-            option = f'--scheduler: {scheduler}' if scheduler else f'--workers: {workers}'
-            words = printable(' '.join(str(error).split())).rstrip('.')
-            raise OptionError(
-                f'{option}: Dask ended ({words}; out of memory?): run again to continue after the'
-                ' last row, or without workers'
-            ) from error
-    else:
-        yield from ((task, compute(task)) for task in tasks)
-
-
-def _as_completed(
-    client: Any, ahead: int, tasks: Iterator[Task]
-) -> Generator[tuple[Task, Answer], None, None]:
-    """Answers of a cluster as they come, with ``ahead`` tasks submitted at a time."""
-    from distributed import as_completed, KilledWorker
-
-    running: dict[str, Task] = {}
-    killed: list[Task] = []
-
-    def submit(task: Task) -> Any:
-        future = client.submit(compute, task, pure=False)
-        running[future.key] = task
-        return future
-
-    # The second time alone: with its worker, tasks end that only waited there.
-    for is_alone in (False, True):
-        waiting = iter(killed) if is_alone else tasks
-        first = map(submit, itertools.islice(waiting, 1 if is_alone else ahead))
-        futures = as_completed(first, loop=client.loop)  # type: ignore[no-untyped-call]
-        for future in futures:
-            task, error = running.pop(future.key), future.exception()
-            if error is None:
-                yield task, future.result()
-            elif isinstance(error, KilledWorker) and not is_alone:
-                killed.append(task)
+            new.append(task)
+    is_here = not (new and (workers or scheduler))
+    in_turn = (compute(task) for task in new)
+    with contextlib.closing(in_turn if is_here else _by_dask(new, workers, scheduler)) as answers:
+        for answer in answers:
+            row = answer.row
+            done.failed += row is None or bool(row.error)
+            if row is not None:
+                _keep(table, row, answer.calibration)
+                done.computed += not row.error
             else:
-                if isinstance(error, KilledWorker):
-                    error = 'ends its worker process, also alone: out of memory?'
-                yield task, failed(task, str(error))
-            for task in itertools.islice(waiting, 1):
-                futures.add(submit(task))  # type: ignore[no-untyped-call]
+                done.unreachable.append(answer.unreachable)
+                if not places.exists(root):
+                    raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), root)
+            on_row()
+    # A file that was repaired or removed is no longer among the tasks.
+    table.forget_failures(but=listed)
+    return done
 
 
-def _set_environment(variables: dict[str, str]) -> None:
-    os.environ.clear()
-    os.environ.update(variables)
+def _keep(table: trend_table.Table, row: trend_table.Row, calibration: str) -> None:
+    """Write the calibration of a bag beside the table, then the row."""
+    if calibration:
+        folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
+        products.make_folder(folder)
+        product_files.write_atomically(folder / CALIBRATION_FILE, calibration)
+    table.add(row)
 
 
-@contextlib.contextmanager
-def _cluster(workers: int, address: str) -> Iterator[tuple[Any, int]]:
-    """Client of a Dask cluster, here or at an address, and how many tasks to submit ahead."""
+def _by_dask(tasks: Sequence[Task], workers: int, address: str) -> Generator[Answer, None, None]:
+    """Answers to tasks, as they come."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import as_completed, Client, KilledWorker
 
+    option = f'--scheduler: {address}' if address else f'--workers: {workers}'
     # For another scheme Dask prints a traceback after the time-out.
     if address and not _ADDRESS.fullmatch(address):
-        raise OptionError(f'--scheduler: {address}: not tcp://HOST:PORT or tls://HOST:PORT')
+        raise OptionError(f'{option}: not tcp://HOST:PORT or tls://HOST:PORT')
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(_SETTINGS))
+    before = dict(os.environ)
+    # Neither workers nor the resource tracker that Python starts import from this folder.
+    os.environ['PYTHONSAFEPATH'] = '1'
+    try:
+        with (
+            dask.config.set(_SETTINGS),
+            contextlib.nullcontext(address) if address else _here(workers) as cluster,
+            Client(cluster, set_as_default=False) as client,  # type: ignore[no-untyped-call]
+        ):
+            futures = client.map(compute, tasks, pure=False, batch_size=_BATCH)
+            waiting = {future.key: task for future, task in zip(futures, tasks, strict=True)}
+            completed = as_completed(futures, loop=client.loop)  # type: ignore[no-untyped-call]
+            ended: list[Task] = []
+            del futures  # a worker holds each result while there is a future of it
+            for future in completed:
+                task, error = waiting.pop(future.key), future.exception()
+                if isinstance(error, KilledWorker):
+                    ended.append(task)
+                else:
+                    yield failed(task, str(error)) if error else future.result()
+            # With its worker, tasks end that only waited there: the second time alone.
+            for task in ended:
+                error = (future := client.submit(compute, task, pure=False)).exception()
+                if isinstance(error, KilledWorker):
+                    error = 'ends its worker process, also alone: out of memory?'
+                yield failed(task, str(error)) if error else future.result()
+    # A worker that is killed while it starts, or a scheduler that is lost or not there.
+    except (RuntimeError, OSError, ValueError, CancelledError, asyncio.CancelledError) as error:
+        words = printable(' '.join(str(error).split())).rstrip('.')
+        raise OptionError(
+            f'{option}: Dask ended ({words}; no scheduler, or out of memory?): run again to'
+            ' continue after the last row, or without workers'
+        ) from error
+    finally:
         # Dask sets the variables of its workers in this process, for good.
-        stack.callback(_set_environment, dict(os.environ))
-        # Neither workers nor the resource tracker that Python starts import from this folder.
-        os.environ['PYTHONSAFEPATH'] = '1'
-        cluster: Any = address
-        if not address:
-            import cryptography  # noqa: F401
+        os.environ.clear()
+        os.environ.update(before)
 
-            # Without certificates another user of this machine could send it code.
-            cluster = stack.enter_context(
-                LocalCluster(  # type: ignore[no-untyped-call]
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    memory_limit=None,
-                    host='127.0.0.1',
-                    dashboard_address=None,
-                    # Its default is port 8787 of all addresses, once in a machine.
-                    scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
-                    security=True,
-                    silence_logs=logging.CRITICAL,
-                )
-            )
-        try:
-            client: Any = stack.enter_context(
-                Client(  # type: ignore[no-untyped-call]
-                    cluster, timeout=_CONNECT_S, set_as_default=False
-                )
-            )
-        except (OSError, ValueError, TypeError) as error:
-            raise OptionError(f'--scheduler: {address}: {error}') from error
-        yield client, workers or _AHEAD * max(1, sum(client.nthreads().values()))
+
+def _here(workers: int) -> contextlib.AbstractContextManager[Any]:
+    """A cluster on this machine that no other user reaches."""
+    import cryptography  # noqa: F401
+    from distributed import LocalCluster
+
+    return LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=workers,
+        threads_per_worker=1,
+        memory_limit=None,  # at the limit a worker pauses, and may never go on
+        host='127.0.0.1',
+        dashboard_address='127.0.0.1:0',
+        # Without certificates another user of this machine could send it code.
+        security=True,
+        silence_logs=logging.CRITICAL,
+    )

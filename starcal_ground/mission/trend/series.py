@@ -31,8 +31,9 @@ from starcal_ros.records import CameraGeometry
 
 FEWEST = 6  # measurements; with fewer, a step and a drift are one
 MAX_P_VALUE = 1e-3  # with a dozen series on a page, one false finding in a hundred pages
-_DRIFT, _TEMPERATURE = 'drift', 'temperature'
+_DRIFT, _TEMPERATURE, _STEP = 'drift', 'temperature', 'step'
 _STEP_SIDE = 2  # measurements on each side of a step: one alone is an outlier
+_MOST_PLACES = 1000  # places of a step that are tested: 0.3 s for as many measurements
 SECONDS_PER_YEAR = 365.25 * 86400.0  # Julian year, IAU
 
 
@@ -79,117 +80,74 @@ def trend_of(
     Temperatures that are not all known, or all equal, are no regressor.
     """
     n = len(value)
-    sigma = np.where(sigma > 0, sigma, np.nan)
-    if n < FEWEST or not np.isfinite(sigma).all():
+    if n < FEWEST or not (np.isfinite(sigma) & (sigma > 0)).all():
         return Trend((), np.full(n, float(np.mean(value))) if n else np.empty(0), np.nan)
-    columns = _columns(time_s, temperature_degc)
-    chosen: list[str] = []
-    while True:
-        p_values = _p_values(columns, chosen, value, sigma)
-        p, best = min((p, name) for name, p in p_values.items() if name not in chosen)
-        if p > max_p_value or len(chosen) >= n // 3:
+    kinds, columns, trials = _candidates(time_s, temperature_degc)
+    A, b = columns / sigma[:, None], value / sigma
+
+    def beside(k: int, others: list[int]) -> float:
+        return float(_p_values(A, b, [c for c in others if c != k], trials)[k])
+
+    chosen = [0]
+    while len(chosen) <= n // 3:
+        p_values = _p_values(A, b, chosen, trials)
+        best = int(np.argmin(p_values))
+        if p_values[best] > max_p_value:
             break
-        chosen = _still_needed(columns, [*chosen, best], value, sigma, max_p_value)
+        chosen.append(best)
+        while len(chosen) > 2:  # without those that the others have made superfluous
+            p, worst = max((beside(k, chosen), k) for k in chosen[1:])
+            if p <= max_p_value:
+                break
+            chosen.remove(worst)
         if best not in chosen:
             break
-    return _fitted(columns, chosen, value, sigma)
+    inverse = np.linalg.pinv(A[:, chosen].T @ A[:, chosen], rcond=1e-12, hermitian=True)
+    x = inverse @ (A[:, chosen].T @ b)
+    fit = columns[:, chosen] @ x
+    scale = float(np.sum(((value - fit) / sigma) ** 2)) / (n - len(chosen))
+    error = np.sqrt(np.diag(inverse) * max(scale, 1.0))
+    terms = [
+        Term(kinds[k][0], float(size), float(sigma), beside(k, chosen), kinds[k][1])
+        for k, size, sigma in zip(chosen[1:], x[1:], error[1:], strict=True)
+    ]
+    terms.sort(key=lambda term: (term.after, term.kind))
+    return Trend(tuple(terms), fit, math.sqrt(scale))
 
 
-def _columns(time_s: Floats, temperature_degc: Floats) -> dict[str, Floats]:
-    """Regressors (n,) by name, '' the constant; those of steps are made when they are needed."""
-    years = (time_s - time_s.mean()) / SECONDS_PER_YEAR
-    columns = {'': np.ones(len(time_s)), _DRIFT: years}
+def _candidates(
+    time_s: Floats, temperature_degc: Floats
+) -> tuple[list[tuple[str, int]], Floats, Floats]:
+    """Kinds of terms with the measurement before a step, regressors (n, m), and trials of each."""
+    n = len(time_s)
+    kinds, columns = [('', -1), (_DRIFT, -1)], [np.ones(n), (time_s - time_s.mean())]
+    columns[1] = columns[1] / SECONDS_PER_YEAR
     if np.isfinite(temperature_degc).all() and np.ptp(temperature_degc) > 0:
-        columns[_TEMPERATURE] = temperature_degc - temperature_degc.mean()
-    return columns
+        kinds.append((_TEMPERATURE, -1))
+        columns.append(temperature_degc - temperature_degc.mean())
+    # Long series are tested at each second place and so on: the memory grows with the square.
+    places = range(_STEP_SIDE - 1, n - _STEP_SIDE, 1 + n // _MOST_PLACES)
+    steps = np.arange(n)[:, None] > np.array(places)
+    trials = np.repeat([1.0, len(places)], [len(kinds), len(places)])
+    return [*kinds, *((_STEP, k) for k in places)], np.column_stack([*columns, steps]), trials
 
 
-def _matrix(columns: dict[str, Floats], chosen: Sequence[str]) -> Floats:
-    """Regressors (n, 1 + c) of the constant and the chosen terms; a step is named ``step 7``."""
-    measurement, matrix = np.arange(len(columns[''])), [columns['']]
-    for name in chosen:
-        kind, _, after = name.partition(' ')
-        matrix.append(np.asarray(measurement > int(after), np.float64) if after else columns[kind])
-    return np.stack(matrix, axis=1)
-
-
-def _solve(
-    columns: dict[str, Floats], chosen: Sequence[str], value: Floats, sigma: Floats
-) -> tuple[Floats, Floats, float]:
-    """Coefficients of the constant and the chosen terms, their covariance, and chi^2."""
-    A = _matrix(columns, chosen) / sigma[:, None]
-    b = value / sigma
-    inverse = np.asarray(np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True), np.float64)
-    x = inverse @ (A.T @ b)
-    return x, inverse, float(np.sum((b - A @ x) ** 2))
-
-
-def _p_values(
-    columns: dict[str, Floats], chosen: Sequence[str], value: Floats, sigma: Floats
-) -> dict[str, float]:
+def _p_values(A: Floats, b: Floats, chosen: list[int], trials: Floats) -> Floats:
     """
-    p-values of all terms, each beside the chosen ones; 1 for those.
+    p-values (m,) of all terms, each beside the chosen ones; 1 for those.
 
     A term lowers chi^2 by the square of the residual along the part of its column that is
-    orthogonal to the columns of the chosen ones, so all are judged by one factorisation.  The
-    sums of a step are those over the measurements after it: time and memory grow with n.
+    orthogonal to the columns of the chosen ones, so all are judged by one factorisation.
     """
-    n, w = len(value), 1.0 / sigma[:, None]
-    Q, _ = np.linalg.qr(_matrix(columns, chosen) * w)
-    b = value / sigma
-    b = b - Q @ (Q.T @ b)
-    names = [name for name in columns if name]
-    places = range(_STEP_SIDE - 1, n - _STEP_SIDE)
-    terms = np.hstack([w, b[:, None], Q]) * w  # times a column, for the sums below
-    C = np.stack([columns[name] for name in names], axis=1)
-    sums = np.vstack([C.T @ terms, np.cumsum(terms[::-1], axis=0)[::-1][places.start + 1 :]])
-    sums = sums[: len(names) + len(places)]
-    sums[: len(names), 0] = np.sum((C * w) ** 2, axis=0)
-    squares, along_b, along_Q = sums[:, 0], sums[:, 1], sums[:, 2:]
-    remaining = squares - np.sum(along_Q**2, axis=1)
+    Q, _ = np.linalg.qr(A[:, chosen])
+    left, b = A - Q @ (Q.T @ A), b - Q @ (Q.T @ b)
+    remaining = np.sum(left**2, axis=0)
     # A column that the chosen ones span lowers nothing.
-    gain = np.where(remaining > 1e-12 * squares, along_b**2 / np.maximum(remaining, 1e-300), 0.0)
-    freedom = n - len(chosen) - 2
+    is_new = remaining > 1e-12 * np.sum(A**2, axis=0)
+    gain = np.where(is_new, (b @ left) ** 2 / np.where(is_new, remaining, 1.0), 0.0)
+    freedom = len(b) - len(chosen) - 1
     F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
-    p_values = fdtrc(1, freedom, np.maximum(F, 0.0))
-    p_values[len(names) :] *= len(places)
-    names += [f'step {k}' for k in places]
-    return dict(zip(names, np.minimum(p_values, 1.0).tolist(), strict=True))
-
-
-def _still_needed(
-    columns: dict[str, Floats],
-    chosen: list[str],
-    value: Floats,
-    sigma: Floats,
-    max_p_value: float,
-) -> list[str]:
-    """The chosen terms without those that the others have made superfluous."""
-    while len(chosen) > 1:
-        p_values = {
-            name: _p_values(columns, [c for c in chosen if c != name], value, sigma)[name]
-            for name in chosen
-        }
-        worst = max(p_values, key=lambda name: p_values[name])
-        if p_values[worst] <= max_p_value:
-            break
-        chosen = [name for name in chosen if name != worst]
-    return chosen
-
-
-def _fitted(columns: dict[str, Floats], chosen: list[str], value: Floats, sigma: Floats) -> Trend:
-    x, inverse, chi2 = _solve(columns, chosen, value, sigma)
-    scale = max(chi2 / (len(value) - len(chosen) - 1), 0.0)
-    error = np.sqrt(np.diag(inverse) * max(scale, 1.0))
-    terms = []
-    for k, name in enumerate(chosen, start=1):
-        others = [other for other in chosen if other != name]
-        p = _p_values(columns, others, value, sigma)[name]
-        kind, _, after = name.partition(' ')
-        terms.append(Term(kind, float(x[k]), float(error[k]), p, int(after) if after else -1))
-    fit = _matrix(columns, chosen) @ x
-    terms.sort(key=lambda term: (term.after, term.kind))
-    return Trend(tuple(terms), np.asarray(fit), float(np.sqrt(scale)))
+    return np.asarray(np.minimum(trials * fdtrc(1, freedom, np.maximum(F, 0.0)), 1.0))
 
 
 _GRID = (15, 12)  # columns and rows of pixels that changes are taken over
@@ -381,29 +339,3 @@ def distinct(rows: Sequence[Row]) -> list[Row]:
         key = row.first_ns, row.last_ns, row.values, row.star_tracker_from_camera_xyzw
         first.setdefault(key, row)
     return list(first.values())
-
-
-_ATTENTION = {'drift': 'drifting', 'step': 'stepped'}
-
-
-@dataclass(frozen=True)
-class Overview:
-    """
-    A camera as a line among others.
-
-    ``verdict``: stepped, drifting, changed since the active calibration; too few to tell; or
-    sound.  Temperature asks for nothing to be done.
-    """
-
-    name: str
-    verdict: str
-    needs_attention: bool
-
-
-def overview_of(name: str, shown: Sequence[Series], is_stable: bool | None) -> Overview:
-    """Overview of a camera with these series; ``is_stable`` is None if too few tell."""
-    kinds = {term.kind for _, term in findings(shown)}
-    reasons = [word for kind, word in _ATTENTION.items() if kind in kinds]
-    reasons += ['changed'] if is_stable is False else []
-    calm = 'too few to tell' if is_stable is None else 'sound'
-    return Overview(name, ', '.join(reasons) or calm, bool(reasons))

@@ -28,6 +28,7 @@ _HEIGHT = 270.0
 _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
 _TICKS = 6
 _STEPS_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240)
+_ATTENTION = {'drift': 'drifting', 'step': 'stepped'}
 _PER = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}
 _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axis
 
@@ -43,14 +44,20 @@ class Page:
 
 @dataclass(frozen=True)
 class _Judged:
-    """A camera with its overview, calibrations, those that differ, series, and its verdict."""
+    """
+    A camera with its calibrations, those that differ, series, and its verdict.
 
-    overview: trends.Overview
+    ``px`` is the change of the newest calibration against the active one; NaN without one.
+    """
+
+    name: str
     group: Sequence[Row]
     rows: Sequence[Row]
     shown: Sequence[trends.Series]
+    px: float
     is_stable: bool | None
-    verdict: tuple[str, str]
+    verdict: tuple[str, ...]
+    attention: str
 
 
 def write_page(
@@ -65,22 +72,26 @@ def write_page(
     max_p_value = trends.MAX_P_VALUE / max(camera_count, 1)
     failures: list[Row] = []
     drawn: list[_Judged] = []
-    lines: list[tuple[trends.Overview, int, str, float, str]] = []
+    lines: list[tuple[str, str, str, int, str, float, str]] = []
     failed = count = 0
     for rows in cameras:
         bad = [row for row in rows if row.error]
         failures += bad[: _LISTED - len(failures)]
         failed, count = failed + len(bad), count + len(rows) - len(bad)
         for name, group in trends.groups(rows).items():
-            camera, px = _judged(name, group, max_p_value)
-            newest = utc_text(camera.rows[-1].time_ns)[:10]
-            lines.append((camera.overview, len(camera.rows), newest, px, camera.verdict[1]))
-            drawn = sorted([*drawn, camera], key=_order)[:_DRAWN]
-    lines.sort(key=lambda line: (not line[0].needs_attention, -np.nan_to_num(line[3])))
+            one = _judged(name, group, max_p_value)
+            calm = 'too few to tell' if one.is_stable is None else 'sound'
+            newest = utc_text(one.rows[-1].time_ns)[:10]
+            found = one.verdict[1]
+            lines.append((name, one.attention, calm, len(one.rows), newest, one.px, found))
+            drawn = sorted(
+                [*drawn, one], key=lambda one: (not one.attention, -len(one.group), one.name)
+            )[:_DRAWN]
+    lines.sort(key=lambda line: (not line[1], -np.nan_to_num(line[5])))
     text = page.page_template('trend.html').render(
         root=printable(root),
         lines=lines if len(lines) > 1 else (),
-        attention=sum(overview.needs_attention for overview, *_ in lines),
+        attention=sum(bool(attention) for _, attention, *_ in lines),
         cameras=[_camera(camera) for camera in drawn],
         failures=[(row.path, row.error) for row in failures],
         failure_count=failed,
@@ -92,22 +103,30 @@ def write_page(
     return Page(path, count, tuple(failures))
 
 
-def _order(camera: _Judged) -> tuple[bool, int, str]:
-    """Sort key of the cameras with figures."""
-    return not camera.overview.needs_attention, -len(camera.group), camera.overview.name
-
-
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
-def _judged(name: str, group: Sequence[Row], max_p_value: float) -> tuple[_Judged, float]:
-    """A camera, and the change of its newest calibration against the active one, px."""
-    rows = trends.distinct(group)
-    active = trends.activations(group)
-    shown = trends.series_of(rows, max_p_value)
-    new = trends.changes(group, active[-1:])
+def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
+    rows, active = trends.distinct(group), trends.activations(group)
+    shown, new = trends.series_of(rows, max_p_value), trends.changes(group, active[-1:])
     is_stable, verdict = verdict_of(rows, group, active, new, shown)
-    overview = trends.overview_of(name, shown, is_stable)
     px = new[-1].line_of_sight_px if new else math.nan
-    return _Judged(overview, group, rows, shown, is_stable, verdict), px
+    missed = tuple(text for text in rows[-1].requirements if not text.endswith(': met'))
+    attention = attention_of(shown, is_stable, missed)
+    sentences = *verdict, *(f'Missed by the newest: {text}.' for text in missed)
+    return _Judged(name, group, rows, shown, px, is_stable, sentences, attention)
+
+
+def attention_of(
+    shown: Sequence[trends.Series], is_stable: bool | None, missed: Sequence[str] = ()
+) -> str:
+    """
+    Why a camera needs attention: drifting, stepped, changed, misses a requirement.
+
+    Empty if it needs none.  Temperature asks for nothing to be done.
+    """
+    kinds = {term.kind for series in shown for term in series.trend.terms}
+    reasons = [word for kind, word in _ATTENTION.items() if kind in kinds]
+    reasons += ['changed'] * (is_stable is False)
+    return ', '.join(reasons + ['misses a requirement'] * bool(missed))
 
 
 @np.errstate(all='ignore')
@@ -119,7 +138,7 @@ def _camera(judged: _Judged) -> dict[str, object]:
     charts = [_change_chart(group, new)] if new else []
     charts += [_chart(series, rows) for series in shown]
     return {
-        'name': judged.overview.name,
+        'name': judged.name,
         'headline': _HEADLINES[judged.is_stable],
         'verdict': judged.verdict,
         'rows': rows,

@@ -25,12 +25,13 @@ import weakref
 
 import numpy as np
 
-from starcal_ros import files, untrusted
+from starcal_ros import untrusted
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.gate import requirement_answers
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, software_version
-from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.errors import ProductError
 from starcal_ros.record_fields import check_shape, Finite, json_object, read_record, Stamp
 from starcal_ros.records import Calibration, CameraGeometry, check_drawable
 from starcal_ros.text import printable
@@ -52,6 +53,7 @@ class Row:
     ``stamp`` is the digest of name, size and time, or etag, of the file when it was read.
     ``kind`` is ``recorded`` (read from a file), ``computed`` (from a bag) or ``failed``.  Times
     are of the middle, first and last image; ``active_since_ns`` is 0 where it was not activated.
+    ``requirements`` are a sentence on each requirement, with its answer.
     ``sigmas`` has those of ``values``, then of three alignment angles (rad);
     ``boresight_sigma_arcsec`` is about x and y of the camera, of the middle of the detector, in
     the star tracker frame.
@@ -70,6 +72,7 @@ class Row:
     accepted: bool = False
     forced: bool = False
     reasons: str = ''
+    requirements: tuple[str, ...] = ()
     parent_frame: str = ''
     child_frame: str = ''
     lens_model: str = ''
@@ -133,6 +136,7 @@ def row_of(
         accepted=calibration.accepted,
         forced=calibration.forced,
         reasons='; '.join(calibration.reasons),
+        requirements=requirement_answers(calibration),
         parent_frame=calibration.parent_frame,
         child_frame=calibration.child_frame,
         lens_model=camera.model,
@@ -183,7 +187,7 @@ def _boresight_sigma(calibration: Calibration) -> Floats:
     return np.asarray(np.sqrt(np.diag(covariance)[[1, 0]]) / ARCSECOND_RAD)
 
 
-TABLE_FILE, PARQUET_FILE = 'trend.sqlite', 'trend.parquet'
+TABLE_FILE = 'trend.sqlite'
 _WAIT_S = 60.0  # for the transaction of another run
 _COLUMNS: dict[str, Any] = get_type_hints(Row)
 _TYPES = {int: 'integer', bool: 'integer', float: 'real', str: 'text'}
@@ -223,14 +227,14 @@ class Table:
 
     def has(self, stamp: str, spacecraft: str, camera: str) -> bool:
         """True for the row of a stamp and camera, recorded or made by this version."""
+        of_task = stamp, spacecraft, camera, RECORDED, f'starcal {software_version()}'
         with self._naming():
-            return bool(
-                self._db.execute(
-                    'SELECT 1 FROM calibration WHERE stamp = ? AND spacecraft = ? AND camera = ? '
-                    'AND (kind = ? OR software = ?)',
-                    (stamp, spacecraft, camera, RECORDED, f'starcal {software_version()}'),
-                ).fetchone()
+            found = self._db.execute(
+                'SELECT 1 FROM calibration WHERE stamp = ? AND spacecraft = ? AND camera = ? '
+                'AND (kind = ? OR software = ?)',
+                of_task,
             )
+            return found.fetchone() is not None
 
     def add(self, row: Row) -> None:
         """Add a row; it replaces that of its stamp, of another version or name of the camera."""
@@ -242,22 +246,13 @@ class Table:
                 f'INSERT OR REPLACE INTO calibration ({_NAMES}) VALUES ({places})', values
             )
 
-    def failures(self) -> set[str]:
-        """Stamps of failures."""
+    def forget_failures(self, but: Iterable[str]) -> None:
+        """Remove the failures of all stamps but some."""
         with self._naming():
-            return {
-                stamp
-                for (stamp,) in self._db.execute(
-                    'SELECT stamp FROM calibration WHERE kind = ?', (FAILED,)
-                )
-            }
-
-    def forget(self, stamps: Iterable[str]) -> None:
-        """Remove the failures of some stamps."""
-        with self.transaction():
-            self._db.executemany(
-                "DELETE FROM calibration WHERE stamp = ? AND kind = 'failed'",
-                zip(stamps, strict=True),
+            self._db.execute(
+                'DELETE FROM calibration WHERE kind = ? AND stamp NOT IN '
+                '(SELECT value FROM json_each(?))',
+                (FAILED, json.dumps([*but])),
             )
 
     def names(self) -> list[tuple[str, str]]:
@@ -285,25 +280,6 @@ class Table:
         rows = (row for rows in self.cameras() for row in rows)
         return sorted(rows, key=lambda row: (row.time_ns, row.stamp))
 
-    def write_parquet(self) -> Path:
-        """Write the rows as a Parquet file beside the table, a row group for each camera."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        types = {str: pa.string(), int: pa.int64(), bool: pa.bool_(), float: pa.float64()}
-        types[tuple[str, ...]] = pa.list_(pa.string())
-        types[tuple[float, ...]] = pa.list_(pa.float64())
-        schema = pa.schema([(name, types[kind]) for name, kind in _COLUMNS.items()])
-        path = self.path.with_name(PARQUET_FILE)
-        with (
-            errors_as(ProductError, path, 'written'),
-            files.replacing(path) as file,
-            pq.ParquetWriter(file, schema) as writer,
-        ):
-            for rows in self.cameras():
-                writer.write_table(pa.Table.from_pylist(list(map(json_object, rows)), schema))
-        return path
-
     def _schema(self) -> set[str]:
         statements = self._db.execute('SELECT sql FROM sqlite_master WHERE sql IS NOT NULL')
         return {statement for (statement,) in statements}
@@ -311,17 +287,9 @@ class Table:
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
         """Write what is added in the block at once, or nothing of it."""
-        if self._db.in_transaction:
-            yield
-            return
-        with self._naming():
+        with self._naming(), self._db:
             self._db.execute('BEGIN IMMEDIATE')
-            try:
-                yield
-                self._db.execute('COMMIT')
-            finally:
-                if self._db.in_transaction:
-                    self._db.execute('ROLLBACK')
+            yield
 
     @contextlib.contextmanager
     def _naming(self) -> Iterator[None]:

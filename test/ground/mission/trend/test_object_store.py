@@ -148,7 +148,6 @@ def server(few_images: Path) -> Iterator[Store]:
 def store(server: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     server.reset()
     monkeypatch.setattr(places, 'ANSWER_S', _ANSWER_S)
-    monkeypatch.setattr(places, 'LIST_S', _ANSWER_S)
     monkeypatch.setattr(places, '_SLOWEST', 2**30)
     yield server
     gc.collect()
@@ -221,8 +220,7 @@ def test_a_bag_that_cannot_be_fetched_fails_and_passes(
 def test_a_store_that_falls_silent_ends_the_run(
     store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
-    """Files that a store does not give, where it gives others, hold up no run."""
-    monkeypatch.setattr(fleet, 'MOST_SILENT', 1)
+    """A file that a store does not give, where it gives others, holds up no run."""
     compute = fleet.compute
 
     def while_silent(task: fleet.Task) -> fleet.Answer:
@@ -231,23 +229,13 @@ def test_a_store_that_falls_silent_ends_the_run(
 
     with monkeypatch.context() as patch:
         patch.setattr(fleet, 'compute', while_silent)
-        assert trend(tmp_path) == 3
-    said = capsys.readouterr()
-    assert '0 new, 0 known, 1 failed' in said.out
+        assert trend(tmp_path) == 2
+    said = capsys.readouterr().err
+    assert f'{_FLEET}: cannot be read: no answer in time' in said and said.count('\n') == 1
+    assert Table(tmp_path).rows() == []
     store.faults = {'GET /archive/fleet/0/.*mcap': -1}
     assert trend(tmp_path) == 0
     assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
-    assert 'the last 1 file not readable; run' in said.err and said.err.count('\n') == 1
     store.faults = {}
     assert trend(tmp_path) == 0
     assert '1 new, 1 known, 0 failed' in capsys.readouterr().out
-
-
-def test_a_bucket_is_listed_by_folders_with_a_request_each(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(places, '_TOGETHER', 1)
-    assert [len(found) for found in places.listings('s3://archive')] == [0, 2, 2]
-    # The bucket, its one folder, a probe of the first folder below it; then each of these.
-    assert len(store.requests) == 5
-    assert all('list-type=2' in line for line in store.requests)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 import shutil
 
@@ -71,21 +70,6 @@ def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, capsys) -> N
     assert paths == ['memory://fleet/bag', 'memory://fleet/one/calibration.json']
     assert main([*line[:3], 'memory://fleet/out']) == 2
     assert 'results are written to a local folder, no URL' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(('together', 'lists'), [(100, [13]), (5, [1, 4, 4, 4])])
-def test_a_store_is_listed_by_folders_where_it_has_many_files(
-    monkeypatch: pytest.MonkeyPatch, together: int, lists: list[int]
-) -> None:
-    memory = fsspec.filesystem('memory')
-    for camera, day in itertools.product(range(3), range(4)):
-        memory.pipe(f'/years/fleet/{camera}/{day}/calibration.json', b'1')
-    memory.pipe('/years/fleet/readme', b'1')
-    monkeypatch.setattr(places, '_TOGETHER', together)
-    found = list(places.listings('memory://years'))
-    assert [len(one) for one in found] == lists
-    names = sorted(entry.name for entry in itertools.chain(*found))
-    assert names == sorted(path.removeprefix('/years/') for path in memory.find('/years'))
 
 
 def test_an_unknown_protocol_is_one_line(tmp_path: Path, capsys) -> None:

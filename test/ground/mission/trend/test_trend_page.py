@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from trend_rows import made  # type: ignore[import-not-found]
 
-from starcal_ground.mission.trend.series import Active, Change, overview_of
-from starcal_ground.mission.trend.trend_page import verdict_of, write_page
+from starcal_ground.mission.trend.series import Active, Change
+from starcal_ground.mission.trend.trend_page import attention_of, verdict_of, write_page
+from starcal_ros.records import GateCheck
 
 # Days of calibrations, which one is active, change of each later one (px); then the verdict.
 VERDICTS: Mapping[str, tuple[Sequence[int], int | None, Sequence[float], bool | None, str]] = {
@@ -33,8 +34,7 @@ def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
     is_stable, (judged, found) = verdict_of(rows, rows, active, new, [])
     assert is_stable is expected and words in judged
     assert found == f'Steps and drifts need 6 calibrations; there are {len(rows)}.'
-    overview = overview_of('camera', [], is_stable)
-    assert overview.needs_attention is (expected is False)
+    assert attention_of([], is_stable) == ('changed' if expected is False else '')
 
 
 def test_steps_are_looked_for_in_many() -> None:
@@ -46,3 +46,15 @@ def test_without_an_active_calibration_there_is_no_table_of_them(tmp_path: Path)
     for is_accepted in (False, True):
         write_page([[dataclasses.replace(made(1), accepted=is_accepted)]], 1, tmp_path, 'fleet')
         assert ('Active calibrations' in (tmp_path / 'trend.html').read_text()) is is_accepted
+
+
+@pytest.mark.parametrize(('note', 'is_missed'), [('met', False), ('missed by 0.2 px', True)])
+def test_a_requirement_that_the_newest_misses_is_in_the_verdict(
+    tmp_path: Path, note: str, is_missed: bool
+) -> None:
+    check = GateCheck('map', 'requirements', 0.7, 0.5, 'px', not is_missed, note)
+    write_page([[made(1), made(2, gate=(check,))]], 1, tmp_path, 'fleet')
+    page = (tmp_path / 'trend.html').read_text()
+    words = 'Missed by the newest: map 0.7 px, at most 0.5 px required: missed by 0.2 px.'
+    assert (words in page) is is_missed
+    assert attention_of([], True, [note] * is_missed) == 'misses a requirement' * is_missed

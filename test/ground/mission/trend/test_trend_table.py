@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import contextlib
 import dataclasses
 import gc
 import math
@@ -19,7 +18,6 @@ from typing import Any
 
 from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from starcal_ground.mission.trend.trend_table import (
@@ -61,26 +59,6 @@ def test_a_table_may_be_dropped_in_another_thread(tmp_path: Path) -> None:
     thread.join()
     gc.collect()
     assert [one.stamp for one in Table(tmp_path).rows()] == ['a']
-
-
-def test_parquet_has_the_columns_of_the_table(tmp_path: Path) -> None:
-    rows = [row('a', 3, camera='x'), row('b', 9, camera='y'), failure('c', '/bad', 'no stars')]
-    path = table_of(tmp_path, *rows).write_parquet()
-    columns = [field.name for field in dataclasses.fields(Row)]
-    parquet = pq.read_table(path)
-    with contextlib.closing(sqlite3.connect(tmp_path / TABLE_FILE)) as other:
-        of_sqlite = [name for name, *_ in other.execute('select * from calibration').description]
-    assert parquet.column_names == columns == of_sqlite
-    assert parquet['values'].to_pylist()[1:] == [list(rows[0].values), list(rows[1].values)]
-    assert pq.ParquetFile(path).num_row_groups == 3
-    table_of(tmp_path, row('d')).write_parquet()  # replaces it
-    assert len(pq.read_table(path)) == 4
-
-
-def test_a_parquet_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / 'trend.parquet').mkdir()
-    with pytest.raises(ProductError, match=r'trend\.parquet: cannot be written: Is a directory'):
-        table_of(tmp_path, row('a')).write_parquet()
 
 
 ROWS = {  # what replaces what: rows that are added, stamps and cameras that are left
@@ -131,9 +109,10 @@ def test_a_row_of_this_version_is_not_made_again(tmp_path: Path, case: str) -> N
     made = dataclasses.replace(row('a', software=software), **changed)  # type: ignore[arg-type]
     table = table_of(tmp_path, made)
     assert table.has('a', '', '') is expected
-    assert table.failures() == ({'a'} if made.error else set())
-    table.forget(['a', 'none'])
-    assert table.rows() == ([] if made.stamp == 'a' and made.error else [made])
+    table.forget_failures(but=[made.stamp, 'none'])
+    assert table.rows() == [made]
+    table.forget_failures(but=['none'])
+    assert table.rows() == ([] if made.error else [made])
 
 
 _KILLED = """
