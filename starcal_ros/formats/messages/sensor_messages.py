@@ -399,7 +399,7 @@ def velocity_from_message(message: codec.Message) -> tuple[int, Floats]:
     """
     linear = message.twist.linear
     velocity_m_s = np.array([linear.x, linear.y, linear.z], np.float64)
-    if not float(np.linalg.norm(velocity_m_s)) < FASTEST_M_S:
+    if not math.hypot(*velocity_m_s.tolist()) < FASTEST_M_S:
         raise ValueError(
             f'velocity {velocity_m_s.tolist()} m/s is faster than any spacecraft: left out; send'
             ' m/s'
