@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from starcal_ground.comparison import compare
     from starcal_ground.products import read_residuals
     from starcal_ground.report.page import plot
+    from starcal_ground.undistortion import undistort_maps
     from starcal_ros import (
         Calibration,
         CameraGeometry,
@@ -67,6 +68,7 @@ __all__ = [
     'project',
     'read_calibration',
     'read_residuals',
+    'undistort_maps',
     'write_calibration',
 ]
 
@@ -80,6 +82,7 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
         'observations_of': 'api',
         'plot': 'report.page',
         'read_residuals': 'products',
+        'undistort_maps': 'undistortion',
         'write_calibration': 'api',
     }
 
