@@ -141,3 +141,8 @@ def test_no_image_is_replaced(
         == 2
     )
     assert 'is an input' in capsys.readouterr().err
+    (tmp_path / 'two').mkdir()
+    cv2.imwrite(str(tmp_path / 'two' / 'one.png'), np.zeros((512, 640), np.uint8))
+    both = [str(tmp_path / 'one.png'), str(tmp_path / 'two' / 'one.png')]
+    assert main.main(['undistort', str(tmp_path), *both, '-o', str(tmp_path / 'straight')]) == 2
+    assert 'several images' in capsys.readouterr().err

@@ -38,17 +38,18 @@ def run(args: argparse.Namespace) -> int:
     if not paths:
         raise IngestError(f'{args.images[0]}: no images')
     products.make_folder(args.output)
+    outputs = [undistortion.written_to(path, args.output) for path in paths]
+    if repeated := next((path for path in outputs if outputs.count(path) > 1), None):
+        raise IngestError(f'{repeated}: of several images: straighten them into several folders')
+    camera: Path = args.output / products.CAMERA_INFO_FILE
+    products.check_outputs([*outputs, camera], paths)
     maps = undistortion.undistort_maps(calibration)
     left_out, written = Refusals(), 0
-    for path in paths:
+    for path, output in zip(paths, outputs, strict=True):
         with left_out.of(path):
-            output = undistortion.written_to(path, args.output)
-            products.check_outputs([output], paths)
             undistortion.undistort_file(path, calibration, maps, output)
             written += 1
-    camera: Path = args.output / products.CAMERA_INFO_FILE
     if written:
-        products.check_outputs([camera], paths)
         straight = undistortion.straight_camera(calibration.geometry.camera)
         products.write_camera_info(straight, camera)
     for line in left_out.lines():
