@@ -38,7 +38,7 @@ _LARGEST = 'thin_prism'  # largest model that both GIANT and mrcal have
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
 
 
-def opencv_yaml(calibration: Calibration, _: Request) -> exported.Content:
+def opencv_yaml(calibration: Calibration, _asked: Request) -> exported.Content:
     """
     YAML for ``cv2.FileStorage``: camera matrix, distortion, and the rotation of an alignment.
 
@@ -65,14 +65,14 @@ def opencv_yaml(calibration: Calibration, _: Request) -> exported.Content:
     return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
 
 
-def ros_yaml(calibration: Calibration, _: Request) -> exported.Content:
+def ros_yaml(calibration: Calibration, _asked: Request) -> exported.Content:
     """
     The camera YAML of ROS, and ``alignment.yaml`` for a static transform publisher.
 
     The alignment is a geometry_msgs/TransformStamped.
     """
     camera = calibration.geometry.camera
-    made = exported.fitted(calibration, camera.model, ('skew',))[1]
+    _, made = exported.fitted(calibration, camera.model, ('skew',))
     x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw.tolist()
     content = {
         'header': {'frame_id': calibration.parent_frame},
@@ -90,7 +90,7 @@ def ros_yaml(calibration: Calibration, _: Request) -> exported.Content:
     return dataclasses.replace(made, files=files)
 
 
-def giant_json(calibration: Calibration, _: Request) -> exported.Content:
+def giant_json(calibration: Calibration, _asked: Request) -> exported.Content:
     """
     JSON whose ``OpenCVModel`` holds the keyword arguments of the model.
 
@@ -126,7 +126,7 @@ def giant_json(calibration: Calibration, _: Request) -> exported.Content:
     )
 
 
-def mrcal_cameramodel(calibration: Calibration, _: Request) -> exported.Content:
+def mrcal_cameramodel(calibration: Calibration, _asked: Request) -> exported.Content:
     """Text for ``mrcal.cameramodel``; ``extrinsics`` are rt_cam_ref."""
     own = calibration.geometry.camera.model
     camera, made = exported.fitted(calibration, own if LENSES[own].mrcal else _LARGEST, ('skew',))
