@@ -18,12 +18,10 @@ the verdicts.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-import contextlib
 from pathlib import Path
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import errors_as, OptionError
 
 _SHOWN = 5  # failures, and cameras: the page has all
 
@@ -57,14 +55,14 @@ def run(args: argparse.Namespace) -> int:
     root, cameras = fleet.absolute(args.root), fleet.Cameras(args.cameras, args.params)
     if fleet.is_remote(args.output):
         raise OptionError(f'-o: {args.output}: results are written to a local folder, no URL')
-    with _reading(args.root):
+    with errors_as(OptionError, args.root):
         if not fleet.exists(root):
             raise OptionError(f'{args.root}: no such folder')
     folder = Path(fleet.absolute(args.output))
     make_folder(folder)
     check_outputs([folder / trend_page.TREND_FILE])
     table = trend_table.Table(folder)
-    with terminal.progress_bar(None, 'calibrations') as advance, _reading(args.root):
+    with terminal.progress_bar(None, 'calibrations') as advance, errors_as(OptionError, args.root):
         found = fleet.find(root, cameras)
         done = fleet.update(table, found, args.workers, args.scheduler, advance, root)
     if done == fleet.Done():
@@ -81,11 +79,3 @@ def run(args: argparse.Namespace) -> int:
         terminal.print_wrapped(words)
     terminal.print_text(f'calibrations: {page.calibrations}; look at {page.path}')
     return arguments.EXIT_ACCEPTED if page.calibrations else arguments.EXIT_REFUSED
-
-
-@contextlib.contextmanager
-def _reading(root: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OptionError(f'{root}: cannot be read: {error.strerror or error}') from error

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export import exported
-from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded
+from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded, short
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.detector_field import COSINE_DOMAIN
@@ -401,8 +401,7 @@ def ck_of_images(calibration: Calibration, asked: Request) -> exported.Content:
             )
             data = _ck(spice, structure, ticks, q)
         except spice.SpiceyError as error:
-            words = ' '.join(str(error).split())[:240]
-            raise ProductError(f'{CK_FILE}: {words}') from error
+            raise ProductError(f'{CK_FILE}: {short(error)}') from error
     sigma_px = float(np.median([sigma_px for _, sigma_px in attitudes.values()]))
     loss = exported.Loss('1-sigma of the attitude of an image (median)', sigma_px)
     return exported.Content({CK_FILE: data}, losses=(loss,))

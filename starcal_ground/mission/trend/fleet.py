@@ -156,7 +156,7 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
     def task(name: str, files: Sequence[str], params: str = '') -> Task:
         settings = settings_of(params) if params else ''
         text = f'{[(file, listed[file]) for file in files]!r} {settings}'
-        stamp = hashlib.sha256(text.encode('utf-8', 'surrogateescape')).hexdigest()
+        stamp = hashlib.sha256(text.encode()).hexdigest()
         folder = posixpath.dirname(name)
         # Read with it for the temperature, which decides nothing.
         beside = posixpath.join(folder, products.OBSERVATIONS_FILE)
@@ -291,17 +291,27 @@ def _store(url: str) -> Iterator[tuple[AbstractFileSystem, str]]:
 
 def compute(task: Task) -> Row:
     """Row of a task, of one that fails with its error; raises OSError without its files."""
+    path = Path(task.url)
     try:
         # The result must not depend on the threads of BLAS.
         with _fetched(task) as path, processes.one_blas_thread():
-            return _row(task, path)
-    except (OSError, ModuleNotFoundError) as error:
-        reason = getattr(error, 'strerror', '') or error
-        words = f'{socket.gethostname()}: cannot be read: {reason}'
-        raise OSError(errno.EIO, words, task.url) from error
+            if not task.params:
+                return row_of(task, RECORDED, read_calibration(path), _observations(path))
+            setup = read_setup(Path(task.params))
+            source = Source((path,), Topics(), setup, air_of(setup))
+            campaign = calibrate(observe(chosen(source)))
+            return row_of(task, COMPUTED, campaign.calibration, campaign.observations)
     # One bag must not end a run over thousands, whatever is in it.
     except Exception as error:
-        return failed(task, f'{type(error).__name__}: {error}')
+        for cause in (error, error.__cause__):
+            if isinstance(cause, (OSError, ModuleNotFoundError)):
+                reason = getattr(cause, 'strerror', '') or cause
+                words = f'{socket.gethostname()}: cannot be read: {reason}'
+                raise OSError(errno.EIO, words, task.url) from error
+        words = f'{type(error).__name__}: {error}'
+        if isinstance(error, StarcalError):
+            words = file_kinds.explained(error)
+        return failed(task, words.replace(str(path), task.url))
 
 
 def failed(task: Task, error: str) -> Row:
@@ -312,22 +322,6 @@ def failed(task: Task, error: str) -> Row:
 
 def _row_of(task: Task, kind: str, **values: Any) -> Row:
     return Row(task.stamp, printable(task.url), kind, task.spacecraft, task.camera, **values)
-
-
-def _row(task: Task, path: Path) -> Row:
-    """Row by the file at a path; raises OSError where it cannot be read."""
-    try:
-        if task.params:
-            setup = read_setup(Path(task.params))
-            source = Source((path,), Topics(), setup, air_of(setup))
-            campaign = calibrate(observe(chosen(source)))
-            return row_of(task, COMPUTED, campaign.calibration, campaign.observations)
-        return row_of(task, RECORDED, read_calibration(path), _observations(path))
-    except (StarcalError, ValueError) as error:
-        if isinstance(cause := error.__cause__, OSError):
-            raise cause from error
-        said = file_kinds.explained(error) if isinstance(error, StarcalError) else str(error)
-        return failed(task, said.replace(str(path), task.url))
 
 
 def row_of(
