@@ -25,6 +25,7 @@ from starcal_ground.mission.trend.trend_table import Table as Rows
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.records import Calibration, CameraGeometry
 
 MOST_MB, MOST_S = 300.0, 20.0  # at 100,000 rows; over 10,000
 SIGMA_CENTRE_PX, SIGMA_BORESIGHT_ARCSEC = 0.3, 0.2  # of simulated rows
@@ -115,38 +116,56 @@ def simulated_rows(name: str, months: list[Floats], rng: np.random.Generator) ->
     The errors of the principal point and of the alignment trade: together they move the boresight
     by its much smaller error.
     """
-    names = CameraModel(1296, 1024, months[0][:10]).parameter_names
-    px_arcsec = 1 / months[0][0] / ARCSECOND_RAD
-    sigma_arcsec = np.hypot(SIGMA_CENTRE_PX * px_arcsec, SIGMA_BORESIGHT_ARCSEC)
-    sigmas = (*_SIGMAS.tolist(), *(np.array([sigma_arcsec, sigma_arcsec, 3.0]) * ARCSECOND_RAD))
+    px_rad = 1 / months[0][0]
+    own_rad = np.array([SIGMA_BORESIGHT_ARCSEC, SIGMA_BORESIGHT_ARCSEC, 3.0]) * ARCSECOND_RAD
+    from_errors = np.zeros((13, 13))  # parameters and alignment by independent errors
+    from_errors[:10, :10] = np.diag(_SIGMAS)
+    from_errors[10:, 10:] = np.diag(own_rad)
+    from_errors[10, 4], from_errors[11, 3] = -px_rad * _SIGMAS[4], px_rad * _SIGMAS[3]
     rows = []
     for month, truth in enumerate(months):
-        error = rng.normal(0, _SIGMAS)
-        turn = rng.normal(0, (SIGMA_BORESIGHT_ARCSEC, SIGMA_BORESIGHT_ARCSEC, 3.0))
-        turn += np.array([-error[4], error[3], 0.0]) * px_arcsec
-        quaternion = Rotation.from_rotvec((truth[10:] + turn) * ARCSECOND_RAD).as_quat()
+        error = from_errors @ rng.normal(size=13)
+        turn_rad = truth[10:] * ARCSECOND_RAD + error[10:]
+        camera = CameraModel(1296, 1024, truth[:10] + error[:10], 'plumb_bob')
         first_ns = round((50 + month / 12) * SECONDS_PER_YEAR) * NANOSECONDS_PER_SECOND
-        rows.append(
-            Row(
-                stamp=f'{name} {month}',
-                path=f'/fleet/{name}/{month:03d}',
-                kind=RECORDED,
-                software='starcal 0',
-                time_ns=first_ns + 50,
-                first_ns=first_ns,
-                last_ns=first_ns + 100,
-                accepted=True,
-                child_frame='camera',
-                lens_model='plumb_bob',
-                width=1296,
-                height=1024,
-                names=names,
-                values=tuple((truth[:10] + error).tolist()),
-                sigmas=tuple(map(float, sigmas)),
-                star_tracker_from_camera_xyzw=tuple(quaternion.tolist()),
-                boresight_sigma_arcsec=(SIGMA_BORESIGHT_ARCSEC,) * 2,
-                spacecraft=name,
-                camera='nav',
-            )
+        calibration = dataclasses.replace(
+            _SAMPLE,
+            time_ns=first_ns + 100,
+            first_image_ns=first_ns,
+            geometry=CameraGeometry(camera, Rotation.from_rotvec(turn_rad).as_quat()),
+            covariance=from_errors @ from_errors.T,
         )
+        row = Row(f'{name} {month}', f'/fleet/{name}/{month:03d}', RECORDED, name, 'nav')
+        rows.append(dataclasses.replace(row, time_ns=first_ns + 50, calibration=calibration))
     return rows
+
+
+_SAMPLE = Calibration(
+    time_ns=0,
+    geometry=CameraGeometry(CameraModel(1296, 1024, np.ones(10)), np.array([0.0, 0.0, 0.0, 1.0])),
+    covariance=np.zeros((13, 13)),
+    method='hierarchical',
+    estimated=(),
+    residual_rms_px=0.1,
+    variance_factor=1.0,
+    images_used=16,
+    images_refused={},
+    stars_used=500,
+    stars_rejected=0,
+    alignment_scatter_arcsec=0.0,
+    star_tracker_sigma_arcsec=(3.0, 3.0, 10.0),
+    centroid_scale=1.0,
+    centroid_floor_px=0.0,
+    dropped_catalog_ids=(),
+    misfit_images_ns=(),
+    singular_values=(),
+    weakest_direction='',
+    zero_skew_cost_px=0.0,
+    iterations=1,
+    termination='',
+    accepted=True,
+    reasons=(),
+    parent_frame='star_tracker',
+    child_frame='camera',
+    provenance={},
+)

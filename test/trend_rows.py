@@ -9,7 +9,8 @@ from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.mission.trend.trend_table import RECORDED, Row, row_of
+from starcal_ground.mission.trend.fleet import row_of, Task
+from starcal_ground.mission.trend.trend_table import RECORDED, Row
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Calibration, CameraGeometry
 
@@ -24,4 +25,4 @@ def made(day: int, rotation_arcsec: tuple[float, ...] = (0, 0, 0), **changed: ob
     geometry = CameraGeometry(one.geometry.camera, after.as_quat())
     stamps = {'first_image_ns': day * DAY_NS, 'time_ns': day * DAY_NS + 100}
     one = dataclasses.replace(one, geometry=geometry, **stamps, **changed)  # type: ignore[arg-type]
-    return row_of(one, str(day), f'/{day}', RECORDED, 20.0)
+    return row_of(Task(f'/{day}', str(day)), RECORDED, one)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+import os
 from pathlib import Path
 import re
 from typing import Any
@@ -356,13 +357,13 @@ def files_of(frames: SetupOptions) -> dict[str, Path]:
     return files
 
 
-def _check_relative(files: Mapping[str, Path]) -> None:
-    """Raise OptionError for a relative path without a file in the current folder."""
+def _check_there(files: Mapping[str, Path]) -> None:
+    """Raise OptionError for a path without a file."""
     for name, path in files.items():
-        if not path.is_absolute() and not path.exists():
+        if not os.path.lexists(path):
+            folder = f' in {Path.cwd()}, the working folder; give the absolute path'
             raise OptionError(
-                f'{name}: {path}: no such file in {Path.cwd()}, the working folder; give'
-                ' the absolute path'
+                f'{name}: {path}: no such file{"" if path.is_absolute() else folder}'
             )
 
 
@@ -381,7 +382,7 @@ def option_groups(values: Mapping[str, object]) -> dict[str, Any]:
     }
     for kind in NODE_OPTION_CLASSES:
         options.from_mapping(kind, values)  # a value that is read elsewhere is checked here too
-    _check_relative(files_of(groups['frames']))
+    _check_there(files_of(groups['frames']))
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
     requirements_of(groups['gate'].requirements)
     return groups

@@ -23,7 +23,6 @@ from starcal_ground.bags.reader import read_observations, Topics
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
-from starcal_ground.mission.trend.trend_table import Row
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Calibration, refused_image
 
@@ -90,10 +89,9 @@ def by_python(bag: Path) -> Mapping[str, Any]:
 def by_trend(bag: Path) -> Mapping[str, Any]:
     """Numbers of the row of `starcal trend`."""
     (task,) = fleet.find(str(bag), Cameras(params=str(bag / 'params.yaml')))
-    row = fleet.compute(task).row
-    assert isinstance(row, Row) and not row.error, row
-    sigmas = dict(zip(row.names, row.sigmas, strict=False))
-    return {'images': row.images, 'values': row.values, 'sigma of fx': sigmas['fx']}
+    row = fleet.compute(task)
+    assert row.calibration is not None, row.error
+    return numbers_of(row.calibration)
 
 
 def by_plan(bag: Path, capsys: pytest.CaptureFixture[str]) -> Mapping[str, Any]:

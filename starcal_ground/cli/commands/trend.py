@@ -4,7 +4,8 @@ Follow calibrations over years.
 
 Adds every calibration.json and state folder under ROOT to a table in DIR, one SQLite file. With
 --params it calibrates bags too. Writes trend.html: each parameter, boresight and alignment over
-time, steps and drifts with p-values, and the change that a recalibration would have made.
+time, steps and drifts with p-values, and the change that a recalibration would have made; prints
+the verdicts.
 
   # all calibrations of a mission; another run adds only new ones
   starcal trend mission -o trend
@@ -17,21 +18,19 @@ time, steps and drifts with p-values, and the change that a recalibration would 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-import contextlib
 from pathlib import Path
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import errors_as, OptionError
 
-_FAILURES_SHOWN = 5
+_SHOWN = 5  # failures, and cameras: the page has all
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
     add('root', metavar='ROOT', help=what)
-    what = 'folder for trend.html, the table trend.sqlite and the calibrations of bags'
+    what = 'folder for trend.html and the table trend.sqlite'
     add('-o', '--output', required=True, metavar='DIR', help=what)
     what = (
         'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '
@@ -50,20 +49,20 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.mission.trend import fleet, places, trend_page, trend_table
+    from starcal_ground.mission.trend import fleet, trend_page, trend_table
     from starcal_ground.products import check_outputs, make_folder
 
-    root, cameras = places.absolute(args.root), fleet.read_cameras(args.cameras, args.params)
-    if places.is_remote(args.output):
+    root, cameras = fleet.absolute(args.root), fleet.Cameras(args.cameras, args.params)
+    if fleet.is_remote(args.output):
         raise OptionError(f'-o: {args.output}: results are written to a local folder, no URL')
-    with _reading(args.root):
-        if not places.exists(root):
+    with errors_as(OptionError, args.root):
+        if not fleet.exists(root):
             raise OptionError(f'{args.root}: no such folder')
-    folder = Path(places.absolute(args.output))
+    folder = Path(fleet.absolute(args.output))
     make_folder(folder)
     check_outputs([folder / trend_page.TREND_FILE])
     table = trend_table.Table(folder)
-    with terminal.progress_bar(None, 'calibrations') as advance, _reading(args.root):
+    with terminal.progress_bar(None, 'calibrations') as advance, errors_as(OptionError, args.root):
         found = fleet.find(root, cameras)
         done = fleet.update(table, found, args.workers, args.scheduler, advance, root)
     if done == fleet.Done():
@@ -73,15 +72,10 @@ def run(args: argparse.Namespace) -> int:
     page = trend_page.write_page(table.cameras(), len(table.names()), folder, args.root)
     terminal.print_text(f'{done.computed} new, {done.known} known, {done.failed} failed')
     failures = [*done.unreachable, *(f'{row.path}: {row.error}' for row in page.failures)]
-    for failure in failures[:_FAILURES_SHOWN]:
+    for failure in failures[:_SHOWN]:
         terminal.print_text(f'failed: {failure}')
+    for verdict in page.verdicts[:_SHOWN]:
+        words = f'{verdict.name}: {verdict.word}. {" ".join(verdict.sentences)}'
+        terminal.print_wrapped(words)
     terminal.print_text(f'calibrations: {page.calibrations}; look at {page.path}')
     return arguments.EXIT_ACCEPTED if page.calibrations else arguments.EXIT_REFUSED
-
-
-@contextlib.contextmanager
-def _reading(root: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OptionError(f'{root}: cannot be read: {error.strerror or error}') from error

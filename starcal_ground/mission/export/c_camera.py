@@ -15,6 +15,7 @@ from importlib import resources
 import re
 import struct
 import sys
+from typing import TYPE_CHECKING
 import zlib
 
 import numpy as np
@@ -28,6 +29,9 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import calibration_text
 from starcal_ros.records import Calibration, ResidualField
+
+if TYPE_CHECKING:
+    from starcal_ground.mission.export.export_formats import Request
 
 TABLE_FILE = 'starcal_camera.bin'
 _MAGIC = b'STARCALT'
@@ -43,9 +47,9 @@ _NO_VARIANCE = 1e-14  # relative eigenvalue of the scaled covariance that is rou
 _BYTES_A_LINE = 20
 
 
-def c_content(calibration: Calibration, table: bool) -> Content:
+def c_content(calibration: Calibration, asked: Request) -> Content:
     """C99 source of a calibration, or the table of its numbers alone."""
-    return Content({TABLE_FILE: c_table(calibration)} if table else c_files(calibration))
+    return Content({TABLE_FILE: c_table(calibration)} if asked.table else c_files(calibration))
 
 
 def c_files(calibration: Calibration) -> dict[str, str]:

@@ -18,23 +18,27 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from starcal_ground.mission.export import exported
-from starcal_ground.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
+from starcal_ground.mission.export.spice import checked_names, kernel_text, SpiceNames, UM_PER_MM
 from starcal_ground.products import CAMERA_INFO_FILE, camera_info_text, yaml_text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import LENSES, ros_distortion
 from starcal_ros.records import Calibration
 
+if TYPE_CHECKING:
+    from starcal_ground.mission.export.export_formats import Request
+
 _LARGEST = 'thin_prism'  # largest model that both GIANT and mrcal have
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
 
 
-def opencv_yaml(calibration: Calibration) -> exported.Content:
+def opencv_yaml(calibration: Calibration, _asked: Request) -> exported.Content:
     """
     YAML for ``cv2.FileStorage``: camera matrix, distortion, and the rotation of an alignment.
 
@@ -61,7 +65,7 @@ def opencv_yaml(calibration: Calibration) -> exported.Content:
     return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
 
 
-def ros_yaml(calibration: Calibration) -> exported.Content:
+def ros_yaml(calibration: Calibration, _asked: Request) -> exported.Content:
     """
     The camera YAML of ROS, and ``alignment.yaml`` for a static transform publisher.
 
@@ -86,7 +90,7 @@ def ros_yaml(calibration: Calibration) -> exported.Content:
     return dataclasses.replace(made, files=files)
 
 
-def giant_json(calibration: Calibration) -> exported.Content:
+def giant_json(calibration: Calibration, _asked: Request) -> exported.Content:
     """
     JSON whose ``OpenCVModel`` holds the keyword arguments of the model.
 
@@ -122,7 +126,7 @@ def giant_json(calibration: Calibration) -> exported.Content:
     )
 
 
-def mrcal_cameramodel(calibration: Calibration) -> exported.Content:
+def mrcal_cameramodel(calibration: Calibration, _asked: Request) -> exported.Content:
     """Text for ``mrcal.cameramodel``; ``extrinsics`` are rt_cam_ref."""
     own = calibration.geometry.camera.model
     camera, made = exported.fitted(calibration, own if LENSES[own].mrcal else _LARGEST, ('skew',))
@@ -161,12 +165,13 @@ _HALF_PX = 0.5
 _ISIS_FIRST_PX = 1.0
 
 
-def isd_files(calibration: Calibration, names: SpiceNames) -> exported.Content:
+def isd_files(calibration: Calibration, asked: Request) -> exported.Content:
     """
     JSON with the keys of a frame camera in an ISD that a calibration determines; and an ISIS IK.
 
     Without a pixel size a pixel counts as 1 mm; lines of sight do not depend on it.
     """
+    names = checked_names(asked.names)
     isis, loss = _isis_kernel(calibration, names)
     camera, made = exported.fitted(calibration, 'plumb_bob', ())
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()

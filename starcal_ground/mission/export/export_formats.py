@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,56 +58,17 @@ class Format:
     has_table: bool = False
 
 
-# Each imports its own: `starcal --help` reads the rows, and would take a second longer.
+Maker = Callable[['Calibration', Request], 'Content']
 
 
-def _spice(made: Calibration, asked: Request) -> Content:
-    from starcal_ground.mission.export import spice
+def _by(module: str, name: str) -> Maker:
+    """A function of this folder; `starcal --help` reads the rows without its imports, a second."""
 
-    return spice.spice_kernels(made, spice.checked_names(asked.names))
+    def make(made: Calibration, asked: Request) -> Content:
+        maker: Maker = getattr(importlib.import_module(f'{__package__}.{module}'), name)
+        return maker(made, asked)
 
-
-def _ck(made: Calibration, asked: Request) -> Content:
-    from starcal_ground.mission.export import spice
-
-    names = spice.checked_names(asked.names)
-    return spice.ck_of_images(made, asked.observations, names, asked.kernels)
-
-
-def _isd(made: Calibration, asked: Request) -> Content:
-    from starcal_ground.mission.export import camera_models, spice
-
-    return camera_models.isd_files(made, spice.checked_names(asked.names))
-
-
-def _opencv(made: Calibration, _: Request) -> Content:
-    from starcal_ground.mission.export import camera_models
-
-    return camera_models.opencv_yaml(made)
-
-
-def _ros(made: Calibration, _: Request) -> Content:
-    from starcal_ground.mission.export import camera_models
-
-    return camera_models.ros_yaml(made)
-
-
-def _giant(made: Calibration, _: Request) -> Content:
-    from starcal_ground.mission.export import camera_models
-
-    return camera_models.giant_json(made)
-
-
-def _mrcal(made: Calibration, _: Request) -> Content:
-    from starcal_ground.mission.export import camera_models
-
-    return camera_models.mrcal_cameramodel(made)
-
-
-def _c(made: Calibration, asked: Request) -> Content:
-    from starcal_ground.mission.export import c_camera
-
-    return c_camera.c_content(made, asked.table)
+    return make
 
 
 def _wcs(made: Calibration, asked: Request) -> Content:
@@ -122,7 +84,7 @@ FORMATS = (
         '`camera.tf`: the camera as TKFRAME in the star tracker frame; `camera.ti`: field of view,'
         ' lens model, skew, field, sigmas, with the equations in comments',
         'changes with temperature are keywords that SPICE does not apply',
-        _spice,
+        _by('spice', 'spice_kernels'),
         needs_alignment=True,
     ),
     Format(
@@ -130,7 +92,7 @@ FORMATS = (
         'attitude at each image for SPICE, with --kernels',
         '`camera.bc`: attitude at each image by its stars, type 3 (below)',
         'sigma and attitudes between images',
-        _ck,
+        _by('spice', 'ck_of_images'),
         needs_alignment=True,
         needs_observations=True,
     ),
@@ -149,7 +111,7 @@ FORMATS = (
         "`camera_isd.json`: the camera's keys of an ALE ISD (`radtan`); `camera_isis.ti`: ISIS"
         ' keywords (`OD_K`)',
         'field and terms that `plumb_bob` lacks; ISIS: all but radial distortion',
-        _isd,
+        _by('camera_models', 'isd_files'),
     ),
     Format(
         'c',
@@ -157,7 +119,7 @@ FORMATS = (
         '`starcal_camera.h` and `starcal_camera.c` for flight software, or `starcal_camera.bin`'
         ' with `--table` ([onboard.md](onboard.md))',
         '1-sigma of the changes with temperature',
-        _c,
+        _by('c_camera', 'c_content'),
         has_table=True,
     ),
     Format(
@@ -165,28 +127,28 @@ FORMATS = (
         'arguments of GIANT',
         "`giant_camera.json`: arguments of GIANT's `OpenCVModel`",
         'field, tilt, `equidistant`',
-        _giant,
+        _by('camera_models', 'giant_json'),
     ),
     Format(
         'mrcal',
         'a model of mrcal',
         '`camera.cameramodel`; its reference frame is the star tracker',
         'skew, field, tilt, `equidistant`',
-        _mrcal,
+        _by('camera_models', 'mrcal_cameramodel'),
     ),
     Format(
         'opencv',
         'YAML of OpenCV',
         '`opencv.yaml` for `cv2.FileStorage`',
         'skew, field',
-        _opencv,
+        _by('camera_models', 'opencv_yaml'),
     ),
     Format(
         'ros',
         'YAML of ROS',
         '`camera_info.yaml` and `alignment.yaml` (TransformStamped)',
         'skew, field',
-        _ros,
+        _by('camera_models', 'ros_yaml'),
         needs_alignment=True,
     ),
 )

@@ -18,13 +18,13 @@ from pathlib import Path
 import re
 import tempfile
 import textwrap
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export import exported
-from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded
+from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded, short
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.detector_field import COSINE_DOMAIN
@@ -34,6 +34,9 @@ from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
+
+if TYPE_CHECKING:
+    from starcal_ground.mission.export.export_formats import Request
 
 _LONGEST_NAME = 32  # pool variables and frames: SPICE Required Reading, kernel.req, frames.req
 _COMMENT_COLUMNS = 78  # longer lines are read, but NAIF asks for no more than 80
@@ -69,12 +72,13 @@ class SpiceNames:
         return self.instrument_id or _INSTRUMENTS_PER_SPACECRAFT * self.spacecraft_id - 1
 
 
-def spice_kernels(calibration: Calibration, names: SpiceNames) -> exported.Content:
+def spice_kernels(calibration: Calibration, asked: Request) -> exported.Content:
     """
     The FK and the IK of a calibration.
 
-    Raises OptionError for frame names that SPICE does not allow.
+    Raises OptionError for names that SPICE does not allow.
     """
+    names = checked_names(asked.names)
     camera_frame = _frame_name(names.camera_frame or calibration.child_frame, '--camera-frame')
     tracker_frame = _frame_name(
         names.star_tracker_frame or calibration.parent_frame, '--star-tracker-frame'
@@ -362,22 +366,24 @@ def attitude_by_stars(
     return rotation, float(1.0 / np.sqrt(information[used].sum()))
 
 
-def ck_of_images(
-    calibration: Calibration,
-    observations: Iterable[StarObservations],
-    names: SpiceNames,
-    kernels: Sequence[Path],
-) -> exported.Content:
+def ck_of_images(calibration: Calibration, asked: Request) -> exported.Content:
     """
-    A CK of the attitudes of images; ``kernels`` are the LSK and the SCLK of the spacecraft.
+    A CK of the attitudes of images.
 
     With a star tracker ID they are of its frame, in which the frame kernel of `spice_kernels` has
     the camera; else of the camera itself, by its instrument ID.  Raises ProductError if no image
-    has stars, or SPICE refuses the file.  Raises IngestError for a kernel that cannot be read.
+    has stars, or SPICE refuses the file.  Raises OptionError without kernels, IngestError for one
+    that cannot be read.
     """
+    names = checked_names(asked.names)
+    if not asked.kernels:
+        raise OptionError(
+            '--kernels: give the leap seconds kernel (naif*.tls) and the clock kernel (.tsc) of'
+            ' the spacecraft, which --to ck needs'
+        )
     attitudes = {
         image.time_ns: attitude
-        for image in observations
+        for image in asked.observations
         if (attitude := attitude_by_stars(calibration, image)) is not None
     }
     if not attitudes:
@@ -388,15 +394,14 @@ def ck_of_images(
         icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
     structure = names.star_tracker_id or names.camera_id
     q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
-    with loaded(kernels) as spice:
+    with loaded(asked.kernels) as spice:
         try:
             ticks = np.array(
                 [spice.sce2c(names.spacecraft_id, ephemeris_time(spice, t)) for t in times_ns]
             )
             data = _ck(spice, structure, ticks, q)
         except spice.SpiceyError as error:
-            words = ' '.join(str(error).split())[:240]
-            raise ProductError(f'{CK_FILE}: {words}') from error
+            raise ProductError(f'{CK_FILE}: {short(error)}') from error
     sigma_px = float(np.median([sigma_px for _, sigma_px in attitudes.values()]))
     loss = exported.Loss('1-sigma of the attitude of an image (median)', sigma_px)
     return exported.Content({CK_FILE: data}, losses=(loss,))

@@ -12,11 +12,10 @@ is refused: it may change the meaning of the numbers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 import re
-from typing import NamedTuple
 
 import erfa
 import numpy as np
@@ -222,34 +221,23 @@ _KEYWORDS = {
 }
 
 
-class _Layout(NamedTuple):
-    """Sections of a message, and the one that it ends in."""
-
-    steps: Mapping[tuple[str, str], str]
-    end: str
-
-
-_LAYOUTS = {
-    'AEM': _Layout(
-        {
-            ('header', 'META_START'): 'metadata',
-            ('metadata', 'META_STOP'): 'place before DATA_START',
-            ('place before DATA_START', 'DATA_START'): 'data',
-            ('data', 'DATA_STOP'): 'header',
-        },
-        'header',
-    ),
-    'OEM': _Layout(
-        {
-            ('header', 'META_START'): 'metadata',
-            ('metadata', 'META_STOP'): 'data',
-            ('data', 'COVARIANCE_START'): 'covariance',
-            ('covariance', 'COVARIANCE_STOP'): 'data',
-            ('data', 'META_START'): 'metadata',
-        },
-        'data',
-    ),
+# The section after a line in another one, and the section that a message ends in.
+_STEPS = {
+    'AEM': {
+        ('header', 'META_START'): 'metadata',
+        ('metadata', 'META_STOP'): 'place before DATA_START',
+        ('place before DATA_START', 'DATA_START'): 'data',
+        ('data', 'DATA_STOP'): 'header',
+    },
+    'OEM': {
+        ('header', 'META_START'): 'metadata',
+        ('metadata', 'META_STOP'): 'data',
+        ('data', 'COVARIANCE_START'): 'covariance',
+        ('covariance', 'COVARIANCE_STOP'): 'data',
+        ('data', 'META_START'): 'metadata',
+    },
 }
+_END = {'AEM': 'header', 'OEM': 'data'}
 
 
 @dataclass
@@ -264,12 +252,6 @@ class Segment:
     metadata: dict[str, str] = field(default_factory=dict)
     epochs: list[str] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
-
-    def add_keyword(self, key: str, value: str) -> None:
-        """Add a keyword of the metadata; raises ValueError if it is there already."""
-        if key in self.metadata:
-            raise ValueError(f'keyword {key} is given twice')
-        self.metadata[key] = value
 
 
 def read_segments(path: Path, kind: str) -> list[Segment]:
@@ -310,12 +292,10 @@ def _kvn_segments(text: str, kind: str) -> list[Segment]:
     version = _VERSION.fullmatch(first)
     if not version or version[1] != kind:
         raise ValueError(f'it begins with {first[:60]!r}, not with CCSDS_{kind}_VERS')
-    layout = _LAYOUTS[kind]
     segments: list[Segment] = []
     section = 'header'
     for number, line in used:
-        after = layout.steps.get((section, line))
-        if after:
+        if after := _STEPS[kind].get((section, line)):
             section = after
             if line == 'META_START':
                 segments.append(Segment(version[2]))
@@ -324,7 +304,7 @@ def _kvn_segments(text: str, kind: str) -> list[Segment]:
             _kvn_line(section, line, segments)
         except ValueError as error:
             raise ValueError(f'line {number}, in the {section}: {error}') from error
-    if section != layout.end:
+    if section != _END[kind]:
         raise ValueError(f'it ends in the {section}: truncated?')
     return segments
 
@@ -335,8 +315,10 @@ def _kvn_line(section: str, line: str, segments: list[Segment]) -> None:
         segments[-1].values.append(tuple(map(float, numbers)))
         segments[-1].epochs.append(epoch)
     elif section != 'covariance':
-        key, equals, value = line.partition('=')
+        key, equals, value = map(str.strip, line.partition('='))
         if not equals or section not in ('header', 'metadata'):
             raise ValueError(f'{line[:60]!r} is out of place')
         if section == 'metadata':
-            segments[-1].add_keyword(key.strip(), value.strip())
+            if key in segments[-1].metadata:
+                raise ValueError(f'keyword {key} is given twice')
+            segments[-1].metadata[key] = value

@@ -87,7 +87,7 @@ def read_spk(paths: Sequence[Path], body: str, at_ns: Sequence[int]) -> Velociti
             except spice.SpiceyError as error:
                 raise ValueError(
                     f'no velocity of {body} about the solar system barycentre at '
-                    f'{utc_text(time_ns)}: {_short(error)}'
+                    f'{utc_text(time_ns)}: {short(error)}'
                 ) from error
             velocities.append(np.array(state[3:]) * _KM)
     return Velocities(np.array(at_ns, np.int64), np.array(velocities).reshape(-1, 3))
@@ -112,7 +112,7 @@ def loaded(paths: Sequence[Path]) -> Iterator[Any]:
                     _text_of(named)
                 spiceypy.furnsh(str(path))
             except spiceypy.SpiceyError as error:
-                raise IngestError(f'{path}: not loaded by SPICE: {_short(error)}') from error
+                raise IngestError(f'{path}: not loaded by SPICE: {short(error)}') from error
         if not spiceypy.expool('DELTET/DELTA_AT'):
             raise IngestError(
                 f'{_names(paths)}: no leap seconds kernel (LSK) among them: add naif*.tls'
@@ -173,7 +173,7 @@ def _icrf_from_frame(spice: Any, frame: str, time_ns: int) -> Floats | None:
         # Both mark a CK without data at the time.
         if error.short in ('SPICE(NOFRAMECONNECT)', 'SPICE(FRAMEDATANOTFOUND)'):
             return None
-        raise ValueError(f'frame {frame}: {_short(error)}') from error
+        raise ValueError(f'frame {frame}: {short(error)}') from error
 
 
 def ephemeris_time(spice: Any, time_ns: int) -> float:
@@ -183,7 +183,7 @@ def ephemeris_time(spice: Any, time_ns: int) -> float:
     return float(spice.utc2et(text)) + rest_ns / NANOSECONDS_PER_SECOND
 
 
-def _short(error: Any) -> str:
+def short(error: Any) -> str:
     """The kind of a SPICE error and its explanation, in one line."""
     words = ' '.join(f'{error.short} {error.long}'.split())
     return words if len(words) <= 240 else words[:237] + '...'

@@ -2,17 +2,17 @@
 """
 The tasks of a fleet: found below a root, answered where their files are, counted into the table.
 
-A task is a calibration to read or a bag to calibrate.  Its answer is made in this process or by a
-worker of Dask.
+A task is a calibration to read or a bag to calibrate.  Its row is made in this process or by a
+worker of Dask.  The root is a folder, or any URL of fsspec (``s3://``, ``gs://``).
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 import contextlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import errno
 import functools
 import hashlib
@@ -23,7 +23,8 @@ from pathlib import Path
 import posixpath
 import re
 import socket
-from typing import Any
+import tempfile
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -32,20 +33,26 @@ from starcal_ground.bags import reader
 from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import calibrate, chosen, observe, Source
 from starcal_ground.images.first_setup import air_of
-from starcal_ground.mission.trend import places, trend_table
+from starcal_ground.mission.trend.trend_table import COMPUTED, FAILED, RECORDED, Row, Table
 from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
-from starcal_ros.formats.products import product_files
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.pipeline.setup import files_of, read_setup
-from starcal_ros.records import StarObservations
+from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.text import printable
 
-KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # in the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
+_IDENTITIES = (  # S3, Google and Azure name them differently
+    *('ETag', 'etag', 'md5Hash'),
+    *('LastModified', 'last_modified', 'updated', 'mtime', 'created'),
+)
+_LONGEST_REASON, _LONGEST_ERROR = 200, 2000  # characters
 _NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
 _BATCH = 1000  # tasks in a message to the scheduler: Dask warns of one over 10 MB
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
@@ -55,6 +62,57 @@ _SETTINGS = {
     'distributed.scheduler.worker-saturation': 1.0,
     'logging': {'distributed': 'critical'},
 }
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """
+    Which camera a path below the root belongs to, and the parameters of that camera.
+
+    Raises OptionError in one line, for a pattern without a name.
+
+    Attributes
+    ----------
+    pattern : str
+        Such as ``{spacecraft}/{camera}/*.mcap``; it applies to the start of a path, up to the
+        segment of the last name.  Empty for none.
+    params : str
+        Parameter file, in which ``{spacecraft}`` and ``{camera}`` are replaced; may be empty.
+    """
+
+    pattern: str = ''
+    params: str = ''
+
+    def __post_init__(self) -> None:
+        """Check the pattern."""
+        expression = self._expression.pattern
+        if self.pattern and ('(?P' not in expression or re.search(r'\\[{}]', expression)):
+            raise OptionError(
+                f'--cameras: {untrusted.shown(self.pattern)}: not a pattern with {{spacecraft}}'
+                ' and {camera}'
+            )
+
+    @functools.cached_property
+    def _expression(self) -> re.Pattern[str]:
+        named, brace, rest = self.pattern.rpartition('}')
+        start = f'{named}{brace}{rest.partition("/")[0]}'.removeprefix('./')
+        expression = re.escape(start).replace(r'\*', '[^/]*')
+        for key in _KEYS:
+            expression = expression.replace(rf'\{{{key}\}}', f'(?P<{key}>[^/]+?)', 1)
+        return re.compile(f'{expression}(?:/|$)')
+
+    def of(self, name: str) -> dict[str, str]:
+        """Spacecraft and camera of a path below the root, empty if nothing names them."""
+        match = self._expression.match(name)
+        names = match.groupdict() if match else {}
+        return {key: printable(names.get(key, '')) for key in _KEYS}
+
+    def params_of(self, name: str) -> str:
+        """Absolute path of the parameters of a bag; empty if there are none."""
+        params = self.params
+        for key, value in self.of(name).items():
+            params = params.replace(f'{{{key}}}', value)
+        return params and os.path.abspath(params)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +128,7 @@ class Task:
         Digest of name, identity and settings, none of which is read from the file: what has it is
         not read again.
     files : tuple of str
-        Those that are read, as far as the listing shows.
-    size : int
-        Their bytes; -1 if one could not be read when it was listed.
+        Those that are read, relative to the folder of ``url``.
     params : str
         Parameter file for a bag; empty for a calibration.
     spacecraft, camera : str
@@ -81,8 +137,7 @@ class Task:
 
     url: str
     stamp: str
-    files: tuple[str, ...]
-    size: int = 0
+    files: tuple[str, ...] = ()
     params: str = ''
     spacecraft: str = ''
     camera: str = ''
@@ -90,36 +145,35 @@ class Task:
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
     """
-    Tasks below a root, as it is listed; no file is read.
+    Tasks below a root, as it is listed: calibrations of a listing, then bags; no file is read.
 
     A bag is a task where it has parameters and no calibration beside it.  Raises OSError when a
-    folder cannot be listed. Raises StarcalError when a parameter file or a file that it names
+    store cannot be listed.  Raises StarcalError when a parameter file or a file that it names
     cannot be read.
     """
     settings_of = functools.cache(_settings)
-    for entries in places.listings(root):
-        listed = {e.name: e for e in entries if KEPT_FOLDER not in e.name.split('/')}
-        yield from _tasks(root, listed, cameras, settings_of)
 
+    def task(name: str, files: Sequence[str], params: str = '') -> Task:
+        settings = settings_of(params) if params else ''
+        text = f'{[(file, listed[file]) for file in files]!r} {settings}'
+        stamp = hashlib.sha256(text.encode()).hexdigest()
+        folder = posixpath.dirname(name)
+        # Read with it for the temperature, which decides nothing.
+        beside = posixpath.join(folder, products.OBSERVATIONS_FILE)
+        read = [*files, beside] if not params and beside in listed else files
+        names = tuple(posixpath.relpath(file, folder or '.') for file in read)
+        return Task(posixpath.join(root, name), stamp, names, params, **cameras.of(name))
 
-def _tasks(
-    root: str,
-    listed: dict[str, places.Entry],
-    cameras: Cameras,
-    settings_of: Callable[[str], str],
-) -> Iterator[Task]:
-    """Tasks of files by name: calibrations in order of their paths, then bags."""
-    for name, entry in listed.items():
-        if posixpath.basename(name) == CALIBRATION_FILE:
-            beside = posixpath.join(posixpath.dirname(name), products.OBSERVATIONS_FILE)
-            yield _task(root, name, (entry,), cameras, beside=listed.get(beside))
-        elif _ARCHIVED.fullmatch(posixpath.basename(name)):
-            yield _task(root, name, (entry,), cameras)
-    for name, files in _bags(listed).items():
-        folder = posixpath.dirname(name) if name in listed else name
-        params = cameras.params_of(name)
-        if params and posixpath.join(folder, CALIBRATION_FILE) not in listed:
-            yield _task(root, name, files, cameras, params, settings_of(params))
+    for listed in _listings(root):
+        for name in listed:
+            file = posixpath.basename(name)
+            if file == CALIBRATION_FILE or _ARCHIVED.fullmatch(file):
+                yield task(name, [name])
+        for name, files in _bags(listed).items():
+            folder = posixpath.dirname(name) if name in listed else name
+            params = cameras.params_of(name)
+            if params and posixpath.join(folder, CALIBRATION_FILE) not in listed:
+                yield task(name, files, params)
 
 
 def _settings(params: str) -> str:
@@ -133,178 +187,167 @@ def _settings(params: str) -> str:
     return sha256.hexdigest()
 
 
-def _task(
-    root: str,
-    name: str,
-    files: Sequence[places.Entry],
-    cameras: Cameras,
-    params: str = '',
-    settings: str = '',
-    beside: places.Entry | None = None,
-) -> Task:
-    """A task; a file ``beside`` is read with it, and decides nothing."""
-    spacecraft, camera = map(printable, cameras.of(name))
-    text = f'{[(entry.name, entry.identity) for entry in files]!r} {settings}'
-    return Task(
-        url=posixpath.join(root, name),
-        stamp=hashlib.sha256(text.encode()).hexdigest(),
-        files=tuple(entry.url for entry in (*files, *filter(None, [beside]))),
-        size=sum(entry.size for entry in files) if all(e.size >= 0 for e in files) else -1,
-        params=params,
-        spacecraft=spacecraft,
-        camera=camera,
-    )
-
-
-def _bags(listed: dict[str, places.Entry]) -> dict[str, list[places.Entry]]:
-    """Bag folders with a metadata.yaml, and single files elsewhere; no files of an archive."""
-    bags: dict[str, list[places.Entry]] = {}
-    for name, entry in listed.items():
+def _bags(listed: Mapping[str, str]) -> dict[str, list[str]]:
+    """Files of bag folders with a metadata.yaml, and single files elsewhere."""
+    bags: dict[str, list[str]] = {}
+    for name in listed:
         folder, file = posixpath.split(name)
         # One image each: the state of a calibrator, calibrated there.
         if not file.endswith('.mcap') or posixpath.basename(folder) == 'ensemble':
             continue
-        metadata = listed.get(posixpath.join(folder, _METADATA))
-        if metadata and file != products.OBSERVATIONS_FILE:
-            bags.setdefault(folder, [metadata]).append(entry)
+        metadata = posixpath.join(folder, _METADATA)
+        if metadata in listed and file != products.OBSERVATIONS_FILE:
+            bags.setdefault(folder, [metadata]).append(name)
         else:
-            bags[name] = [entry]
+            bags[name] = [name]
     return bags
 
 
-@dataclass(frozen=True)
-class Cameras:
+def absolute(place: str) -> str:
+    """The place as every process finds it: an absolute path, or the URL."""
+    return place.rstrip('/') if is_remote(place) else os.path.abspath(place)
+
+
+def is_remote(place: str) -> bool:
+    """True for a URL."""
+    return '://' in place
+
+
+def exists(place: str) -> bool:
+    """True for a file or a folder; raises OSError."""
+    if not is_remote(place):
+        return os.path.exists(place)
+    with _store(place) as (fs, path):
+        fs.invalidate_cache()
+        return bool(fs.exists(path))
+
+
+def _listings(root: str) -> Iterator[dict[str, str]]:
     """
-    Which camera a path below the root belongs to, and the parameters of that camera.
+    Files below a root by their paths from there: of a folder each, or of all of a store.
 
-    Attributes
-    ----------
-    pattern : regular expression or None
-        Of the start of a path, with groups for spacecraft and camera.
-    params : str
-        Parameter file, in which ``{spacecraft}`` and ``{camera}`` are replaced; may be empty.
+    Their identities change with the content: size, and etag or time where it is known.
     """
-
-    pattern: re.Pattern[str] | None = None
-    params: str = ''
-
-    def of(self, name: str) -> tuple[str, str]:
-        """Spacecraft and camera of a path below the root, empty if nothing names them."""
-        match = self.pattern.match(name) if self.pattern else None
-        names = match.groupdict() if match else {}
-        return names.get(_KEYS[0], ''), names.get(_KEYS[1], '')
-
-    def params_of(self, name: str) -> str:
-        """Absolute path of the parameters of a bag; empty if there are none."""
-        if not self.params:
-            return ''
-        spacecraft, camera = self.of(name)
-        text = self.params.replace('{spacecraft}', spacecraft).replace('{camera}', camera)
-        return os.path.abspath(text)
+    if not is_remote(root):
+        for folder, folders, files in os.walk(root):
+            folders.sort()
+            paths = (os.path.join(folder, name) for name in sorted(files))
+            yield {os.path.relpath(path, root): _identity(path) for path in paths}
+        return
+    with _store(root) as (fs, base):
+        fs.invalidate_cache()
+        infos = fs.find(base, detail=True)
+    yield {
+        posixpath.relpath(path, base): f'{info["size"]} '
+        f'{next((info[name] for name in _IDENTITIES if info.get(name)), "")}'
+        for path, info in sorted(infos.items())
+    }
 
 
-def read_cameras(pattern: str, params: str) -> Cameras:
-    """
-    Cameras by a pattern such as ``{spacecraft}/{camera}/*.mcap``, empty for none.
-
-    The expression is of the start of a path, up to the segment of the last name.  Raises
-    OptionError in one line, for a pattern without a name.
-    """
-    if not pattern:
-        return Cameras(params=params)
-    start = pattern[: pattern.rfind('}') + 1]
-    start += pattern[len(start) :].partition('/')[0]
-    expression = re.escape(start.removeprefix('./')).replace(r'\*', '[^/]*')
-    for key in _KEYS:
-        expression = expression.replace(rf'\{{{key}\}}', f'(?P<{key}>[^/]+?)', 1)
-    if '(?P' not in expression or re.search(r'\\[{}]', expression):
-        raise OptionError(
-            f'--cameras: {untrusted.shown(pattern)}: not a pattern with {{spacecraft}} and'
-            ' {camera}'
-        )
-    return Cameras(re.compile(f'{expression}(?:/|$)'), params)
-
-
-@dataclass(frozen=True)
-class Answer:
-    """
-    The row that a task gives, and ``calibration.json`` of a bag.
-
-    No row where a file cannot be reached; ``unreachable`` says why.
-    """
-
-    row: trend_table.Row | None
-    calibration: str = ''
-    unreachable: str = ''
-
-
-def compute(task: Task) -> Answer:
-    """Answer to a task; for one that fails, the row with its error."""
+def _identity(path: str) -> str:
     try:
-        if task.size >= 0 and not (places.is_remote(task.url) or os.path.exists(task.url)):
+        status = os.stat(path)
+    except OSError as error:
+        return f'error {error.errno}'
+    return f'{status.st_size} {status.st_mtime_ns}'
+
+
+@contextlib.contextmanager
+def _fetched(task: Task) -> Iterator[Path]:
+    """
+    The path of a file or folder while the block runs; raises OSError.
+
+    Remote files are copied into a temporary folder of this machine, since readers of bags seek
+    and are C code; local ones are read where they are.
+    """
+    if not is_remote(task.url):
+        if not os.path.exists(task.url):
             raise FileNotFoundError(errno.ENOENT, _NOT_SEEN, task.url)
-        # The result must not depend on the threads of BLAS.
-        with places.fetched(task.url, task.files, task.size) as path, processes.one_blas_thread():
-            return _answer(task, path)
-    except (OSError, ModuleNotFoundError) as error:
-        reason = f'cannot be read: {getattr(error, "strerror", "") or error}'
-        if task.size < 0:  # nor could the client
-            return failed(task, reason)
-        return Answer(None, unreachable=f'{task.url}: {socket.gethostname()}: {reason}')
-    # One bag must not end a run over thousands, whatever is in it.
-    except Exception as error:
-        return failed(task, f'{type(error).__name__}: {error}')
+        yield Path(task.url)
+        return
+    with tempfile.TemporaryDirectory(prefix='starcal-') as folder:
+        with _store(posixpath.dirname(task.url)) as (fs, base):
+            there = [posixpath.join(base, file) for file in task.files]
+            fs.get(there, [os.path.join(folder, file) for file in task.files])
+        yield Path(folder, posixpath.basename(task.url))
 
 
-def failed(task: Task, error: str) -> Answer:
-    """Answer to a task that failed."""
-    return Answer(_of_camera(trend_table.failure(task.stamp, task.url, error), task))
+@contextlib.contextmanager
+def _store(url: str) -> Iterator[tuple[AbstractFileSystem, str]]:
+    """The file system of a URL and the path there; failures of its client become OSError."""
+    import fsspec
 
-
-def _of_camera(row: trend_table.Row, task: Task) -> trend_table.Row:
-    return replace(row, spacecraft=task.spacecraft, camera=task.camera)
-
-
-def _answer(task: Task, path: Path) -> Answer:
-    """Answer by the file at a path; raises OSError where it cannot be read."""
-    text = ''
     try:
-        if task.params:
+        yield fsspec.core.url_to_fs(url)
+    # Each client of an object store has exceptions of its own, or leaves out the reason.
+    except Exception as error:
+        if isinstance(error, OSError) and error.strerror:
+            raise
+        if isinstance(cause := error.__cause__, ModuleNotFoundError):  # the client
+            raise ModuleNotFoundError(str(cause), name=cause.name) from error
+        words = ' '.join(f'{type(error).__name__}: {error}'.split())
+        raise OSError(errno.EIO, words[:_LONGEST_REASON], url) from error
+
+
+def compute(task: Task) -> Row:
+    """Row of a task, of one that fails with its error; raises OSError without its files."""
+    path = Path(task.url)
+    try:
+        # The result must not depend on the threads of BLAS.
+        with _fetched(task) as path, processes.one_blas_thread():
+            if not task.params:
+                return row_of(task, RECORDED, read_calibration(path), _observations(path))
             setup = read_setup(Path(task.params))
             source = Source((path,), Topics(), setup, air_of(setup))
             campaign = calibrate(observe(chosen(source)))
-            made, kind = campaign.calibration, trend_table.COMPUTED
-            degc = _mean_temperature(campaign.observations)
-            text = product_files.calibration_text(made)
-        else:
-            made, kind = product_files.read_calibration(path), trend_table.RECORDED
-            degc = _temperature(path.with_name(products.OBSERVATIONS_FILE))
-        row = trend_table.row_of(made, task.stamp, task.url, kind, degc)
-        return Answer(_of_camera(row, task), text)
-    except (StarcalError, ValueError) as error:
-        cause = error.__cause__
-        if isinstance(cause, OSError):
-            raise cause from error
-        said = file_kinds.explained(error) if isinstance(error, StarcalError) else str(error)
-        return failed(task, said.replace(str(path), task.url))
+            return row_of(task, COMPUTED, campaign.calibration, campaign.observations)
+    # One bag must not end a run over thousands, whatever is in it.
+    except Exception as error:
+        for cause in (error, error.__cause__):
+            if isinstance(cause, (OSError, ModuleNotFoundError)):
+                reason = getattr(cause, 'strerror', '') or cause
+                words = f'{socket.gethostname()}: cannot be read: {reason}'
+                raise OSError(errno.EIO, words, task.url) from error
+        words = f'{type(error).__name__}: {error}'
+        if isinstance(error, StarcalError):
+            words = file_kinds.explained(error)
+        return failed(task, words.replace(str(path), task.url))
 
 
-def _temperature(observations: Path) -> float:
-    """Mean temperature of recorded observations; NaN without any."""
-    if not observations.is_file():
-        return math.nan
-    try:
-        topic = reader.choose_topic([observations], OBSERVATIONS_TYPE)
-        records: list[StarObservations] = list(reader.read_observations([observations], topic))
-    except StarcalError:
-        return math.nan
-    return _mean_temperature([record for record in records if not record.refusal])
+def failed(task: Task, error: str) -> Row:
+    """Row of a task that failed."""
+    words = printable(' '.join(error.split()) or 'failed')[:_LONGEST_ERROR]
+    return _row_of(task, FAILED, error=words)
 
 
-def _mean_temperature(records: Sequence[StarObservations]) -> float:
-    degc = np.array([record.temperature_degc for record in records])
-    known = degc[~np.isnan(degc)]
-    return float(np.mean(known)) if len(known) else math.nan
+def _row_of(task: Task, kind: str, **values: Any) -> Row:
+    return Row(task.stamp, printable(task.url), kind, task.spacecraft, task.camera, **values)
+
+
+def row_of(
+    task: Task, kind: str, made: Calibration, observations: Iterable[StarObservations] = ()
+) -> Row:
+    """Row of a calibration, with the mean temperature of its observations."""
+    degc = np.array([image.temperature_degc for image in observations if not image.refusal])
+    known = degc[np.isfinite(degc)]
+    reference_degc = made.temperature.reference_degc if made.temperature else math.nan
+    return _row_of(
+        task,
+        kind,
+        time_ns=((made.first_image_ns or made.time_ns) + made.time_ns) // 2,
+        temperature_degc=float(known.mean()) if len(known) else reference_degc,
+        calibration=made,
+    )
+
+
+def _observations(calibration: Path) -> list[StarObservations]:
+    """Observations beside a calibration; none where they are missing or damaged."""
+    file = calibration.with_name(products.OBSERVATIONS_FILE)
+    if file.is_file():
+        with contextlib.suppress(StarcalError):
+            topic = reader.choose_topic([file], OBSERVATIONS_TYPE)
+            return list(reader.read_observations([file], topic))
+    return []
 
 
 @dataclass
@@ -322,7 +365,7 @@ class Done:
 
 
 def update(
-    table: trend_table.Table,
+    table: Table,
     tasks: Iterable[Task],
     workers: int = 0,
     scheduler: str = '',
@@ -334,8 +377,7 @@ def update(
 
     A task that ends its worker process, also alone, becomes the row of a failure; the others go
     on.  A file that cannot be reached has no row, so the next run tries it again.
-    The calibration of a bag is written beside the table before its row, and each row is on disk
-    before the next, so a run that was stopped starts where it stopped.
+    Each row is on disk before the next, so a run that was stopped starts where it stopped.
     Raises OptionError when Dask ends or no scheduler answers, OSError when the root cannot be
     reached any more.
 
@@ -358,38 +400,46 @@ def update(
             done.known += 1
         else:
             new.append(task)
-    is_here = not (new and (workers or scheduler))
-    in_turn = (compute(task) for task in new)
-    with contextlib.closing(in_turn if is_here else _by_dask(new, workers, scheduler)) as answers:
+    by_dask = new and (workers or scheduler)
+    answers = _by_dask(new, workers, scheduler) if by_dask else _in_turn(new)
+    with contextlib.closing(answers):
         for answer in answers:
-            row = answer.row
-            done.failed += row is None or bool(row.error)
-            if row is not None:
-                _keep(table, row, answer.calibration)
-                done.computed += not row.error
+            if isinstance(answer, Row):
+                table.add(answer)
+                done.computed += not answer.error
             else:
-                done.unreachable.append(answer.unreachable)
-                if not places.exists(root):
+                done.unreachable.append(f'{answer.filename}: {answer.strerror}')
+                if not exists(root):
                     raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), root)
+            done.failed += not isinstance(answer, Row) or bool(answer.error)
             on_row()
     # A file that was repaired or removed is no longer among the tasks.
     table.forget_failures(but=listed)
     return done
 
 
-def _keep(table: trend_table.Table, row: trend_table.Row, calibration: str) -> None:
-    """Write the calibration of a bag beside the table, then the row."""
-    if calibration:
-        folder = table.path.with_name(KEPT_FOLDER) / trend_table.kept_name(row)
-        products.make_folder(folder)
-        product_files.write_atomically(folder / CALIBRATION_FILE, calibration)
-    table.add(row)
+Answers = Generator['Row | OSError', None, None]
 
 
-def _by_dask(tasks: Sequence[Task], workers: int, address: str) -> Generator[Answer, None, None]:
-    """Answers to tasks, as they come."""
+def _in_turn(tasks: Sequence[Task]) -> Answers:
+    """Rows of tasks, or why their files cannot be reached."""
+    for task in tasks:
+        try:
+            yield compute(task)
+        except OSError as error:
+            yield error
+
+
+def _by_dask(tasks: Sequence[Task], workers: int, address: str) -> Answers:
+    """Rows of tasks as they come, or why their files cannot be reached."""
     import dask
     from distributed import as_completed, Client, KilledWorker
+
+    def answer(task: Task, future: Any) -> Row | OSError:
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            return failed(task, 'ends its worker process, also alone: out of memory?')
+        return error if isinstance(error, OSError) else future.result()
 
     option = f'--scheduler: {address}' if address else f'--workers: {workers}'
     # For another scheme Dask prints a traceback after the time-out.
@@ -411,17 +461,14 @@ def _by_dask(tasks: Sequence[Task], workers: int, address: str) -> Generator[Ans
             ended: list[Task] = []
             del futures  # a worker holds each result while there is a future of it
             for future in completed:
-                task, error = waiting.pop(future.key), future.exception()
-                if isinstance(error, KilledWorker):
+                task = waiting.pop(future.key)
+                if isinstance(future.exception(), KilledWorker):
                     ended.append(task)
                 else:
-                    yield failed(task, str(error)) if error else future.result()
+                    yield answer(task, future)
             # With its worker, tasks end that only waited there: the second time alone.
             for task in ended:
-                error = (future := client.submit(compute, task, pure=False)).exception()
-                if isinstance(error, KilledWorker):
-                    error = 'ends its worker process, also alone: out of memory?'
-                yield failed(task, str(error)) if error else future.result()
+                yield answer(task, client.submit(compute, task, pure=False))
     # A worker that is killed while it starts, or a scheduler that is lost or not there.
     except (RuntimeError, OSError, ValueError, CancelledError, asyncio.CancelledError) as error:
         words = printable(' '.join(str(error).split())).rstrip('.')

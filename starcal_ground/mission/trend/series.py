@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Rows of a table as series in time with their trends, what was active when, and an overview.
+Rows of a table as series in time with their trends, and the change by each calibration.
 
 Model of a series of measurements with known sigmas: a constant, a drift with time, a coefficient
 of temperature, and steps between two neighbouring measurements.  Terms enter one by one, the most
@@ -14,27 +14,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import itertools
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ground.mission.trend.trend_table import COMPUTED, Row
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import grid_lines_of_sight, movement
-from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
+from starcal_ros.assessment.lookup import Derivatives, grid_lines_of_sight
+from starcal_ros.camera import INTRINSIC_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.records import CameraGeometry
+from starcal_ros.records import Calibration
 
 FEWEST = 6  # measurements; with fewer, a step and a drift are one
 MAX_P_VALUE = 1e-3  # with a dozen series on a page, one false finding in a hundred pages
-_DRIFT, _TEMPERATURE, _STEP = 'drift', 'temperature', 'step'
+STEP, DRIFT, TEMPERATURE = 'step', 'drift', 'temperature'
 _STEP_SIDE = 2  # measurements on each side of a step: one alone is an outlier
 _MOST_PLACES = 1000  # places of a step that are tested: 0.3 s for as many measurements
 SECONDS_PER_YEAR = 365.25 * 86400.0  # Julian year, IAU
+_GRID = (15, 12)  # columns and rows of pixels that changes are taken over
+_LEAST, _MOST = 1e-30, 1e15  # sigmas in use: their squares and inverses must stay finite
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,16 @@ def trend_of(
     Temperatures that are not all known, or all equal, are no regressor.
     """
     n = len(value)
-    if n < FEWEST or not (np.isfinite(sigma) & (sigma > 0)).all():
-        return Trend((), np.full(n, float(np.mean(value))) if n else np.empty(0), np.nan)
-    kinds, columns, trials = _candidates(time_s, temperature_degc)
-    A, b = columns / sigma[:, None], value / sigma
+    if n < FEWEST:
+        return Trend((), np.full(n, np.mean(value)), math.nan)
+    candidates = _candidates(time_s, temperature_degc)
+    kinds = [kind for kind, _, _ in candidates]
+    trials = np.array([count for _, _, count in candidates])
+    A = np.column_stack([regressor for _, regressor, _ in candidates]) / sigma[:, None]
+    b = value / sigma
 
-    def beside(k: int, others: list[int]) -> float:
-        return float(_p_values(A, b, [c for c in others if c != k], trials)[k])
+    def p_value(k: int) -> float:
+        return float(_p_values(A, b, [c for c in chosen if c != k], trials)[k])
 
     chosen = [0]
     while len(chosen) <= n // 3:
@@ -95,41 +98,38 @@ def trend_of(
         if p_values[best] > max_p_value:
             break
         chosen.append(best)
-        while len(chosen) > 2:  # without those that the others have made superfluous
-            p, worst = max((beside(k, chosen), k) for k in chosen[1:])
-            if p <= max_p_value:
-                break
+        # Without those that the others have made superfluous.
+        while len(chosen) > 2 and p_value(worst := max(chosen[1:], key=p_value)) > max_p_value:
             chosen.remove(worst)
         if best not in chosen:
             break
     inverse = np.linalg.pinv(A[:, chosen].T @ A[:, chosen], rcond=1e-12, hermitian=True)
-    x = inverse @ (A[:, chosen].T @ b)
-    fit = columns[:, chosen] @ x
-    scale = float(np.sum(((value - fit) / sigma) ** 2)) / (n - len(chosen))
-    error = np.sqrt(np.diag(inverse) * max(scale, 1.0))
-    terms = [
-        Term(kinds[k][0], float(size), float(sigma), beside(k, chosen), kinds[k][1])
-        for k, size, sigma in zip(chosen[1:], x[1:], error[1:], strict=True)
+    size = inverse @ (A[:, chosen].T @ b)
+    fit = A[:, chosen] @ size
+    scatter = math.sqrt(np.sum((b - fit) ** 2) / (n - len(chosen)))
+    error = np.sqrt(np.diag(inverse)) * max(scatter, 1.0)
+    made = [
+        Term(kinds[k][0], float(size[j]), float(error[j]), p_value(k), kinds[k][1])
+        for j, k in enumerate(chosen)
+        if j
     ]
-    terms.sort(key=lambda term: (term.after, term.kind))
-    return Trend(tuple(terms), fit, math.sqrt(scale))
+    return Trend(tuple(sorted(made, key=lambda term: term.after)), fit * sigma, scatter)
 
 
 def _candidates(
     time_s: Floats, temperature_degc: Floats
-) -> tuple[list[tuple[str, int]], Floats, Floats]:
-    """Kinds of terms with the measurement before a step, regressors (n, m), and trials of each."""
-    n = len(time_s)
-    kinds, columns = [('', -1), (_DRIFT, -1)], [np.ones(n), (time_s - time_s.mean())]
-    columns[1] = columns[1] / SECONDS_PER_YEAR
+) -> list[tuple[tuple[str, int], Floats, float]]:
+    """Kind of each term with the measurement before a step, its regressor (n,), and its trials."""
+    n, drift = len(time_s), (time_s - time_s.mean()) / SECONDS_PER_YEAR
+    terms: list[tuple[tuple[str, int], Floats, float]] = []
+    terms += (('', -1), np.ones(n), 1.0), ((DRIFT, -1), drift, 1.0)
     if np.isfinite(temperature_degc).all() and np.ptp(temperature_degc) > 0:
-        kinds.append((_TEMPERATURE, -1))
-        columns.append(temperature_degc - temperature_degc.mean())
+        terms.append(((TEMPERATURE, -1), temperature_degc - temperature_degc.mean(), 1.0))
     # Long series are tested at each second place and so on: the memory grows with the square.
     places = range(_STEP_SIDE - 1, n - _STEP_SIDE, 1 + n // _MOST_PLACES)
-    steps = np.arange(n)[:, None] > np.array(places)
-    trials = np.repeat([1.0, len(places)], [len(kinds), len(places)])
-    return [*kinds, *((_STEP, k) for k in places)], np.column_stack([*columns, steps]), trials
+    after = np.arange(n)
+    terms += [((STEP, k), (after > k).astype(np.float64), len(places)) for k in places]
+    return terms
 
 
 def _p_values(A: Floats, b: Floats, chosen: list[int], trials: Floats) -> Floats:
@@ -150,18 +150,6 @@ def _p_values(A: Floats, b: Floats, chosen: list[int], trials: Floats) -> Floats
     return np.asarray(np.minimum(trials * fdtrc(1, freedom, np.maximum(F, 0.0)), 1.0))
 
 
-_GRID = (15, 12)  # columns and rows of pixels that changes are taken over
-# Series whose estimates trade with each other: one drift shows in several of them.
-_TRADING = {
-    name: group
-    for group in (
-        ('boresight about x', 'alignment_x', 'cy'),
-        ('boresight about y', 'alignment_y', 'cx'),
-    )
-    for name in group
-}
-
-
 @dataclass(frozen=True)
 class Series:
     """
@@ -178,153 +166,125 @@ class Series:
     trend: Trend
 
 
-@dataclass(frozen=True)
-class Active:
+def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Series]:
     """
-    A calibration that was active from a stamp to another (0: still is).
+    Series of the parameters, boresight and alignment of the calibrations of one lens model.
 
-    ``assumed``: nothing records an activation; each accepted calibration is taken as active from
-    its last image.
+    A number has those of the calibrations that estimated it; boresight and alignment are relative
+    to the first one.
     """
+    made = calibrations(rows)
+    first = made[0].geometry
+    sights, sight_sigmas_rad = map(np.array, zip(*map(_boresight, made), strict=True))
+    of_first = first.star_tracker_from_camera.inv().apply(sights)
+    turned_rad = [alignment_difference_rad(one.geometry, first) for one in made]
+    angles = np.column_stack([np.cross(of_first[0], of_first)[:, :2], turned_rad]) / ARCSECOND_RAD
+    sigmas = np.array([one.sigma for one in made])
+    aligned = np.array([[one.has_alignment / ARCSECOND_RAD] for one in made])
+    angle_sigmas = np.column_stack([sight_sigmas_rad, sigmas[:, -3:]]) * aligned
+    values = np.column_stack([[one.geometry.camera.parameters for one in made], angles])
+    sigmas = np.column_stack([sigmas[:, :-3], angle_sigmas])
+    names = first.camera.parameter_names
+    units = ['px' if name in INTRINSIC_NAMES else '' for name in names] + ['arcsec'] * 5
+    names += 'boresight about x', 'boresight about y', 'alignment_x', 'alignment_y', 'alignment_z'
+    time_s = np.array([row.time_ns for row in rows], np.float64) / NANOSECONDS_PER_SECOND
+    degc = np.array([row.temperature_degc for row in rows])
+    shown = []
+    for name, unit, value, sigma in zip(names, units, values.T, sigmas.T, strict=True):
+        k = np.flatnonzero((sigma > _LEAST) & (sigma < _MOST) & np.isfinite(value))
+        if len(k):
+            trend = trend_of(time_s[k], value[k], sigma[k], degc[k], max_p_value)
+            shown.append(Series(name, unit, tuple(k.tolist()), value[k], sigma[k], trend))
+    return shown
 
-    row: int
-    since_ns: int
-    until_ns: int
-    assumed: bool
+
+def calibrations(rows: Sequence[Row]) -> list[Calibration]:
+    """The calibrations of rows that are no failures."""
+    return [row.calibration for row in rows if row.calibration is not None]
+
+
+def _boresight(one: Calibration) -> tuple[Floats, Floats]:
+    """
+    Line of sight (3,) of the middle of the detector, star tracker frame, and its sigma (2,), rad.
+
+    The sigma is about the x and y axes of the camera.
+    """
+    camera = one.geometry.camera
+    direction, covariance = _sight(one, np.array([[camera.width - 1, camera.height - 1]]) / 2)
+    in_tracker = one.geometry.star_tracker_from_camera.apply(direction)
+    # A small rotation about x moves the direction along y, one about y along x.
+    return in_tracker, np.sqrt(np.diag(covariance)[[1, 0]])
+
+
+def _sight(one: Calibration, pixel: Floats) -> tuple[Floats, Floats]:
+    """Direction (3,) of a pixel (1, 2) and its covariance (3, 3), rad^2, camera frame."""
+    derivatives = Derivatives.at(one.geometry.camera, pixel)
+    (covariance,) = derivatives.covariance_rad2(one.map_covariance, derivatives.J)
+    return derivatives.directions[0], covariance
 
 
 @dataclass(frozen=True)
 class Change:
     """
-    Change by a calibration against another one, such as that which was active then.
+    Change by calibration ``row`` against calibration ``against``, that which was active then.
 
-    ``line_of_sight_px`` is the largest change of a line of sight in the star tracker frame,
-    ``shape_px`` that with the common rotation removed; px at the focal length.
+    ``px`` is the largest change of a line of sight in the star tracker frame, px at the focal
+    length; ``sigmas`` the same in the 1-sigma of both, NaN where that is not known.
     """
 
     row: int
     against: int
-    line_of_sight_px: float
-    shape_px: float
+    px: float
+    sigmas: float
 
 
-def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Series]:
-    """Series of parameters, boresight and alignment of the calibrations of one lens model."""
-    first = rows[0].geometry
-    series = []
-    for k, name in enumerate(rows[0].names):
-        values = np.array([row.values[k] for row in rows])
-        sigmas = np.array([row.sigmas[k] for row in rows])
-        unit = 'px' if name in INTRINSIC_NAMES else ''
-        series += _known(rows, name, unit, values, sigmas, max_p_value)
-    boresight = _boresight_arcsec([row.geometry for row in rows])
-    of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
-    for k, axis in enumerate('xy'):
-        name = f'boresight about {axis}'
-        series += _known(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
-    alignment = np.array(
-        [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
-    )
-    sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
-    for k, axis in enumerate('xyz'):
-        name = f'alignment_{axis}'
-        series += _known(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
-    return series
+def activations(rows: Sequence[Row]) -> list[tuple[int, int]]:
+    """
+    Times since which calibrations were active, ns, and the indices of these, in order.
+
+    Where nothing records an activation, each accepted calibration counts as active from its last
+    image; those that were computed from a bag were never on board, if there are others.
+    """
+    made = list(enumerate(calibrations(rows)))
+    recorded = [(one.active_since_ns, k) for k, one in made if one.active_since_ns > 0]
+    accepted = [(one.time_ns, k) for k, one in made if one.accepted]
+    on_board = [(since_ns, k) for since_ns, k in accepted if rows[k].kind != COMPUTED]
+    return sorted(recorded or on_board or accepted)
 
 
-def findings(shown: Sequence[Series]) -> list[tuple[Series, Term]]:
-    """Terms of series, a drift of several that trade with each other where it is clearest."""
-    terms = [(series, term) for series in shown for term in series.trend.terms]
-    clearest: dict[object, tuple[float, str]] = {}
-    for series, term in terms:
-        if term.kind == 'drift':
-            group = _TRADING.get(series.name, series.name)
-            best = (abs(term.size) / term.sigma, series.name)
-            clearest[group] = max(best, clearest.get(group, best))
-    names = {name for _, name in clearest.values()}
+def pairs(rows: Sequence[Row], active: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Indices of each calibration and of the one that was active at its last image."""
     return [
-        (series, term) for series, term in terms if term.kind != 'drift' or series.name in names
+        (k, against)
+        for k, one in enumerate(calibrations(rows))
+        for against in [i for since_ns, i in active if since_ns <= one.time_ns and i != k][-1:]
     ]
 
 
-def _known(
-    rows: Sequence[Row],
-    name: str,
-    unit: str,
-    value: Floats,
-    sigma: Floats,
-    max_p_value: float,
-) -> list[Series]:
-    """The series of the calibrations that estimated a number; none where none did."""
-    known = np.flatnonzero(np.isfinite(sigma) & (sigma > 0) & np.isfinite(value))
-    if not len(known):
-        return []
-    time_s = np.array([rows[k].time_ns for k in known], np.float64) / NANOSECONDS_PER_SECOND
-    temperature = np.array([rows[k].temperature_degc for k in known])
-    trend = trend_of(time_s, value[known], sigma[known], temperature, max_p_value)
-    return [Series(name, unit, tuple(known.tolist()), value[known], sigma[known], trend)]
-
-
-def _boresight_arcsec(geometries: Sequence[CameraGeometry]) -> Floats:
-    """Rotations (n, 2) of the line of sight of the middle about x and y of the first camera."""
-    camera = geometries[0].camera
-    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    in_tracker = [
-        geometry.star_tracker_from_camera.apply(line_of_sight(geometry.camera, middle))
-        for geometry in geometries
-    ]
-    tracker_from_first = Rotation.from_quat(geometries[0].star_tracker_from_camera_xyzw)
-    of_first = tracker_from_first.inv().apply(in_tracker)
-    return np.asarray(np.cross(of_first[0], of_first)[:, :2] / ARCSECOND_RAD)
-
-
-def activations(rows: Sequence[Row]) -> list[Active]:
-    """Calibrations that were active, in order; recorded activations, else assumed ones."""
-    recorded = sorted(
-        (row.active_since_ns, k) for k, row in enumerate(rows) if row.active_since_ns > 0
-    )
-    # A calibration computed from a bag was never on board.
-    on_board = [(row.last_ns, k) for k, row in enumerate(rows) if row.accepted]
-    on_board = [(since, k) for since, k in on_board if rows[k].kind != COMPUTED] or on_board
-    starts = recorded or sorted(on_board)
-    return [
-        Active(k, since, until, not recorded)
-        for (since, k), (until, _) in itertools.pairwise([*starts, (0, -1)])
-        if since != until
-    ]
-
-
-def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
-    """Change by each calibration against the one active at its last image."""
-    made = []
-    for k, row in enumerate(rows):
-        then = [period for period in active if period.since_ns <= row.last_ns and period.row != k]
-        if then:
-            made.append(_change(rows, k, then[-1].row))
-    return made
-
-
-def _change(rows: Sequence[Row], row: int, against: int) -> Change:
-    before, after = rows[against].geometry, rows[row].geometry
-    if (before.camera.width, before.camera.height) != (after.camera.width, after.camera.height):
-        return Change(row, against, math.inf, math.inf)
-    old, new = (grid_lines_of_sight(geometry, *_GRID) for geometry in (before, after))
-    moved_rad = np.linalg.norm(new - old, axis=1).max()
-    _, left_px = movement(before, after, *_GRID)
-    total_px = float(moved_rad * after.camera.parameters[0])
-    return Change(row, against, total_px, float(left_px.max()))
+def change(rows: Sequence[Row], row: int, against: int) -> Change:
+    """Change between two calibrations; infinite where they do not compare."""
+    both = calibrations([rows[against], rows[row]])
+    cameras = [one.geometry.camera for one in both]
+    if len({(camera.width, camera.height) for camera in cameras}) > 1:
+        return Change(row, against, math.inf, math.nan)
+    old, new = (grid_lines_of_sight(one.geometry, *_GRID) for one in both)
+    moved_rad = np.linalg.norm(new - old, axis=1)
+    worst = int(np.argmax(moved_rad))
+    pixel = pixel_grid(cameras[1], *_GRID)[worst : worst + 1]
+    variance_rad2 = sum(float(np.trace(_sight(one, pixel)[1])) for one in both)
+    sigmas = float(moved_rad[worst]) / math.sqrt(variance_rad2) if variance_rad2 > 0 else math.nan
+    return Change(row, against, float(moved_rad[worst] * cameras[1].parameters[0]), sigmas)
 
 
 def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Calibrations by spacecraft, camera, frame, size and lens model; the largest group first."""
     by_name: dict[str, list[Row]] = {}
-    for row in rows:
-        if row.error:
-            continue
-        size = f'{row.width} x {row.height}'
-        parts = (row.spacecraft, row.camera, row.child_frame, size, row.lens_model)
-        name = ', '.join(filter(None, parts))
-        by_name.setdefault(name, []).append(row)
+    for row, one in ((row, row.calibration) for row in rows):
+        if one is not None:
+            camera = one.geometry.camera
+            size = f'{camera.width} x {camera.height}'
+            parts = (row.spacecraft, row.camera, one.child_frame, size, camera.model)
+            by_name.setdefault(', '.join(filter(None, parts)), []).append(row)
     return dict(sorted(by_name.items(), key=lambda item: (-len(item[1]), item[0])))
 
 
@@ -335,7 +295,8 @@ def distinct(rows: Sequence[Row]) -> list[Row]:
     A state folder has a calibration once more for each activation, and a folder may be copied.
     """
     first: dict[object, Row] = {}
-    for row in rows:
-        key = row.first_ns, row.last_ns, row.values, row.star_tracker_from_camera_xyzw
+    for row, one in zip(rows, calibrations(rows), strict=True):
+        numbers = one.geometry.camera.parameters, one.geometry.star_tracker_from_camera_xyzw
+        key = one.first_image_ns, one.time_ns, *(array.tobytes() for array in numbers)
         first.setdefault(key, row)
     return list(first.values())

@@ -156,10 +156,7 @@ def read_calibration(path: Path | str) -> Calibration:
     'hierarchical'
     """
     file = calibration_file(Path(path))
-    content = read_json(file)
-    if not isinstance(content, dict):
-        raise ProductError(f'{file}: not a calibration (no JSON object)')
-    return calibration_from_content(file, content)
+    return calibration_from_content(file, read_json(file))
 
 
 def calibration_file(path: Path) -> Path:
@@ -179,12 +176,14 @@ def calibration_file(path: Path) -> Path:
     return last
 
 
-def calibration_from_content(path: Path, content: Mapping[str, Any]) -> Calibration:
+def calibration_from_content(path: Path, content: object) -> Calibration:
     """
     The calibration in the JSON object of a ``calibration.json``; other keys are ignored.
 
     Raises ProductError naming the file ``path`` and the key that is missing or wrong.
     """
+    if not isinstance(content, dict):
+        raise ProductError(f'{path}: not a calibration (no JSON object)')
     if 'schema' not in content:
         raise ProductError(f'{path}: not a calibration (no key schema)')
     if content['schema'] != SCHEMA:

@@ -17,7 +17,7 @@ from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.records import Calibration, refused_image, StarObservations
 
 FIRST_NS = 1_778_829_600_123_456_789
@@ -84,6 +84,8 @@ def test_spice_has_the_attitude_of_each_image_and_none_between(
 def test_without_stars_or_clock_it_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match='no image with stars'):
         written(tmp_path, MADE, [], 0)
+    with pytest.raises(OptionError, match='^--kernels: give the leap seconds kernel'):
+        export(MADE, 'ck', tmp_path, Request(SpiceNames(-42), observations=[observed(0)]))
     other = SpiceNames(-42)
     kernels = [tmp_path / 'leap.tls', tmp_path / 'clock.tsc']
     with pytest.raises(ProductError, match=r'camera\.bc: .*SPICE'):

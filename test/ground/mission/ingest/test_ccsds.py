@@ -30,35 +30,37 @@ FIRST = ' '.join(map(repr, (XYZW[3], *XYZW[:3])))
 
 
 OLD = {'ATTITUDE_DIR': 'A2B', 'QUATERNION_TYPE': 'LAST'}
+HEAD = 'CREATION_DATE = 2026-05-15T07:00:00\nORIGINATOR = TEST\n'
+Changes = Mapping[str, str | None]
+
+
+def message(kind: str, version: str, head: str, changes: Changes, data: str) -> str:
+    """A message in KVN of one segment; a change to None removes a keyword."""
+    keywords = {'OBJECT_NAME': 'SAT', 'OBJECT_ID': '2026-001A', 'TIME_SYSTEM': 'UTC', **changes}
+    metadata = ''.join(f'{key} = {value}\n' for key, value in keywords.items() if value)
+    return f'CCSDS_{kind}_VERS = {version}\n{head}META_START\n{metadata}META_STOP\n{data}'
 
 
 def aem(
     version: str,
-    changes: Mapping[str, str | None],
+    changes: Changes,
     line: str = FORWARD,
-    head: str = 'CREATION_DATE = 2026-05-15T07:00:00\nORIGINATOR = TEST\n',
+    head: str = HEAD,
     times: tuple[str, str] = T,
 ) -> str:
-    """An AEM in KVN with one attitude at two times; a change to None removes a keyword."""
-    keywords: dict[str, str | None] = {
-        'OBJECT_NAME': 'SAT',
-        'OBJECT_ID': '2026-001A',
+    """An AEM with one attitude at two times."""
+    keywords = {
         'CENTER_NAME': 'EARTH',
         'REF_FRAME_A': 'ICRF',
         'REF_FRAME_B': 'STARTRACKER_1',
-        'TIME_SYSTEM': 'UTC',
         'START_TIME': times[0],
         'STOP_TIME': times[1],
         'ATTITUDE_TYPE': 'QUATERNION',
         **(OLD if version == '1.0' else {}),
-        **changes,
     }
-    metadata = ''.join(f'{key} = {value}\n' for key, value in keywords.items() if value)
     data = ''.join(f'{time} {line}\n' for time in times)
-    return (
-        f'CCSDS_AEM_VERS = {version}\n{head}META_START\n{metadata}META_STOP\n'
-        f'DATA_START\n{data}DATA_STOP\n'
-    )
+    data = f'DATA_START\n{data}DATA_STOP\n'
+    return message('AEM', version, head, {**keywords, **changes}, data)
 
 
 GMAT = {'CENTER_NAME': 'Earth', 'INTERPOLATION_METHOD': 'Linear', 'INTERPOLATION_DEGREE': '7'}
@@ -120,6 +122,10 @@ REFUSED_ATTITUDES = {
     'another message': ('CCSDS_APM_VERS = 2.0\n', 'not with CCSDS_AEM_VERS'),
     'xml': ('<?xml version="1.0"?>\n<aem/>', 'it is XML: convert it to KVN'),
     'version 3': (aem('3.0', {}), "version '3.0' is not 1.0 or 2.0"),
+    'unknown times': (aem('1.0', {'TIME_SYSTEM': 'MET'}), 'MET'),
+    'unknown frame': (aem('1.0', {'REF_FRAME_A': 'TEME'}), 'one must be ICRF or EME2000'),
+    'no tracker': (aem('1.0', {'REF_FRAME_B': 'EME2000'}), 'one must be ICRF'),
+    'no date': (aem('1.0', {}, times=('2026-05-15T99:20:00', T[1])), 'is not a date and time'),
 }  # fmt: skip
 
 
@@ -157,29 +163,14 @@ def test_attitudes_outside_the_useable_span_are_left_out(tmp_path: Path) -> None
     assert found.time_ns.tolist() == [from_text(T[0], 'UTC')]
 
 
-def oem(
-    version: str,
-    changes: Mapping[str, str | None],
-    more: str = '',
-    end: str = '',
-    head: str = 'CREATION_DATE = 2026-05-15T07:00:00\nORIGINATOR = TEST\n',
-) -> str:
-    """An OEM in KVN of an even motion about the barycentre."""
-    keywords: dict[str, str | None] = {
-        'OBJECT_NAME': 'SAT',
-        'OBJECT_ID': '2026-001A',
-        'CENTER_NAME': 'SOLAR SYSTEM BARYCENTER',
-        'REF_FRAME': 'ICRF',
-        'TIME_SYSTEM': 'UTC',
-        'START_TIME': T[0],
-        'STOP_TIME': T[1],
-        **changes,
-    }
-    metadata = ''.join(f'{key} = {value}\n' for key, value in keywords.items() if value)
+def oem(version: str, changes: Changes, more: str = '', end: str = '', head: str = HEAD) -> str:
+    """An OEM of an even motion about the barycentre."""
+    keywords = {'CENTER_NAME': 'SOLAR SYSTEM BARYCENTER', 'REF_FRAME': 'ICRF'}
+    span = {'START_TIME': T[0], 'STOP_TIME': T[1]}
     data = ''.join(
         f'{time} {state(seconds)}{more}\n' for time, seconds in zip(T, (0, 10), strict=True)
     )
-    return f'CCSDS_OEM_VERS = {version}\n{head}META_START\n{metadata}META_STOP\n{data}{end}'
+    return message('OEM', version, head, {**keywords, **span, **changes}, f'{data}{end}')
 
 
 def state(seconds: float) -> str:
@@ -208,6 +199,8 @@ VELOCITIES = {
 }
 
 REFUSED_VELOCITIES = {
+    'another centre': (oem('2.0', {'CENTER_NAME': 'MOON'}), 'MOON'),
+    'another time': (oem('2.0', {}).replace('T07', 'T08'), 'no velocity for 1 of 1 images'),
     'frame of date': (oem('2.0', {'REF_FRAME': 'TOD'}), 'neither ICRF nor EME2000'),
     'orekit keyword': (oem('2.0', {'WRONG_KEYWORD': '1'}), '2.0 has no keyword WRONG_KEYWORD'),
     'orekit keyword in data': (oem('2.0', {}, end='KEY = 1\n'), 'line 15, in the data'),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import json
 from pathlib import Path
 import shutil
@@ -47,8 +48,10 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def words(text: str, **values: object) -> list[str]:
-    return [word.format(**values) for word in text.split()]
+def run(aem: Path, *images_of: Path, bag: Path | None = None, more: Sequence[object] = ()) -> int:
+    """Exit status of an import of images with attitudes, by default into `bag` beside these."""
+    places = ['--attitude', aem, '-o', bag or aem.parent / 'bag']
+    return main(['import', '--images', *map(str, (*images_of, *places, *more))])
 
 
 @pytest.mark.slow
@@ -56,12 +59,9 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
     night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     aem, bag = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag'
-    line = words(
-        'import --images {night}/*.fits --attitude {aem} -o {bag} --camera {camera}',
-        night=night, aem=aem, bag=bag, camera=TINY / 'camera.yaml',
-    )  # fmt: skip
-    velocities = str(write_velocities(tmp_path / 'velocity.csv'))
-    assert main([*line, '--velocity', velocities, '--alignment', *map(repr, ALIGNMENT)]) == 0
+    velocities = ['--velocity', write_velocities(tmp_path / 'velocity.csv')]
+    prior = ['--camera', TINY / 'camera.yaml', '--alignment', *ALIGNMENT]
+    assert run(aem, night / '*.fits', more=[*velocities, *prior]) == 0
     out = capsys.readouterr().out
     assert '10 images' in out and 'params.yaml -o DIR' in out
     found = list(reader.read_images([bag], '/camera/image_raw'))
@@ -81,8 +81,8 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
 def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, capsys) -> None:
     kernels = write_ck(tmp_path)
     bag = tmp_path / 'bag.mcap'
-    line = words('import --images {night}/*.fits -o {bag} --attitude', night=night, bag=bag)
-    assert main([*line, *map(str, kernels), '--star-tracker', str(FRAME_ID)]) == 0
+    attitude = ['--attitude', *kernels, '--star-tracker', FRAME_ID]
+    assert run(kernels[0], night / '*.fits', bag=bag, more=attitude) == 0
     topics = Topics('/camera/image_raw', '/star_tracker/attitude')
     held = read_telemetry([bag], topics).attitudes
     for image in images()[1:-1]:
@@ -97,12 +97,11 @@ def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -
     second = aem.read_text()[start:].replace('STARTRACKER_1', 'ST-2')
     aem.write_text(aem.read_text() + second)
     bag = tmp_path / 'bag'
-    line = words('import --images {n}/*.fits --attitude {a} -o {b} --camera {c}', n=night, a=aem,
-                 b=bag, c=TINY / 'camera.yaml')  # fmt: skip
-    line += ['--star-tracker', 'STARTRACKER_1', '--more-star-trackers', 'ST-2', '--alignment']
-    assert main([*line, *map(repr, ALIGNMENT)]) == 2
+    more = ['--camera', TINY / 'camera.yaml', '--star-tracker', 'STARTRACKER_1']
+    more += ['--more-star-trackers', 'ST-2', '--alignment', *ALIGNMENT]
+    assert run(aem, night / '*.fits', more=more) == 2
     assert '--alignment: 4 numbers, 8 are needed' in capsys.readouterr().err
-    assert main([*line, *map(repr, [*ALIGNMENT, *ALIGNMENT])]) == 0
+    assert run(aem, night / '*.fits', more=[*more, *ALIGNMENT]) == 0
     first, other = (
         [raw.data for raw in reader.read_raw([bag], [topic])]
         for topic in ('/star_tracker/attitude', '/ST_2/attitude')
@@ -123,9 +122,7 @@ def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, capsys)
     # The middle third is missing: a gap, and what is after the end.
     kept = lines[: start + count // 3] + lines[start + 2 * count // 3 : -4] + ['DATA_STOP']
     aem.write_text('\n'.join(kept) + '\n')
-    line = words('import --images {n}/*.fits --attitude {a} -o {b}', n=night, a=aem,
-                 b=tmp_path / 'bag')  # fmt: skip
-    assert main(line) == 0
+    assert run(aem, night / '*.fits') == 0
     out = capsys.readouterr().out
     assert 'images are in gaps of up to' in out and 'have no attitude about them' in out
 
@@ -133,9 +130,7 @@ def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, capsys)
 def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsys) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     aem.write_text(aem.read_text().replace('2026-05-15T07:', '2027-05-15T07:'))
-    line = words('import --images {n}/*.fits --attitude {a} -o {b}', n=night, a=aem,
-                 b=tmp_path / 'bag')  # fmt: skip
-    assert main(line) == 2
+    assert run(aem, night / '*.fits') == 2
     error = capsys.readouterr().err
     spans = [
         f'{utc_text(times[0])} to {utc_text(times[-1])}'
@@ -145,40 +140,25 @@ def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsy
     assert spans[1].replace('2026', '2027') in error and error.count('\n') == 1
 
 
-def test_each_bad_file_is_one_line(night: Path, tmp_path: Path, capsys) -> None:
-    for name in ('a.fits', 'b.fits'):
-        (tmp_path / name).write_bytes(b'nothing')
-    aem = write_aem(tmp_path / 'a.aem')
-    line = words('import --images {n}/*.fits {t}/*.fits --attitude {a} -o {b}', n=night,
-                 t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
-    assert main(line) == 2
-    error = capsys.readouterr().err.splitlines()
-    assert len(error) == 2 and 'a.fits' in error[0] and 'b.fits' in error[1]
-    assert not (tmp_path / 'bag').exists()
-
-
 @pytest.mark.parametrize(
     ('line', 'found'),
     [
-        ('--images {night}/*.nothing --attitude {aem}', 'no file matches'),
-        ('--images {night}/0.fits --attitude {night}/none.aem', 'cannot be read'),
+        ('{night}/*.nothing', 'no file matches'),
+        ('{night}/0.fits --attitude {night}/none.aem', 'cannot be read'),
+        ('{night}/0.fits --attitude {aem} {night}/0.fits', 'one file, unless all are SPICE'),
+        ('{night}/0.fits --camera {aem}', 'a.aem'),
+        ('{night}/0.fits --star-tracker ST7', 'choose one with'),
+        ('{night}/0.fits --value-range 5 1', 'is empty'),
         (
-            '--images {night}/0.fits --attitude {aem} {night}/0.fits',
-            'one file, unless all are SPICE',
-        ),
-        ('--images {night}/0.fits --attitude {aem} --camera {aem}', 'a.aem'),
-        ('--images {night}/0.fits --attitude {aem} --star-tracker ST7', 'choose one with'),
-        ('--images {night}/0.fits --attitude {aem} --value-range 5 1', 'is empty'),
-        (
-            '--images {night}/0.fits --attitude {aem} --camera {camera} --more-star-trackers ST-2',
+            '{night}/0.fits --camera {camera} --more-star-trackers ST-2',
             '--alignment: 0 numbers, 8 are needed: x y z w for each star tracker; only that of a ',
         ),
     ],
 )
 def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, found: str) -> None:
     aem = write_aem(tmp_path / 'a.aem')
-    given = words(line, night=night, aem=aem, camera=TINY / 'camera.yaml')
-    assert main(['import', *given, '-o', str(tmp_path / 'bag')]) == 2
+    given = line.format(night=night, aem=aem, camera=TINY / 'camera.yaml').split()
+    assert run(aem, Path(given[0]), more=given[1:]) == 2
     error = capsys.readouterr().err
     assert found in error and error.count('\n') == 1
 
@@ -186,9 +166,7 @@ def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, f
 def test_no_input_is_replaced(night: Path, tmp_path: Path, capsys) -> None:
     aem = write_aem(tmp_path / 'import.json')
     before = aem.read_bytes()
-    line = words('import --images {n}/0.fits --attitude {a} -o {b}', n=night, a=aem,
-                 b=tmp_path)  # fmt: skip
-    assert main(line) == 2
+    assert run(aem, night / '0.fits', bag=tmp_path) == 2
     assert 'would be replaced' in capsys.readouterr().err and aem.read_bytes() == before
 
 
@@ -215,10 +193,8 @@ def test_no_file_of_another_origin_is_replaced(
     folder.mkdir()
     (folder / name).write_bytes(b'of another program')
     before = tree(folder)
-    aem = write_aem(tmp_path / 'a.aem')
-    line = words('import --images {n}/[0-3].fits --attitude {a} -o {b} --camera {c}', n=night,
-                 a=aem, b=tmp_path / bag, c=TINY / 'camera.yaml')  # fmt: skip
-    assert main(line) == 2
+    aem, more = write_aem(tmp_path / 'a.aem'), ['--camera', TINY / 'camera.yaml']
+    assert run(aem, night / '[0-3].fits', bag=tmp_path / bag, more=more) == 2
     error = capsys.readouterr().err
     assert 'was not written by starcal' in error and error.count('\n') == 1
     assert tree(folder) == before
@@ -230,10 +206,9 @@ def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
     (tmp_path / 'bag').mkdir()
     camera = shutil.copy(TINY / 'camera.yaml', tmp_path / 'bag/camera.yaml')
     for images_of in ('[0-3].fits', '*.fits'):
-        line = words('import --images {n}/{i} --attitude {a} -o {b} --camera {c}', n=night,
-                     i=images_of, a=write_aem(tmp_path / 'a.aem'), b=tmp_path / 'bag',
-                     c=camera)  # fmt: skip
-        assert main(line) == 0, capsys.readouterr().err
+        aem = write_aem(tmp_path / 'a.aem')
+        status = run(aem, night / images_of, more=['--camera', camera])
+        assert status == 0, capsys.readouterr().err
     assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
 
 
@@ -246,9 +221,8 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> N
             file.write(f'NAXIS{axis}  = {11000:20}'.ljust(80).encode())
         file.truncate(2880 * (2 + 11000 * 11000 * 8 // 2880))
     aem = write_aem(tmp_path / 'a.aem')
-    line = words('import --images {n}/0.fits {t}/*.fits --attitude {a} -o {b}', n=night,
-                 t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
-    assert main(line) == 2
+    assert run(aem, night / '0.fits', tmp_path / '*.fits') == 2
+    assert not (tmp_path / 'bag').exists()
     first, second = capsys.readouterr().err.splitlines()
     assert 'cut.fits: not an image in FITS, TIFF or PNG' in first
     assert 'huge.fits: needs more than 1 GB of memory to be read' in second
@@ -260,8 +234,7 @@ def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, capsys) -> N
         header = {'DATE-AVG': date(image.time_ns), 'ROWORDER': 'BOTTOM-UP'}
         write_fits(tmp_path / f'{number}.fits', upside_down, **header)
     aem = write_aem(tmp_path / 'a.aem')
-    line = 'import --images {t}/*.fits --attitude {a} -o {t}/bag'
-    assert main(words(line, t=tmp_path, a=aem)) == 0
+    assert run(aem, tmp_path / '*.fits') == 0
     note = 'pixels of the images: rows last to first (ROWORDER)'
     assert note in capsys.readouterr().out
     assert note in json.loads((tmp_path / 'bag/import.json').read_text())['notes']
@@ -274,7 +247,6 @@ def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:
     for number, image in enumerate(images()[:3]):
         write_fits(tmp_path / f'{number}.fits', image, 'float32')
     aem = write_aem(tmp_path / 'a.aem')
-    line = 'import --images {t}/*.fits --attitude {a} -o {t}/bag --value-range 0 2e6'
-    assert main(words(line, t=tmp_path, a=aem)) == 0
+    assert run(aem, tmp_path / '*.fits', more=['--value-range', 0, 2e6]) == 0
     out = capsys.readouterr().out
     assert 'a step of 16 bit is' in out and 'pixel values are 0 + 30.7692308 DN' in out

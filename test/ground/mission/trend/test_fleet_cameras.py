@@ -10,7 +10,7 @@ import pytest
 from trend_missions import write  # type: ignore[import-not-found]
 
 from starcal_ground.cli.main import main
-from starcal_ground.mission.trend.fleet import Cameras, read_cameras
+from starcal_ground.mission.trend.fleet import Cameras
 from starcal_ground.mission.trend.series import groups
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ros.errors import StarcalError
@@ -29,11 +29,11 @@ from starcal_ros.errors import StarcalError
     ],
 )
 def test_a_pattern_names_spacecraft_and_camera(pattern, name, expected) -> None:
-    assert read_cameras(pattern, '').of(name) == expected
+    assert Cameras(pattern).of(name) == dict(zip(('spacecraft', 'camera'), expected, strict=True))
 
 
 def test_the_names_are_replaced_in_the_path_of_the_parameters(tmp_path: Path) -> None:
-    cameras = read_cameras('{spacecraft}/*', str(tmp_path / '{spacecraft}.yaml'))
+    cameras = Cameras('{spacecraft}/*', str(tmp_path / '{spacecraft}.yaml'))
     assert cameras.params_of('B/y.mcap') == str(tmp_path / 'B.yaml')
     assert Cameras().params_of('x') == ''
 
@@ -43,7 +43,7 @@ def test_the_names_are_replaced_in_the_path_of_the_parameters(tmp_path: Path) ->
 )
 def test_a_bad_pattern_is_one_line(text: str) -> None:
     with pytest.raises(StarcalError, match='not a pattern with') as caught:
-        read_cameras(text, '')
+        Cameras(text)
     assert '\n' not in str(caught.value)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
-import importlib.util
 import os
 from pathlib import Path
 import re
@@ -28,11 +27,6 @@ def example(language: str, word: str) -> str:
     fences = re.findall(rf'```{language}\n(.*?)```', _DOCUMENT, re.DOTALL)
     (found,) = (text for text in fences if word in text)
     return str(found)
-
-
-def needs(*names: str) -> pytest.MarkDecorator:
-    missing = [name for name in names if importlib.util.find_spec(name) is None]
-    return pytest.mark.skipif(bool(missing), reason=f'needs pip install {" ".join(missing)}')
 
 
 @contextlib.contextmanager
@@ -69,32 +63,3 @@ def test_the_containers_of_kubernetes_find_each_other() -> None:
         client.wait_for_workers(1, timeout=_START_S)
         (worker,) = client.scheduler_info()['workers'].values()
         assert (worker['name'], worker['nthreads']) == (name, 1)
-
-
-@needs('jsonschema', 'dask_kubernetes')
-def test_the_manifest_fits_the_schema_of_the_operator() -> None:
-    import dask_kubernetes  # type: ignore[import-not-found,import-untyped,unused-ignore]
-    import jsonschema  # type: ignore[import-not-found,import-untyped,unused-ignore]
-
-    (path,) = Path(dask_kubernetes.__file__).parent.rglob('crds/daskcluster.yaml')
-    versions = yaml.safe_load(path.read_text())['spec']['versions']
-    (schema,) = (v['schema']['openAPIV3Schema'] for v in versions if v['name'] == 'v1')
-    spec = yaml.safe_load(example('yaml', 'DaskCluster'))['spec']
-    validator = jsonschema.Draft202012Validator(refusing_unknown(schema['properties']['spec']))
-    assert list(validator.iter_errors(spec)) == []
-    spec['worker']['spec']['containers'][0]['argument'] = 1
-    assert len(list(validator.iter_errors(spec))) == 1
-
-
-def refusing_unknown(schema: Any) -> Any:
-    """A schema of Kubernetes as JSON schema, in which a name that is not listed is an error."""
-    if isinstance(schema, list):
-        return [refusing_unknown(one) for one in schema]
-    if not isinstance(schema, dict):
-        return schema
-    made = {name: refusing_unknown(value) for name, value in schema.items()}
-    if isinstance(schema.get('properties'), dict) and 'additionalProperties' not in schema:
-        made['additionalProperties'] = schema.get('x-kubernetes-preserve-unknown-fields', False)
-    if schema.get('x-kubernetes-int-or-string'):
-        made['type'] = ['integer', 'string']
-    return made

@@ -13,19 +13,21 @@ import threading
 import urllib.parse
 from xml.sax.saxutils import escape
 
+import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ground.cli.main import main
-from starcal_ground.mission.trend import fleet, places
-from starcal_ground.mission.trend.trend_table import Table
+from starcal_ground.mission.trend import fleet
+from starcal_ground.mission.trend.trend_table import Row, Table
 
 s3fs = pytest.importorskip('s3fs')  # of requirements/dev.txt; not in the oldest versions
 # What was never answered warns when it is collected, which is in the test itself.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings('ignore::ResourceWarning')]
 
 _FLEET = 's3://archive/fleet'
-_ANSWER_S = 3.0  # a sound answer takes milliseconds
+# A sound answer takes milliseconds.
+_CLIENT = {'connect_timeout': 1.0, 'read_timeout': 0.5, 'retries': {'max_attempts': 0}}
 _CODES = {403: 'AccessDenied', 404: 'NoSuchKey', 503: 'SlowDown'}
 _TIME = '2026-01-01T00:00:00.000Z'
 
@@ -135,7 +137,9 @@ def server(few_images: Path) -> Iterator[Store]:
         settings = {'ACCESS_KEY_ID': 'a', 'SECRET_ACCESS_KEY': 'b', 'ENDPOINT_URL': made.url}
         for name, value in {**settings, 'DEFAULT_REGION': 'us-east-1'}.items():
             patch.setenv(f'AWS_{name}', value)
-        places.exists(_FLEET)  # the client starts before its time is short
+        patch.setitem(fsspec.config.conf, 's3', {'config_kwargs': _CLIENT})
+        patch.setattr(s3fs.S3FileSystem, 'retries', 2)
+        fleet.exists(_FLEET)
         yield made
     made.is_closing.set()
     made.shutdown()
@@ -145,10 +149,8 @@ def server(few_images: Path) -> Iterator[Store]:
 
 
 @pytest.fixture
-def store(server: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+def store(server: Store) -> Iterator[Store]:
     server.reset()
-    monkeypatch.setattr(places, 'ANSWER_S', _ANSWER_S)
-    monkeypatch.setattr(places, '_SLOWEST', 2**30)
     yield server
     gc.collect()
 
@@ -175,9 +177,9 @@ PLACES = {  # faults of requests, root, what the one line names
     'no bucket': ({}, 's3://none/fleet', 's3://none/fleet: no such folder'),
     'no folder': ({}, 's3://archive/other', 's3://archive/other: no such folder'),
     'no rights': ({'': 403}, _FLEET, 'cannot be read: PermissionError: '),
-    'drops each connection': ({'': 0}, _FLEET, f'{_FLEET}: cannot be read: no answer in time'),
-    'never answers': ({'': -1}, _FLEET, f'{_FLEET}: cannot be read: no answer in time'),
-    'never lists': ({'list-type': -1}, _FLEET, f'{_FLEET}: cannot be read: no answer in time'),
+    'drops each connection': ({'': 0}, _FLEET, f'{_FLEET}: cannot be read: ConnectionClosed'),
+    'never answers': ({'': -1}, _FLEET, f'{_FLEET}: cannot be read: ReadTimeoutError: '),
+    'never lists': ({'list-type': -1}, _FLEET, f'{_FLEET}: cannot be read: ReadTimeoutError: '),
 }
 
 
@@ -192,11 +194,11 @@ def test_a_store_that_cannot_be_listed_is_one_line(
 
 
 FAULTS = {  # of requests of one bag, and the reason of its row
-    'dropped': ({'GET /archive/fleet/0/.*mcap': 0}, 'no answer in time'),
-    'never answered': ({'GET /archive/fleet/0/.*mcap': -1}, 'no answer in time'),
+    'dropped': ({'GET /archive/fleet/0/.*mcap': 0}, 'ConnectionClosedError: '),
+    'never answered': ({'GET /archive/fleet/0/.*mcap': -1}, 'ReadTimeoutError: '),
     'cut off': ({'GET /archive/fleet/0/.*mcap': -2}, ''),
     'forbidden': ({'/archive/fleet/0/.*mcap': 403}, 'PermissionError: '),
-    'overloaded': ({'GET /archive/fleet/0/.*mcap': 503}, 'no answer in time'),
+    'overloaded': ({'GET /archive/fleet/0/.*mcap': 503}, 'SlowDown'),
     'gone': ({'/archive/fleet/0/.*mcap': 404}, ''),
 }
 
@@ -223,7 +225,7 @@ def test_a_store_that_falls_silent_ends_the_run(
     """A file that a store does not give, where it gives others, holds up no run."""
     compute = fleet.compute
 
-    def while_silent(task: fleet.Task) -> fleet.Answer:
+    def while_silent(task: fleet.Task) -> Row:
         store.faults = {'': -1}  # every request
         return compute(task)
 
@@ -231,7 +233,7 @@ def test_a_store_that_falls_silent_ends_the_run(
         patch.setattr(fleet, 'compute', while_silent)
         assert trend(tmp_path) == 2
     said = capsys.readouterr().err
-    assert f'{_FLEET}: cannot be read: no answer in time' in said and said.count('\n') == 1
+    assert f'{_FLEET}: cannot be read: ReadTimeoutError: ' in said and said.count('\n') == 1
     assert Table(tmp_path).rows() == []
     store.faults = {'GET /archive/fleet/0/.*mcap': -1}
     assert trend(tmp_path) == 0

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The command over a folder tree: rows, increments, workers, poison and versions."""
+"""The command over a folder tree or a URL: rows, increments, workers, poison and versions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ import shutil
 
 import dask
 from fleet_tasks import kill_on_poison, kill_once  # type: ignore[import-not-found]
+import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
 from trend_missions import make_mission, trend, write  # type: ignore[import-not-found]
 
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
-from starcal_ground.mission.trend.fleet import Answer, Cameras, Task
-from starcal_ground.mission.trend.trend_table import COMPUTED, Table
+from starcal_ground.mission.trend.fleet import Cameras, Task
+from starcal_ground.mission.trend.trend_table import COMPUTED, Row, Table
 
 
 @pytest.fixture
@@ -30,12 +31,14 @@ def mission(tmp_path: Path) -> Path:
 
 def test_only_what_is_new_is_computed(mission: Path, capsys, monkeypatch) -> None:
     assert trend(mission) == 0
-    assert '8 new, 0 known, 0 failed' in capsys.readouterr().out
+    out = ' '.join(capsys.readouterr().out.split())
+    assert '8 new, 0 known, 0 failed' in out
+    assert 'plumb_bob: sound. The active calibration is the newest one. No step or drift' in out
     write(mission / 'later/deep', 100)
     called: list[Task] = []
     compute = fleet.compute
 
-    def counted(task: Task) -> Answer:
+    def counted(task: Task) -> Row:
         called.append(task)
         return compute(task)
 
@@ -114,9 +117,10 @@ def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, capsys) -> None:
 
 
 def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:
-    made = (('pipe', 'x.mcap'), ('pipe', 'calibration.json'), ('folder', 'calibration.json'))
+    made = (('pipe', 'x.mcap'), ('pipe', 'calibration.json'))
     links = ((target, 'x.mcap') for target in ('/dev/zero', '/dev/tty', 'nowhere', 'x.mcap'))
-    for k, (kind, name) in enumerate((*made, *links, ('folder', 'x.mcap'))):
+    folders = (('folder', name) for name in ('x.mcap', 'calibration.json'))
+    for k, (kind, name) in enumerate((*made, *links, *folders)):
         (mission / f'odd{k}').mkdir()
         path = mission / f'odd{k}' / name
         if kind == 'pipe':
@@ -126,8 +130,8 @@ def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:
         else:
             path.symlink_to(kind)
     assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
-    # A folder in place of a bag is one without a bag in it.
-    assert '8 new, 0 known, 7 failed' in capsys.readouterr().out
+    # A folder in place of a file is one without a bag or a calibration in it.
+    assert '8 new, 0 known, 6 failed' in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -143,13 +147,14 @@ def test_a_link_to_no_file_costs_itself_and_not_its_bag(
     assert '12 new, 0 known, 0 failed' in capsys.readouterr().out
 
 
-def test_a_calibration_that_no_page_can_show_costs_itself(mission: Path, capsys) -> None:
+def test_a_number_that_no_page_can_show_is_left_out(mission: Path, capsys) -> None:
     path = mission / '3/calibration.json'
     wild = json.loads(path.read_text())
     wild['covariance'][0][0] = 1e300
     path.write_text(json.dumps(wild))
     assert trend(mission) == 0
-    assert '7 new, 0 known, 1 failed' in capsys.readouterr().out
+    assert '8 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert '<b>fx</b>Not tested' not in (mission.parent / 'out/trend.html').read_text()
 
 
 @pytest.mark.slow
@@ -161,7 +166,8 @@ def test_bags_are_calibrated_with_parameters(few_images: Path, tmp_path: Path, c
     assert main([*line, '--params', str(TINY / 'params.yaml')]) == 0
     assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
     good = [row for row in Table(tmp_path / 'out').rows() if not row.error]
-    assert [row.kind for row in good] == [COMPUTED] and good[0].accepted
+    assert [row.kind for row in good] == [COMPUTED]
+    assert good[0].calibration and good[0].calibration.accepted
 
 
 @pytest.mark.parametrize(
@@ -169,6 +175,7 @@ def test_bags_are_calibrated_with_parameters(few_images: Path, tmp_path: Path, c
     [
         ('trend {t}/none -o {t}/out', 'no such folder'),
         ('trend {t} -o {t}/out', 'no calibration.json below it'),
+        ('trend nowhere://fleet -o {t}', 'nowhere'),
     ],
 )
 def test_bad_input_is_one_line(tmp_path: Path, capsys, line: str, words: str) -> None:
@@ -179,7 +186,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys, line: str, words: str) ->
 
 @pytest.mark.slow
 def test_a_bag_that_kills_its_worker_costs_itself(mission: Path, monkeypatch) -> None:
-    poison = [Task(f'poison {k}', f'poison {k}', (), size=-1) for k in range(2)]
+    poison = [Task(f'poison {k}', f'poison {k}') for k in range(2)]
     found = [poison[0], *fleet.find(str(mission), Cameras()), poison[1]]
     monkeypatch.setattr(fleet, 'compute', kill_on_poison)
     table = Table(mission.parent)
@@ -213,3 +220,51 @@ def test_a_worker_killed_while_it_starts_is_one_line_and_the_next_run_goes_on(
     said = capsys.readouterr().err
     assert said.count('\n') == 1 and '--workers: 1: Dask ended' in said and 'run again' in said
     assert trend(mission) == 0 and '8 new, 0 known, 0 failed' in capsys.readouterr().out
+
+
+def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
+    shutil.copytree(mission / '1', mission / 'copy')
+    assert trend(mission) == 0
+    capsys.readouterr()
+
+    def unread(*_: object) -> None:
+        raise AssertionError('a file is read')
+
+    monkeypatch.setattr(fleet, 'compute', unread)
+    assert trend(mission) == 0
+    assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
+
+
+def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(mission: Path) -> None:
+    found = list(fleet.find(str(mission), Cameras()))
+    away = mission.rename(mission.parent / 'unmounted')
+    done = fleet.update(Table(mission.parent), found)
+    assert (done.failed, len(done.unreachable), Table(mission.parent).rows()) == (8, 8, [])
+    assert 'not seen by this worker; mount it' in done.unreachable[0]
+    away.rename(mission)
+    assert fleet.update(Table(mission.parent), found) == fleet.Done(computed=8)
+
+
+def test_relative_paths_are_made_absolute(mission: Path, monkeypatch) -> None:
+    monkeypatch.chdir(mission.parent)
+    assert main(['trend', 'mission', '-o', 'out']) == 0
+    assert all(Path(row.path).is_absolute() for row in Table('out').rows())
+
+
+@pytest.mark.slow
+def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, capsys) -> None:
+    memory = fsspec.filesystem('memory')
+    memory.rm('/fleet', recursive=True) if memory.exists('/fleet') else None
+    memory.put(str(few_images), '/fleet/bag', recursive=True)
+    write(tmp_path / 'one', 3)
+    memory.put(str(tmp_path / 'one'), '/fleet/one', recursive=True)
+    line = ['trend', 'memory://fleet', '-o', str(tmp_path)]
+    line += ['--params', str(TINY / 'params.yaml')]
+    assert main(line) == 0
+    assert '2 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert main(line) == 0
+    assert '0 new, 2 known, 0 failed' in capsys.readouterr().out
+    paths = sorted(row.path for row in Table(tmp_path).rows())
+    assert paths == ['memory://fleet/bag', 'memory://fleet/one/calibration.json']
+    assert main([*line[:3], 'memory://fleet/out']) == 2
+    assert 'results are written to a local folder, no URL' in capsys.readouterr().err
