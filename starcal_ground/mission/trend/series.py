@@ -23,7 +23,7 @@ from starcal_ground.comparison import alignment_difference_rad
 from starcal_ground.mission.trend.trend_table import COMPUTED, Row
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives, grid_lines_of_sight
-from starcal_ros.camera import INTRINSIC_NAMES, pixel_grid
+from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import Calibration
 
@@ -175,7 +175,11 @@ def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Ser
     """
     made = calibrations(rows)
     first = made[0].geometry
-    sights, sight_sigmas_rad = map(np.array, zip(*map(_boresight, made), strict=True))
+    middle = np.array([[first.camera.width - 1, first.camera.height - 1]]) / 2
+    # The derivatives of all cameras of a group are those of one, to the change of its parameters.
+    of_all = Derivatives.at(first.camera, middle)
+    found = [_boresight(one, middle, of_all) for one in made]
+    sights, sight_sigmas_rad = map(np.array, zip(*found, strict=True))
     of_first = first.star_tracker_from_camera.inv().apply(sights)
     turned_rad = [alignment_difference_rad(one.geometry, first) for one in made]
     angles = np.column_stack([np.cross(of_first[0], of_first)[:, :2], turned_rad]) / ARCSECOND_RAD
@@ -203,14 +207,17 @@ def calibrations(rows: Sequence[Row]) -> list[Calibration]:
     return [row.calibration for row in rows if row.calibration is not None]
 
 
-def _boresight(one: Calibration) -> tuple[Floats, Floats]:
+def _boresight(one: Calibration, middle: Floats, of_all: Derivatives) -> tuple[Floats, Floats]:
     """
-    Line of sight (3,) of the middle of the detector, star tracker frame, and its sigma (2,), rad.
+    Line of sight (3,) of the middle (1, 2) of the detector, star tracker frame, and its sigma.
 
-    The sigma is about the x and y axes of the camera.
+    The sigma (2,), rad, is about the x and y axes of the camera.
     """
-    camera = one.geometry.camera
-    direction, covariance = _sight(one, np.array([[camera.width - 1, camera.height - 1]]) / 2)
+    if of_all.J.shape[-1] == len(one.map_covariance.matrix):
+        (direction,) = line_of_sight(one.geometry.camera, middle)
+        (covariance,) = of_all.covariance_rad2(one.map_covariance, of_all.J)
+    else:  # with a field, and the first one without, or the reverse
+        direction, covariance = _sight(one, middle)
     in_tracker = one.geometry.star_tracker_from_camera.apply(direction)
     # A small rotation about x moves the direction along y, one about y along x.
     return in_tracker, np.sqrt(np.diag(covariance)[[1, 0]])
