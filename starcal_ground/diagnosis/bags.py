@@ -38,7 +38,6 @@ _STAR_REMEDIES = {
     StarRefusal.FAINT.label: 'expose for longer',
     StarRefusal.SATURATED.label: 'expose for a shorter time',
     StarRefusal.HOT_PIXEL.label: 'check bad_pixel_map and dark_frame',
-    StarRefusal.ELONGATED.label: 'mend coma, focus or tracking: so many are no cosmic rays',
     StarRefusal.NOT_DETECTED.label: 'check for clouds and dew, or lower magnitude_limit',
 }
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
