@@ -21,6 +21,7 @@ from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.topics import OnImage, Topics, Wanted
 from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.assessment.predictions import Residuals
+from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import check_site, Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
@@ -40,7 +41,7 @@ class Source:
     Bags, topics and setup; once `chosen`, the topics that are read and an alignment.
 
     ``through_air`` is given where the air, if any, is to be found by the stars, in all images
-    together; ``notes`` are sentences for the user.
+    together; ``notes`` are sentences for the user; ``files`` are those that the user gave.
     """
 
     bags: tuple[Path, ...]
@@ -48,6 +49,7 @@ class Source:
     setup: Setup
     through_air: ThroughAir | None = None
     notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
 
     @property
     def image_count(self) -> int:
@@ -102,9 +104,13 @@ def chosen(source: Source) -> Source:
         check_site(setup.site)
     topics = bag_topics.choose_topics(bags, requested, setup)
     if not (setup.is_aligned or topics.observations):
-        from starcal_ground.diagnosis.bags import aligned_by_bags  # seldom needed, slow
+        from starcal_ground.diagnosis.bags import aligned_by_stars  # seldom needed, slow
+        from starcal_ground.diagnosis.diagnose import found_alignment
 
-        setup, sentence = aligned_by_bags(bags, requested, setup)
+        setup, diagnosis = aligned_by_stars(bags, requested, setup)
+        _, sentence = found_alignment(diagnosis)
+        if not setup.is_aligned:
+            raise OptionError(f'prior_alignment: not given, and not found: {sentence}')
         notes = (*notes, sentence)
     return replace(source, topics=topics, setup=setup, notes=notes)
 

@@ -11,13 +11,12 @@ from itertools import islice
 import math
 from pathlib import Path
 
-import numpy as np
-
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.contents import topic_contents, TopicContent
 from starcal_ground.campaign import calibrate, Observed, observed_of, Progress, Source
 from starcal_ground.diagnosis.bags import (
+    aligned_by_stars,
     diagnose_bags,
     of_bags,
     of_most,
@@ -27,10 +26,10 @@ from starcal_ground.diagnosis.bags import (
     Refused,
     refused_all_the_same,
 )
-from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
+from starcal_ground.diagnosis.diagnose import Diagnosis
 from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError, OptionError, StarcalError, TooFewObservations
-from starcal_ros.pipeline.setup import aligned, check_site
+from starcal_ros.pipeline.setup import check_site
 from starcal_ros.records import StarObservations
 from starcal_ros.sky.attitude import AttitudeOptions
 
@@ -120,11 +119,9 @@ def _measured(source: Source, progress: Progress) -> Examined:
         check_site(setup.site)
     topics = bag_topics.choose_topics(bags, source.topics, setup)
     if not (setup.is_aligned or topics.observations):
-        unaligned = diagnose_bags(bags, topics, setup)
-        alignment, _ = found_alignment(unaligned)
-        if alignment is None:
+        setup, unaligned = aligned_by_stars(bags, topics, setup)
+        if not setup.is_aligned:
             return Examined(_contents(bags, topics, (), 0), unaligned)
-        setup = aligned(setup, np.array(alignment))
     source = replace(source, topics=topics, setup=setup)
     count = source.image_count
     with progress(count) as advance:

@@ -23,7 +23,7 @@ from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttit
 from starcal_ground.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
 from starcal_ros.assessment.gate import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import BagError, ImageRefused, OptionError
+from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations, StarRefusal
@@ -120,16 +120,17 @@ def of_bags(
     return of_refusals(by_itself, count) or diagnosis
 
 
-def aligned_by_bags(paths: Sequence[Path], requested: Topics, setup: Setup) -> tuple[Setup, str]:
+def aligned_by_stars(
+    paths: Sequence[Path], requested: Topics, setup: Setup
+) -> tuple[Setup, Diagnosis]:
     """
-    A setup with the alignment that the images show, since none is given, and a sentence on it.
+    A setup with the alignment that at least three images show, or as it is, and their diagnosis.
 
-    Raises BagError when a bag cannot be read, OptionError when fewer than three images agree.
+    Raises BagError when a bag cannot be read.
     """
-    values, sentence = found_alignment(diagnose_bags(paths, requested, setup))
-    if values is None:
-        raise OptionError(f'prior_alignment: not given, and not found: {sentence}')
-    return aligned(setup, np.array(values)), sentence
+    diagnosis = diagnose_bags(paths, requested, setup)
+    values, _ = found_alignment(diagnosis)
+    return (setup if values is None else aligned(setup, np.array(values))), diagnosis
 
 
 def _without_common_time(
