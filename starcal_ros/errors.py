@@ -37,7 +37,7 @@ class StarcalError(Exception):
     ...     starcal_ground.calibrate_bag('no.mcap', 'bags/tiny/params.yaml')
     ... except starcal_ground.StarcalError as error:
     ...     print(error)
-    no.mcap: no such bag
+    no.mcap: no such file or folder
     """
 
 

@@ -426,7 +426,7 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         elif os.path.lexists(path):
             files.append(path)
         else:
-            raise BagError(f'{path}: no such bag')
+            raise BagError(f'{path}: no such file or folder')
     for file in files:
         # Opening a pipe would wait for its writer.
         with errors_as(BagError, file), regular_file(file) as stream:

@@ -665,7 +665,7 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
     ('arguments', 'text'),
     [
         ((), 'bag: path of the bag to play is missing'),
-        (('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such bag'),
+        (('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such file or folder'),
         (('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
     ],
 )

@@ -47,7 +47,7 @@ def test_from_bag(tmp_path: Path) -> None:
 def test_from_a_bag_that_is_not_there(tmp_path: Path) -> None:
     done = run(tmp_path, EXAMPLES / 'from_bag.py', 'none', TINY / 'params.yaml', 'out.json')
     assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr == 'none: no such bag\n'
+    assert done.stderr == 'none: no such file or folder\n'
 
 
 @pytest.mark.slow

@@ -225,7 +225,7 @@ def test_the_reading_thread_ends_with_its_reader(tmp_path: Path) -> None:
 
 def test_an_error_of_reading_reaches_the_caller(tmp_path: Path) -> None:
     file = tmp_path / 'vanished.mcap'
-    with pytest.raises(BagError, match='no such bag'):
+    with pytest.raises(BagError, match='no such file or folder'):
         list(read_frames([file], TOPICS, OPTIONS))
 
 

@@ -192,7 +192,7 @@ def test_several_topics_of_a_type(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('name', 'content', 'text'),
     [
-        ('missing', None, 'no such bag'),
+        ('missing', None, 'no such file or folder'),
         ('text.mcap', b'hello', 'not an MCAP bag'),
         ('empty.mcap', b'', 'not an MCAP bag'),
         ('folder/', None, 'no .mcap files'),

@@ -98,7 +98,7 @@ def test_a_command_line_imports_its_command_alone() -> None:
         (['inspect', 'a.mcap'], ['inspect: no such command', 'starcal diagnose lists']),
         (['calibrat'], ["'calibrat'", 'calibrate']),
         (['diagnose', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'diagnose --help']),
-        (['diagnose', 'none.mcap'], ['none.mcap', 'no such bag']),
+        (['diagnose', 'none.mcap'], ['none.mcap', 'no such file or folder']),
         (['diagnose', ''], ['empty path']),
         (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
         (
@@ -121,7 +121,7 @@ def test_a_command_line_imports_its_command_alone() -> None:
         (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', '-1'], ['--seed', '-1']),
         (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', 'one'], ['--seed', 'one']),
         (['play'], ['BAG']),
-        (['play', 'none.mcap'], ['none.mcap', 'no such bag']),
+        (['play', 'none.mcap'], ['none.mcap', 'no such file or folder']),
         (['play', 'a.mcap', '--observer=ground'], ['--observer=ground (see starcal play --help)']),
         (['play', str(TINY), '--rate', 'fast'], ['--rate', 'fast']),
         (['calibrate', 'a', '-o', 'x', '--from', 'noon'], ['--from', 'is not a time: give 2026']),
@@ -155,7 +155,7 @@ def test_bags_that_are_none(run: Run, tmp_path: Path) -> None:
     old.mkdir()
     (old / 'old.db3').write_bytes(b'SQLite format 3\0')
     for bag, words in (
-        (tmp_path / 'none.mcap', ['no such bag']),
+        (tmp_path / 'none.mcap', ['no such file or folder']),
         (text, ['not an MCAP bag']),
         (empty, ['not an MCAP bag']),
         (folder, ['no .mcap files']),
