@@ -95,7 +95,6 @@ def test_a_command_line_imports_its_command_alone() -> None:
     ('arguments', 'words'),
     [
         (['fly'], ["'fly'"]),
-        (['inspect', 'a.mcap'], ['inspect: no such command', 'starcal diagnose lists']),
         (['calibrat'], ["'calibrat'", 'calibrate']),
         (['diagnose', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'diagnose --help']),
         (['diagnose', 'none.mcap'], ['none.mcap', 'no such file or folder']),
