@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 import math
 from pathlib import Path
@@ -66,32 +66,9 @@ def diagnose_bags(
     """
     Why the images of bags cannot be used: by their refusals, by their stamps, by their stars.
 
-    ``refused`` are all images, if a measurement with the setup has refused them.  Raises BagError
-    when a bag cannot be read, or holds no images with attitudes.
-    """
-    diagnosis = of_bags(paths, requested, setup, refused)
-    return refused_all_the_same(refused, diagnosis) if diagnosis.cause == 'none' else diagnosis
-
-
-def refused_all_the_same(
-    refused: Sequence[Refused], fits: Diagnosis, images: int = 0
-) -> Diagnosis:
-    """The refusals of images whose set-up fits as their cause; ``images``: of so many."""
-    by_images = of_refusals(refused, images or sum(group.count for group in refused))
-    if by_images is None:
-        return fits
-    # The remedy of the others is to ask for this diagnosis.
-    mend = () if by_images.cause == 'no_match' else by_images.mend
-    return replace(by_images, evidence=(*fits.evidence, *by_images.evidence), mend=mend)
-
-
-def of_bags(
-    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused]
-) -> Diagnosis:
-    """
-    `diagnose_bags`, with ``none`` where attitudes, alignment and camera fit.
-
-    ``refused`` are the images that a measurement with the setup has refused, if there was one.
+    ``none`` where attitudes, alignment and camera fit.  ``refused`` are the images that a
+    measurement with the setup has refused, if there was one.  Raises BagError when a bag cannot be
+    read, or holds no images with attitudes.
     """
     topics = bag_topics.choose_topics(paths, requested, setup)
     if topics.observations:
