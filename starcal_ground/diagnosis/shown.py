@@ -24,6 +24,8 @@ SIGMAS = 3.0  # significance with which the stars show the principal point elsew
 _FAINTER = 0.8  # share of the brightest peak up to which a star is surely not saturated
 _FEW_IN_AN_IMAGE = 5  # stars whose brightnesses are compared with each other
 _FEW_SHAPES = 5  # stars whose median extent one blend does not move
+_ALONG = 0.5  # least length of the mean axis of stars that are elongated one way
+_CHANCE = 500.0  # stars of axes in all directions exceed a longer mean once in so many cases
 _FAR_DEX = 0.2  # least difference of two stars: half a magnitude, twice their usual scatter
 
 
@@ -199,7 +201,9 @@ def shape_of(solved: Sequence[Solved], bins: int = 1) -> StarShape | None:
     if len(long_px) < _FEW_SHAPES:
         return None
     double = np.exp(2j * along_rad).mean()  # an axis has two directions
-    is_common = abs(double) > 0.5  # of axes in all directions, less in one of 500 cases of 25
+    # Rayleigh's test of directions that are uniform.
+    least = max(_ALONG, math.sqrt(math.log(_CHANCE) / len(along_rad)))
+    is_common = abs(double) > least
     along_deg = math.degrees(0.5 * float(np.angle(double))) if is_common else math.nan
     middle_px = bins * np.median([long_px, wide_px], axis=1)
     return StarShape(len(long_px), float(middle_px[0]), float(middle_px[1]), along_deg)
