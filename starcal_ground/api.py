@@ -314,9 +314,8 @@ def calibrate_images(
 
 def _calibrated(given: Given) -> Calibration:
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
-        first = source_of(given, Path(name), Path(name))
-        observed = campaign.observe(campaign.chosen(first.source))
-        return campaign.calibrate(observed, inputs_of(first.files)).calibration
+        source = campaign.chosen(source_of(given, Path(name), Path(name)))
+        return campaign.calibrate(campaign.observe(source), inputs_of(source.files)).calibration
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:

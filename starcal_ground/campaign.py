@@ -15,16 +15,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.topics import OnImage, Topics, Wanted
 from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.assessment.predictions import Residuals
+from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import check_site, Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 from starcal_ros.text import counted
+
+if TYPE_CHECKING:
+    from starcal_ground.diagnosis.diagnose import Diagnosis
 
 _FOR_WANT_OF_STARS = {REQUIREMENTS, 'min_coverage'}  # checks that fail, of a sound calibration
 
@@ -40,7 +45,7 @@ class Source:
     Bags, topics and setup; once `chosen`, the topics that are read and an alignment.
 
     ``through_air`` is given where the air, if any, is to be found by the stars, in all images
-    together; ``notes`` are sentences for the user.
+    together; ``notes`` are sentences for the user; ``files`` are those that the user gave.
     """
 
     bags: tuple[Path, ...]
@@ -48,6 +53,7 @@ class Source:
     setup: Setup
     through_air: ThroughAir | None = None
     notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
 
     @property
     def image_count(self) -> int:
@@ -88,25 +94,37 @@ class Campaign:
     notes: tuple[str, ...]
 
 
-def chosen(source: Source) -> Source:
+def looked_up(source: Source) -> tuple[Source, Diagnosis | None]:
     """
-    A source with the topics to calibrate from, and a setup with an alignment.
+    A source with the topics to calibrate from, and an alignment if the images show it.
 
-    The alignment is found from the images where the setup has none; recorded observations need
-    none, since their stars are identified.  Raises BagError when a bag cannot be read, a topic is
-    missing or several have its type.  Raises OptionError when no alignment is found, or for a
-    camera on the ground of which neither the site is stated nor the air to be found.
+    The diagnosis of the images is given where the setup has no alignment; recorded observations
+    need none, since their stars are identified.  Raises BagError when a bag cannot be read, a
+    topic is missing or several have its type.  Raises OptionError for a camera on the ground of
+    which neither the site is stated nor the air to be found.
     """
-    bags, requested, setup, notes = source.bags, source.topics, source.setup, source.notes
     if source.through_air is None:
-        check_site(setup.site)
-    topics = bag_topics.choose_topics(bags, requested, setup)
-    if not (setup.is_aligned or topics.observations):
-        from starcal_ground.diagnosis.bags import aligned_by_bags  # seldom needed, slow
+        check_site(source.setup.site)
+    topics = bag_topics.choose_topics(source.bags, source.topics, source.setup)
+    if source.setup.is_aligned or topics.observations:
+        return replace(source, topics=topics), None
+    from starcal_ground.diagnosis.bags import aligned_by_stars  # seldom needed, slow
 
-        setup, sentence = aligned_by_bags(bags, requested, setup)
-        notes = (*notes, sentence)
-    return replace(source, topics=topics, setup=setup, notes=notes)
+    setup, diagnosis = aligned_by_stars(source.bags, topics, source.setup)
+    return replace(source, topics=topics, setup=setup), diagnosis
+
+
+def chosen(source: Source) -> Source:
+    """`looked_up`, with a note on an alignment that is found; raises OptionError if it is not."""
+    found, diagnosis = looked_up(source)
+    if diagnosis is None:
+        return found
+    from starcal_ground.diagnosis.diagnose import found_alignment
+
+    _, sentence = found_alignment(diagnosis)
+    if not found.setup.is_aligned:
+        raise OptionError(f'prior_alignment: not given, and not found: {sentence}')
+    return replace(found, notes=(*found.notes, sentence))
 
 
 def observe(

@@ -11,26 +11,21 @@ from itertools import islice
 import math
 from pathlib import Path
 
-import numpy as np
-
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.contents import topic_contents, TopicContent
-from starcal_ground.campaign import calibrate, Observed, observed_of, Progress, Source
+from starcal_ground.campaign import calibrate, looked_up, Observed, observed_of, Progress, Source
 from starcal_ground.diagnosis.bags import (
     diagnose_bags,
-    of_bags,
     of_most,
     of_refusals,
     placed,
     refusals,
     Refused,
-    refused_all_the_same,
 )
-from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
+from starcal_ground.diagnosis.diagnose import Diagnosis
 from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError, OptionError, StarcalError, TooFewObservations
-from starcal_ros.pipeline.setup import aligned, check_site
 from starcal_ros.records import StarObservations
 from starcal_ros.sky.attitude import AttitudeOptions
 
@@ -115,24 +110,18 @@ def without_setup(
 
 def _measured(source: Source, progress: Progress) -> Examined:
     """`examine`, with its errors raised."""
-    bags, setup, unaligned, wrong = source.bags, source.setup, None, None
-    if source.through_air is None:
-        check_site(setup.site)
-    topics = bag_topics.choose_topics(bags, source.topics, setup)
-    if not (setup.is_aligned or topics.observations):
-        unaligned = diagnose_bags(bags, topics, setup)
-        alignment, _ = found_alignment(unaligned)
-        if alignment is None:
-            return Examined(_contents(bags, topics, (), 0), unaligned)
-        setup = aligned(setup, np.array(alignment))
-    source = replace(source, topics=topics, setup=setup)
+    wrong = None
+    source, unaligned = looked_up(source)
+    bags, topics, setup = source.bags, source.topics, source.setup
+    if unaligned and not setup.is_aligned:
+        return Examined(_contents(bags, topics, (), 0), unaligned)
     count = source.image_count
     with progress(count) as advance:
         records = _counted(bag_topics.read(bags, topics, setup), advance)
         seen = list(islice(records, _MEASURED))
         none_matches = {one.refusal for one in seen} == {'no_match'}
         if none_matches and topics.image and not unaligned and count > len(seen):
-            wrong = of_bags(bags, topics, setup, refusals(seen))
+            wrong = diagnose_bags(bags, topics, setup, refusals(seen))
         if wrong is None or wrong.cause == 'none':
             wrong = None
             seen += records
@@ -181,14 +170,14 @@ def _why_refused(observed: Observed, refused: Sequence[Refused], progress: Progr
     fits = Diagnosis('none', None, 'There is nothing to diagnose in recorded observations.')
     if source.topics.image:
         most = of_most(refused, count)
-        fits = of_bags(source.bags, source.topics, source.setup, most)
+        fits = diagnose_bags(source.bags, source.topics, source.setup, most)
     if fits.cause != 'none':
         return fits
     try:
         calibration = calibrate(observed, progress=progress).calibration
     except TooFewObservations as error:
         if of_most(refused, count):
-            return refused_all_the_same(refused, fits, count)
+            return _all_the_same(refused, fits, count)
         reasons: Sequence[str] = (str(error),)
     else:
         reasons = calibration.reasons
@@ -200,6 +189,14 @@ def _why_refused(observed: Observed, refused: Sequence[Refused], progress: Progr
     return Diagnosis('refused', len(reasons), sentence, (*fits.evidence, *more))
 
 
+def _all_the_same(refused: Sequence[Refused], fits: Diagnosis, images: int) -> Diagnosis:
+    """The refusals of so many images whose set-up fits, as their cause."""
+    by_images = of_refusals(refused, images) or fits
+    # The remedy of the others is to ask for this diagnosis.
+    mend = () if by_images.cause == 'no_match' else by_images.mend
+    return replace(by_images, evidence=(*fits.evidence, *by_images.evidence), mend=mend)
+
+
 def cause_of_refusals(observed: Observed) -> Diagnosis | None:
     """The cause for which most are refused, by a diagnosis where all are; None if none shows."""
     source, count = observed.source, len(observed.observations)
@@ -207,7 +204,7 @@ def cause_of_refusals(observed: Observed) -> Diagnosis | None:
     if not (source.topics.image and 0 < sum(group.count for group in refused) == count):
         return of_refusals(refused, count)
     try:
-        diagnosis = diagnose_bags(source.bags, source.topics, source.setup, refused)
+        fits = diagnose_bags(source.bags, source.topics, source.setup, refused)
     except BagError:
         return None
-    return None if diagnosis.cause == 'none' else diagnosis
+    return fits if fits.cause != 'none' else _all_the_same(refused, fits, count)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 import functools
 from pathlib import Path
@@ -19,6 +19,7 @@ import yaml
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
+from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import (
@@ -33,7 +34,7 @@ FRAME_ID, CLOCK_ID = -999100, -999
 
 @functools.cache
 def images() -> tuple[Image, ...]:
-    found = reader.read_images([TINY], '/opnav/image_raw')
+    found = reader.read_images([TINY], IMAGE_TOPIC)
     return tuple(image for image in found if isinstance(image, Image))
 
 
@@ -45,8 +46,20 @@ def frames_of(count: int) -> list[np.ndarray]:
 @functools.cache
 def attitudes() -> tuple[tuple[int, np.ndarray], ...]:
     """Stamps and quaternions, icrf_from_star_tracker."""
-    raw = reader.read_raw([TINY], ['/star_tracker/attitude'])
+    raw = reader.read_raw([TINY], [ATTITUDE_TOPIC])
     return tuple(attitude_from_message(reader.decode(message)) for message in raw)
+
+
+def write_tiny(
+    path: Path, frames: Iterable[Image], samples: Iterable[tuple[int, np.ndarray]] | None = None
+) -> Path:
+    """A bag of images and of attitudes, those of the small bag by default, on its topics."""
+    with BagWriter(path) as writer:
+        for time_ns, xyzw in attitudes() if samples is None else samples:
+            writer.write_attitude(ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
+        for image in frames:
+            writer.write_image(IMAGE_TOPIC, image, 'camera')
+    return path
 
 
 def params_with(folder: Path, **changes: Any) -> Path:

@@ -149,15 +149,19 @@ Guesses = Callable[[int], Sequence[Rotation]]
 
 
 def identify_images(
-    images: Iterable[Image], camera: CameraModel, catalog: StarCatalog, guesses: Guesses
+    images: Iterable[Image],
+    camera: CameraModel,
+    catalog: StarCatalog,
+    guesses: Guesses,
+    search_s: float = _SEARCH_S,
 ) -> Identified:
     """
     The first images that can be identified, in the order of their stamps.
 
-    ``guesses`` are tried before the sky is searched.  The search ends after 10 s of processor time
-    of this thread.
+    ``guesses`` are tried before the sky is searched.  The search ends after ``search_s`` of
+    processor time of this thread.
     """
-    finder = ImageSearch(camera, catalog, time.thread_time() + _SEARCH_S)
+    finder = ImageSearch(camera, catalog, time.thread_time() + search_s)
     looked_at: list[BrightSources] = []
     other_sizes: list[tuple[int, int]] = []
     solved: list[Solved] = []

@@ -197,20 +197,14 @@ def check_file(output: Path, inputs: Sequence[Path]) -> None:
     check_outputs([output], [*inputs, *beside])
 
 
-@dataclasses.dataclass(frozen=True)
-class Time:
-    """Value of a time option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
-
-    seconds: float
-    since_first_image: bool
-
-
-def parse_time(text: str) -> Time:
+def parse_time(text: str) -> Callable[[int], int]:
     """
     A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
 
-    Raises argparse.ArgumentTypeError for another text.
+    Returns a function that gives it, ns since 1970, from the stamp of the first image.  Raises
+    argparse.ArgumentTypeError for another text.
     """
+    is_relative = text.strip().startswith('+')
     try:
         seconds = float(text)
     except ValueError:
@@ -221,11 +215,11 @@ def parse_time(text: str) -> Time:
                 f'{text!r} is not a time: give 2026-05-15T07:20:00, seconds since 1970, or'
                 ' +seconds after the first image'
             ) from error
-        with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
-        return Time(with_zone.timestamp(), False)
+        seconds = (read if read.tzinfo else read.replace(tzinfo=timezone.utc)).timestamp()
     if not math.isfinite(seconds):
         raise argparse.ArgumentTypeError(f'{text!r} is not a finite number of seconds')
-    return Time(seconds, text.strip().startswith('+'))
+    after_ns = round(seconds * NANOSECONDS_PER_SECOND)
+    return lambda first_ns: after_ns + is_relative * first_ns
 
 
 @dataclasses.dataclass
@@ -233,11 +227,11 @@ class Selection:
     """
     Selection of the images between two times, both included, queried in the order of the bag.
 
-    None: from the first image, to the last one.
+    The times are those of `parse_time`; None: from the first image, to the last one.
     """
 
-    start: Time | None
-    end: Time | None
+    start: Callable[[int], int] | None
+    end: Callable[[int], int] | None
     _first_ns: int | None = None
     _last_ns: int = 0
 
@@ -246,8 +240,8 @@ class Selection:
         if self._first_ns is None:
             self._first_ns = time_ns
         self._last_ns = max(self._last_ns, time_ns)
-        is_before = self.start is not None and time_ns < self._ns(self.start)
-        return not (is_before or (self.end is not None and time_ns > self._ns(self.end)))
+        is_before = self.start is not None and time_ns < self.start(self._first_ns)
+        return not (is_before or (self.end is not None and time_ns > self.end(self._first_ns)))
 
     def without_images(self) -> str:
         """Error message for a selection without images."""
@@ -258,7 +252,3 @@ class Selection:
             f'--from, --to: no image is between these times: the images span {first} to {last},'
             f' +0 to +{(self._last_ns - self._first_ns) / NANOSECONDS_PER_SECOND:g} s'
         )
-
-    def _ns(self, time: Time) -> int:
-        origin_ns = (self._first_ns or 0) if time.since_first_image else 0
-        return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)

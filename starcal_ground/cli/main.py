@@ -54,8 +54,6 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with status 2."""
-        if "invalid choice: 'inspect'" in message:  # a command of development versions
-            message = 'inspect: no such command: starcal diagnose lists the contents of a bag'
         unknown = re.search(r'unrecognized arguments: --([^ =]+)', message)
         name = unknown[1].replace('-', '_') if unknown else ''
         if self.has_set and name in _options():

@@ -30,8 +30,14 @@ _TIGHTEST = 4  # gate checks shown of a calibration that passed
 
 @dataclass(frozen=True)
 class Received:
-    """Newest messages of each topic; None or empty before the first."""
+    """
+    Newest messages of each topic; None or empty before the first.
 
+    ``health`` has level and message of each node by its full name without the first slash;
+    ``namespace`` is that of the topics, without it too.
+    """
+
+    namespace: str = ''
     images: int = 0
     refused: Mapping[str, int] = field(default_factory=dict)
     last: StarObservations | None = None
@@ -75,10 +81,21 @@ def view(received: Received) -> Group:
     )
 
 
+def _nothing_of(received: Received, node: str, words: str) -> Line:
+    """Words on a node without messages, or the remedy if it runs in other namespaces only."""
+    places = (name.rpartition('/') for name in received.health)
+    namespaces = sorted(namespace for namespace, _, name in places if name == node)
+    if not namespaces or received.namespace in namespaces:
+        return Line(words, 'dim')
+    return Line(
+        f'nothing of {node} in /{received.namespace}: try --remap __ns:=/{namespaces[0]}', 'yellow'
+    )
+
+
 def _images(received: Received) -> Text:
     last = received.last
     if last is None:
-        return Line('no image since the start of this view', 'dim')
+        return _nothing_of(received, 'star_observer', 'no image since the start of this view')
     refused = sum(received.refused.values())
     lines = [
         Line(f'{received.images} since the start of this view, {received.images - refused} used')
@@ -96,7 +113,7 @@ def _images(received: Received) -> Text:
 def _ensemble(received: Received) -> Group | Text:
     status = received.status
     if status is None:
-        return Line('no status received from a calibrator', 'dim')
+        return _nothing_of(received, 'calibrator', 'no status received from a calibrator')
     head = Line()
     for there, needed, what in (
         (status.images, status.min_images, 'images'),

@@ -22,10 +22,10 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Integers, Mask
+from starcal_ros.arrays import Floats, Indices, Integers, Mask
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.sky.attitude import AttitudeHistory, with_direction
+from starcal_ros.sky.attitude import AttitudeHistory, IDENTITY_XYZW, with_direction
 
 CLOCK_SEARCH_S = 71.0  # Terrestrial Time is 69.2 s ahead of UTC, the atomic time 37 s
 IMAGES_OF_A_READING = 3  # fewest to search a shift or axes: two fit about any of them
@@ -46,7 +46,6 @@ _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 XYZW = 'x, y, z, w'
 W_FIRST = 'w, x, y, z'
 _ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in range(4)]
-_CONJUGATE = np.diag([-1.0, -1.0, -1.0, 1.0])
 
 
 def _galactic(*_: float) -> Floats:
@@ -85,7 +84,7 @@ class Meaning:
     """
     Meaning of received numbers: their order and signs, the direction, and the inertial axes.
 
-    ``numbers`` is what the fields x, y, z, w hold.  ``axes`` is one of `_OTHER_AXES`, empty for
+    ``numbers`` are those in the fields x, y, z, w.  ``axes`` is one of `_OTHER_AXES`, empty for
     the ICRF, or a name of the axes whose rotation from the ICRF is ``axes_from_icrf``.
     """
 
@@ -105,40 +104,21 @@ class Meaning:
         moved = sum(name[-1] != right for name, right in zip(fields, 'xyzw', strict=True))
         return moved + self.numbers.count('-') + 3 * bool(self.axes)
 
-    def at(self, time_ns: Integers) -> Floats:
-        """Matrices (1 or m, 4, 4) from received numbers to ``icrf_from_star_tracker``."""
-        matrix = _matrix_of(self.numbers)
-        matrix = matrix if self.direction == 'st_to_inertial' else _CONJUGATE @ matrix
-        if self.axes in _OTHER_AXES:
-            days = time_ns / (86400 * NANOSECONDS_PER_SECOND)
-            from_icrf = [_OTHER_AXES[self.axes](_UNIX_EPOCH_JD, float(day)) for day in days]
-            return _times(Rotation.from_matrix(np.array(from_icrf)).inv().as_quat()) @ matrix
+    def at(self, time_ns: Integers, sent: Floats) -> Rotation:
+        """Rotations ``icrf_from_star_tracker`` (m,) of received numbers (m, 4) at stamps (m,)."""
+        xyzw = np.empty_like(sent)
+        for field, name in enumerate(self.numbers.split(', ')):
+            xyzw[:, 'xyzw'.index(name[-1])] = -sent[:, field] if name[0] == '-' else sent[:, field]
+        read = Rotation.from_quat(xyzw)
+        if self.direction == 'inertial_to_st':
+            read = read.inv()
         if self.axes_from_icrf is not None:
-            return np.asarray(_times(self.axes_from_icrf.inv().as_quat()) @ matrix)[None]
-        return matrix[None]
-
-
-@functools.cache
-def _matrix_of(numbers: str) -> Floats:
-    """Matrix (4, 4) from received fields to x, y, z, w."""
-    matrix = np.zeros((4, 4))
-    for field, name in enumerate(numbers.split(', ')):
-        matrix['xyzw'.index(name[-1]), field] = -1.0 if name[0] == '-' else 1.0
-    return matrix
-
-
-def _times(quaternion: Floats) -> Floats:
-    """Matrices (..., 4, 4) of the multiplication by quaternions (..., 4) from the left."""
-    x, y, z, w = np.moveaxis(quaternion, -1, 0)
-    rows = [[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-
-
-def _times_from_right(quaternion: Floats) -> Floats:
-    """Matrices (..., 4, 4) of the multiplication by quaternions (..., 4) from the right."""
-    x, y, z, w = np.moveaxis(quaternion, -1, 0)
-    rows = [[w, z, -y, x], [-z, w, x, y], [y, -x, w, z], [-x, -y, -z, w]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+            return self.axes_from_icrf.inv() * read
+        if not self.axes:
+            return read
+        days = time_ns / (86400 * NANOSECONDS_PER_SECOND)
+        from_icrf = [_OTHER_AXES[self.axes](_UNIX_EPOCH_JD, float(day)) for day in days]
+        return Rotation.from_matrix(np.array(from_icrf)).inv() * read
 
 
 @functools.cache
@@ -271,11 +251,11 @@ class Case:
 
     def turned_by_frozen_attitudes(self) -> float | None:
         """Angle that the camera turns by while the attitudes stay the same; None: they turn."""
-        sent, usable = self._sent(np.zeros(1))
-        if np.count_nonzero(usable) < 2:
+        rows, sent = self._unshifted
+        if len(rows) < 2:
             return None
-        turned = _largest_turn(Rotation.from_quat(sent[usable]))
-        camera_rad = _largest_turn(self.icrf_from_camera[np.flatnonzero(usable[0])])
+        turned = _largest_turn(Rotation.from_quat(sent))
+        camera_rad = _largest_turn(self.icrf_from_camera[rows])
         # The noise of a star tracker is arcseconds, and an image's rotation is known to less.
         return camera_rad if turned < _LEAST_RAD and camera_rad > 2.0 * _AGREE_RAD else None
 
@@ -285,14 +265,13 @@ class Case:
 
         No order, sign, direction, alignment or inertial axes change them.
         """
-        sent, usable = self._sent(np.zeros(1))
-        rows = np.flatnonzero(usable[0])
+        rows, sent = self._unshifted
         if len(rows) < 2:
             return None
         i, j = np.triu_indices(len(rows), 1)
         camera = self.icrf_from_camera[rows]
         by_stars = (camera[i].inv() * camera[j]).magnitude()
-        received = Rotation.from_quat(sent[0, rows])
+        received = Rotation.from_quat(sent)
         by_attitudes = (received[i].inv() * received[j]).magnitude()
         k = int(np.abs(by_stars - by_attitudes).argmax())
         return float(by_stars[k]), float(by_attitudes[k])
@@ -349,17 +328,24 @@ class Case:
         at_ns = self.time_ns + np.rint(shift_s[:, None] * NANOSECONDS_PER_SECOND).astype(np.int64)
         return _sent_at(self.attitudes, at_ns, self.setup.attitude.max_attitude_gap_s)
 
+    @functools.cached_property
+    def _unshifted(self) -> tuple[Indices, Floats]:
+        """Rows (n,) of the images with usable attitudes, and the numbers (n, 4) at them."""
+        sent, usable = self._sent(np.zeros(1))
+        return np.flatnonzero(usable[0]), sent[0, usable[0]]
+
     def _read(self, meanings: Sequence[Meaning], shift_s: Floats | None = None) -> list[Reading]:
         """The reading of each meaning at each shift (s,) of the stamps, with its alignment."""
         shift_s = np.zeros(1) if shift_s is None else shift_s
         sent, usable = self._sent(shift_s)
-        # Where one is not usable it is of no rotation, and agrees with none.
-        sent = np.where(usable[..., None], sent, 0.0)
-        from_right = _times_from_right(self.icrf_from_camera.as_quat()) @ _CONJUGATE
+        camera = self.icrf_from_camera[np.tile(np.arange(len(self.time_ns)), len(shift_s))]
+        stamps = np.tile(self.time_ns, len(shift_s))
         readings = []
         for meaning in meanings:
-            alignments = np.einsum('mij,smj->smi', from_right @ meaning.at(self.time_ns), sent)
-            agreeing, scatter_rad, mean = _agreed(alignments)
+            read = meaning.at(stamps, sent.reshape(-1, 4))
+            alignments = (read.inv() * camera).as_quat().reshape(sent.shape)
+            # One that is not usable is of no rotation, and agrees with none.
+            agreeing, scatter_rad, mean = _agreed(np.where(usable[..., None], alignments, 0.0))
             readings += [
                 Reading(meaning, int(agreeing[k]), float(scatter_rad[k]), mean[k], float(shift))
                 for k, shift in enumerate(shift_s)
@@ -400,11 +386,10 @@ class Case:
 
         The turns by the attitudes are those of the camera in other axes.
         """
-        sent, usable = self._sent(np.zeros(1))
-        rows = np.flatnonzero(usable[0])
+        rows, sent = self._unshifted
         if len(rows) < IMAGES_OF_A_READING:
             return
-        read = Rotation.from_quat((usual.at(self.time_ns[rows]) @ sent[0, rows, :, None])[..., 0])
+        read = usual.at(self.time_ns[rows], sent)
         camera = self.icrf_from_camera[rows]
         for three in itertools.combinations(range(len(rows)), 3):
             by_attitudes, by_stars = (_turns_between(r[list(three)]) for r in (read, camera))
@@ -457,30 +442,34 @@ def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> 
     sent, usable = _sent_at(attitudes, at_ns, setup.attitude.max_attitude_gap_s)
     if prior is None or not usable.any():
         return []
-    read = [Rotation.from_quat(meaning.at(at_ns[0])[0] @ sent[0, 0]) for meaning in _usual(setup)]
+    read = (meaning.at(at_ns[0], sent[0])[0] for meaning in _usual(setup))
     predicted = [(rotation * prior).inv() for rotation in read]
     return [_ROLLS[turns] * rotation for turns in (0, 2, 1, 3) for rotation in predicted]
 
 
 def _sent_at(attitudes: WireAttitudes, at_ns: Integers, max_gap_s: float) -> tuple[Floats, Mask]:
-    """Received numbers (..., 4) at stamps (...), interpolated, and which of them are usable."""
+    """
+    Received numbers (..., 4) at stamps (...), interpolated, and which of them are usable.
+
+    Those that are not are of the identity.
+    """
     times = attitudes.time_ns
+    sent = np.broadcast_to(IDENTITY_XYZW, (*at_ns.shape, 4)).copy()
+    usable = np.zeros(at_ns.shape, bool)
     if len(times) < 2:
-        return np.zeros((*at_ns.shape, 4)), np.zeros(at_ns.shape, bool)
+        return sent, usable
     after = np.clip(np.searchsorted(times, at_ns, side='left'), 1, len(times) - 1)
     gap_ns = times[after] - times[after - 1]
     usable = (at_ns >= times[after - 1]) & (at_ns <= times[after])
     usable &= gap_ns <= max_gap_s * NANOSECONDS_PER_SECOND
-    before, behind = attitudes.quaternion[after - 1], attitudes.quaternion[after]
-    cosine = (before * behind).sum(axis=-1, keepdims=True)
-    behind = np.where(cosine < 0, -behind, behind)
-    angle = np.arccos(np.minimum(np.abs(cosine), 1.0))
-    part = np.asarray((at_ns - times[after - 1]) / np.maximum(gap_ns, 1))[..., None]
-    # Equal attitudes have an angle of zero, and any mean of them is right.
-    sine = np.where(angle > 1e-9, np.sin(angle), 1.0)
-    one = np.where(angle > 1e-9, np.sin((1.0 - part) * angle) / sine, 1.0 - part)
-    other = np.where(angle > 1e-9, np.sin(part * angle) / sine, part)
-    return one * before + other * behind, usable
+    if not usable.any():
+        return sent, usable
+    row = after[usable]
+    part = (at_ns[usable] - times[row - 1]) / np.maximum(gap_ns[usable], 1)
+    before, behind = (Rotation.from_quat(attitudes.quaternion[k]) for k in (row - 1, row))
+    turned = Rotation.from_rotvec(part[:, None] * (before.inv() * behind).as_rotvec())
+    sent[usable] = (before * turned).as_quat()
+    return sent, usable
 
 
 def _agreed(quaternion: Floats) -> tuple[Integers, Floats, Rotation]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttit
 from starcal_ground.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
 from starcal_ros.assessment.gate import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import BagError, ImageRefused, OptionError
+from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations, StarRefusal
@@ -38,7 +38,6 @@ _STAR_REMEDIES = {
     StarRefusal.FAINT.label: 'expose for longer',
     StarRefusal.SATURATED.label: 'expose for a shorter time',
     StarRefusal.HOT_PIXEL.label: 'check bad_pixel_map and dark_frame',
-    StarRefusal.ELONGATED.label: 'mend coma, focus or tracking: so many are no cosmic rays',
     StarRefusal.NOT_DETECTED.label: 'check for clouds and dew, or lower magnitude_limit',
 }
 UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
@@ -67,32 +66,9 @@ def diagnose_bags(
     """
     Why the images of bags cannot be used: by their refusals, by their stamps, by their stars.
 
-    ``refused`` are all images, if a measurement with the setup has refused them.  Raises BagError
-    when a bag cannot be read, or holds no images with attitudes.
-    """
-    diagnosis = of_bags(paths, requested, setup, refused)
-    return refused_all_the_same(refused, diagnosis) if diagnosis.cause == 'none' else diagnosis
-
-
-def refused_all_the_same(
-    refused: Sequence[Refused], fits: Diagnosis, images: int = 0
-) -> Diagnosis:
-    """The refusals of images whose set-up fits as their cause; ``images``: of so many."""
-    by_images = of_refusals(refused, images or sum(group.count for group in refused))
-    if by_images is None:
-        return fits
-    # The remedy of the others is to ask for this diagnosis.
-    mend = () if by_images.cause == 'no_match' else by_images.mend
-    return replace(by_images, evidence=(*fits.evidence, *by_images.evidence), mend=mend)
-
-
-def of_bags(
-    paths: Sequence[Path], requested: Topics, setup: Setup, refused: Sequence[Refused]
-) -> Diagnosis:
-    """
-    `diagnose_bags`, with ``none`` where attitudes, alignment and camera fit.
-
-    ``refused`` are the images that a measurement with the setup has refused, if there was one.
+    ``none`` where attitudes, alignment and camera fit.  ``refused`` are the images that a
+    measurement with the setup has refused, if there was one.  Raises BagError when a bag cannot be
+    read, or holds no images with attitudes.
     """
     topics = bag_topics.choose_topics(paths, requested, setup)
     if topics.observations:
@@ -121,16 +97,17 @@ def of_bags(
     return of_refusals(by_itself, count) or diagnosis
 
 
-def aligned_by_bags(paths: Sequence[Path], requested: Topics, setup: Setup) -> tuple[Setup, str]:
+def aligned_by_stars(
+    paths: Sequence[Path], requested: Topics, setup: Setup
+) -> tuple[Setup, Diagnosis]:
     """
-    A setup with the alignment that the images show, since none is given, and a sentence on it.
+    A setup with the alignment that at least three images show, or as it is, and their diagnosis.
 
-    Raises BagError when a bag cannot be read, OptionError when fewer than three images agree.
+    Raises BagError when a bag cannot be read.
     """
-    values, sentence = found_alignment(diagnose_bags(paths, requested, setup))
-    if values is None:
-        raise OptionError(f'prior_alignment: not given, and not found: {sentence}')
-    return aligned(setup, np.array(values)), sentence
+    diagnosis = diagnose_bags(paths, requested, setup)
+    values, _ = found_alignment(diagnosis)
+    return (setup if values is None else aligned(setup, np.array(values))), diagnosis
 
 
 def _without_common_time(

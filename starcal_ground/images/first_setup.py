@@ -36,14 +36,7 @@ from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline.setup import (
-    aligned,
-    files_of,
-    load_setup,
-    option_groups,
-    paths_from,
-    Setup,
-)
+from starcal_ros.pipeline.setup import files_of, load_setup, option_groups, paths_from, Setup
 from starcal_ros.records import Ensemble, OF_THE_STARS
 from starcal_ros.text import printable
 
@@ -140,61 +133,52 @@ class Given:
             raise OptionError(f'{self.params}: {error}' if self.params else str(error)) from error
 
 
-@dataclass(frozen=True)
-class FirstSetup:
+def write_setup(source: Source, stated: Mapping[str, object], folder: Path) -> None:
     """
-    The source to calibrate from, before `campaign.chosen`, and the files that are read.
+    Write ``params.yaml`` and ``camera.yaml``, which repeat the calibration of a source.
 
-    Its notes are sentences on what the stars show.
+    ``stated`` are the options of its inputs; its topics are those that are read.
     """
+    setup = source.setup
+    values: dict[str, object] = {'lens_model': setup.frames.lens_model}
+    if setup.has_tracker:
+        values['attitude_direction'] = setup.attitude.attitude_direction
+        values['prior_alignment'] = setup.prior.star_tracker_from_camera_xyzw.tolist()
+    elif setup.site.observer == 'ground':  # stated by the images
+        values |= dataclasses.asdict(setup.site)
+    values |= paths_from(stated, Path.cwd())
+    values['camera_info_url'] = CAMERA_FILE
+    text = ''.join(f'{name}: {_in_a_line(value)}\n' for name, value in values.items())
+    to_state = ''.join(f'# {name}: {what}\n' for name, what in assumed(source, stated))
+    found = ''.join(f'# {printable(line)}\n' for line in source.notes)
+    content = f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
+    make_folder(folder)
+    write_camera_info(setup.prior.camera, folder / CAMERA_FILE, pixels_of=setup.pixels_of)
+    write_atomically(folder / PARAMETER_FILE, content)
 
-    given: Given
-    source: Source
-    files: tuple[Path, ...]
 
-    def write(self, folder: Path, topics: Topics) -> None:
-        """Write ``params.yaml`` and ``camera.yaml``, which repeat the calibration."""
-        make_folder(folder)
-        setup = self.source.setup
-        path = folder / CAMERA_FILE
-        write_camera_info(setup.prior.camera, path, pixels_of=setup.pixels_of)
-        write_atomically(folder / PARAMETER_FILE, self._parameter_file(topics))
+def assumed(
+    source: Source, stated: Mapping[str, object], ensemble: Ensemble | None = None
+) -> list[tuple[str, str]]:
+    """
+    Options that nobody has stated, each with what is assumed.
 
-    def _parameter_file(self, topics: Topics) -> str:
-        setup = self.source.setup
-        values: dict[str, object] = {'lens_model': setup.frames.lens_model}
-        if setup.has_tracker:
-            values['attitude_direction'] = setup.attitude.attitude_direction
-            values['prior_alignment'] = setup.prior.star_tracker_from_camera_xyzw.tolist()
-        elif setup.site.observer == 'ground':  # stated by the images
-            values |= dataclasses.asdict(setup.site)
-        values |= paths_from(self.given.options, Path.cwd())
-        values['camera_info_url'] = CAMERA_FILE
-        text = ''.join(f'{name}: {_in_a_line(value)}\n' for name, value in values.items())
-        found = ''.join(f'# {printable(line)}\n' for line in self.source.notes)
-        to_state = ''.join(f'# {name}: {what}\n' for name, what in self.assumed(topics))
-        return f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
-
-    def assumed(self, topics: Topics, ensemble: Ensemble | None = None) -> list[tuple[str, str]]:
-        """
-        Options that nobody has stated, each with what is assumed; ``topics`` are those read.
-
-        ``ensemble``: the images, where they are at hand.
-        """
-        setup, stated = self.source.setup, self.given.options
-        has_tracker = setup.has_tracker
-        has_velocity = bool(topics.velocity or topics.observations)
-        rows = [
-            ('star_tracker_sigma_arcsec', 'from the scatter of the images',
-             has_tracker and not tracker_sigma_is_given(setup.calibration)),
-            ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
-            ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
-            ('shutter', _assumed_shutter(ensemble), has_tracker),
-            ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
-             not (has_velocity or setup.site.observer == 'ground'
-                  or 'observer_velocity_m_s' in stated)),
-        ]  # fmt: skip
-        return [(name, text) for name, text, matters in rows if matters and name not in stated]
+    The topics of the source are those read; ``ensemble``: the images, where they are at hand.
+    """
+    setup, topics = source.setup, source.topics
+    has_tracker = setup.has_tracker
+    has_velocity = bool(topics.velocity or topics.observations)
+    rows = [
+        ('star_tracker_sigma_arcsec', 'from the scatter of the images',
+         has_tracker and not tracker_sigma_is_given(setup.calibration)),
+        ('star_tracker_slow_arcsec', 'as large as its noise', has_tracker),
+        ('stamp_offset_s', '0, stamps of the middle of the exposure', has_tracker),
+        ('shutter', _assumed_shutter(ensemble), has_tracker),
+        ('observer', 'space, about the Earth or the Sun' if has_tracker else 'by the stars',
+         not (has_velocity or setup.site.observer == 'ground'
+              or 'observer_velocity_m_s' in stated)),
+    ]  # fmt: skip
+    return [(name, text) for name, text, matters in rows if matters and name not in stated]
 
 
 def _assumed_shutter(ensemble: Ensemble | None) -> str:
@@ -219,12 +203,13 @@ def source_of(
     folder: Path,
     bag_folder: Path,
     on_notes: Callable[[Sequence[str]], None] = lambda notes: None,
-) -> FirstSetup:
+) -> Source:
     """
-    Source and set-up of any inputs: bags with attitudes or without, observations, photographs.
+    Source of any inputs: bags with attitudes or without, observations, photographs.
 
-    A camera that is found is written to a folder, bags of images and of the attitudes of their
-    stars to ``bag_folder``; ``on_notes`` is told of files that are left out, before the search.
+    Its topics are those asked for, and its notes sentences on what the stars show.  A camera that
+    is found is written to a folder, bags of images and of the attitudes of their stars to
+    ``bag_folder``; ``on_notes`` is told of files that are left out, before the search.
 
     Raises NotFromStars when the stars give no camera. Raises BagError when a bag cannot be read,
     or several topics have a type. Raises OptionError for options that do not go together.
@@ -233,18 +218,19 @@ def source_of(
     with given.with_place():
         if not given.is_by_stars:
             setup, found = (setup, ()) if setup else _of_attitudes(given, folder)
-            source = Source(tuple(given.paths), given.topics, setup, air_of(setup), found)
-            return FirstSetup(given, source, (*reader.mcap_files(given.paths), *stated))
+            files = (*reader.mcap_files(given.paths), *stated)
+            return Source(tuple(given.paths), given.topics, setup, air_of(setup), found, files)
         from starcal_ground.images import night_sky  # the search of the sky is slow to load
 
         if not given.photographs:
             of_bags = given.paths, given.topics, given.options, bag_folder, given.lens
             source = night_sky.from_bags(*of_bags)
-            return FirstSetup(given, source, (*reader.mcap_files(given.paths), *stated))
+            return dataclasses.replace(source, files=(*reader.mcap_files(given.paths), *stated))
         photographs, notes = night_sky.photographs_of(given.photographs, *given.lens)
         on_notes(notes)
         source = night_sky.from_photographs(photographs, given.options, bag_folder)
-        return FirstSetup(given, source, (*(one.path for one in photographs), *stated))
+        files = (*(one.path for one in photographs), *stated)
+        return dataclasses.replace(source, files=files)
 
 
 def air_of(setup: Setup) -> ThroughAir | None:
@@ -258,8 +244,7 @@ def air_of(setup: Setup) -> ThroughAir | None:
 
 def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     """Setup of bags with attitudes whose camera is not stated, and sentences on it."""
-    from starcal_ground.diagnosis.bags import diagnose_bags
-    from starcal_ground.diagnosis.diagnose import found_alignment
+    from starcal_ground.diagnosis.bags import aligned_by_stars
     from starcal_ground.images import from_stars, night_sky  # as in `source_of`
 
     if choose_topics(given.paths, given.topics).observations:
@@ -282,11 +267,10 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     for setup in setups:
         if setup.is_aligned:  # stated; a wrong direction is named where no image matches
             return setup, (words,)
-        topics = choose_topics(given.paths, given.topics, setup)
-        diagnosis = diagnose_bags(given.paths, given.topics, setup)
-        alignment, _ = found_alignment(diagnosis)
-        if alignment is not None:
+        found, diagnosis = aligned_by_stars(given.paths, given.topics, setup)
+        if found.is_aligned:
+            topic = choose_topics(given.paths, given.topics, setup).attitude
             read = setup.attitude.attitude_direction
-            line = f'attitudes of {topics.attitude}: {read}, {diagnosis.images} images agree'
-            return aligned(setup, np.array(alignment)), (words, line)
+            line = f'attitudes of {topic}: {read}, {diagnosis.images} images agree'
+            return found, (words, line)
     return setups[0], (words,)  # why none is found is named where it is needed

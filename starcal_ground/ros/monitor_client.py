@@ -37,7 +37,7 @@ class Monitor(Node):
 
     def __init__(self, context: rclpy.Context | None = None) -> None:
         super().__init__('starcal_monitor', context=context)
-        self.received = Received()
+        self.received = Received(namespace=self.get_namespace().strip('/'))
         self._unread = 0
         for kind, topic, qos, callback in (
             (StarObservations, 'observations', 100, self._on_observations),

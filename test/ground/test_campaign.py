@@ -11,7 +11,7 @@ import shutil
 from typing import Any
 
 import cv2
-from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
+from mission_files import images, TINY, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
@@ -172,12 +172,7 @@ def test_images_without_a_match_are_measured_with_the_calibration() -> None:
 
 def test_of_two_images_of_one_stamp_each_is_measured_again_for_itself(tmp_path: Path) -> None:
     """Neither matched at first; now the first one does, and the other is out of order."""
-    bag = tmp_path / 'bag.mcap'
-    with BagWriter(bag) as writer:
-        for time_ns, quaternion in attitudes():
-            writer.write_attitude('/star_tracker/attitude', time_ns, quaternion, 'icrf')
-        for image in (*images()[:3], *images()[2:]):
-            writer.write_image('/camera/image_raw', image, 'camera')
+    bag = write_tiny(tmp_path / 'bag.mcap', (*images()[:3], *images()[2:]))
     setup = read_setup(TINY / 'params.yaml')
     source = campaign.chosen(campaign.Source((bag,), Topics(), setup))
     before = list(campaign.observe(source).measured)

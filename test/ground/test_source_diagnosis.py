@@ -10,13 +10,13 @@ import math
 from pathlib import Path
 
 import cv2
-from mission_files import images as tiny_images  # type: ignore[import-not-found]
-from mission_files import params_with, TINY
+from mission_files import attitudes, params_with, TINY, write_tiny  # type: ignore[import-not-found]
+from mission_files import images as tiny_images
 import numpy as np
 import pytest
 
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.bags import reader, topics
+from starcal_ground.bags import topics
 from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import Source
 from starcal_ground.cli import main
@@ -27,7 +27,6 @@ from starcal_ground.source_diagnosis import Contents, examine, without_setup
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.records import Image, refused_image
 
@@ -72,16 +71,13 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
     dark; image 5 is cut; the samples about image 7 are no rotations; after image 9 the attitudes
     end, and one more image comes.
     """
-    samples = [
-        attitude_from_message(reader.decode(raw)) for raw in reader.read_raw([TINY], [ATTITUDE])
-    ]
     stamps = [image.time_ns for image in images]
 
     def near(k: int, time_ns: int) -> bool:
         return abs(time_ns - stamps[k]) < 10**9
 
     with BagWriter(path) as writer:
-        for time_ns, xyzw in samples:
+        for time_ns, xyzw in attitudes():
             if near(0, time_ns) or (near(1, time_ns) and time_ns > stamps[1]):
                 continue
             broken = near(7, time_ns)
@@ -131,10 +127,8 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
-    path = tmp_path / 'images.mcap'
-    with BagWriter(path) as writer:
-        writer.write_image(IMAGE, tiny_images()[0], 'camera')
-        writer.write_attitude(ATTITUDE, 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    alone = [(0, np.array([0.0, 0.0, 0.0, 1.0]))]
+    path = write_tiny(tmp_path / 'images.mcap', tiny_images()[:1], alone)
     assert math.isnan(contents_of(path).longest_attitude_gap_s)
     assert main.main(['diagnose', str(path), '--json']) == EXIT_REFUSED
     assert json.loads(capsys.readouterr().out)['contents']['longest_attitude_gap_s'] is None
@@ -185,8 +179,7 @@ def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
                 data=np.asarray(coded[1]).ravel(),
             )
             writer.write('/image', COMPRESSED_TYPE, tiny_images()[k].time_ns, message)
-        for raw in reader.read_raw([TINY], [ATTITUDE]):
-            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+        for time_ns, xyzw in attitudes():
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
     found = contents_of(path)
     (image,) = (t for t in found.topics if t.name == '/image')
@@ -236,21 +229,12 @@ def test_the_tool_says_it_to_people_and_programs(
 def test_a_bag_that_cannot_be_calibrated_ends_with_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / 'two.mcap'
-    with BagWriter(path) as writer:
-        for image in tiny_images()[:2]:
-            writer.write_image(IMAGE, image, 'camera')
-        writer.write_attitude(ATTITUDE, 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    alone = [(5, np.array([0.0, 0.0, 0.0, 1.0]))]
+    path = write_tiny(tmp_path / 'two.mcap', tiny_images()[:2], alone)
     assert main.main(['diagnose', str(path)]) == 3
     out = capsys.readouterr().out
     assert 'Cannot be calibrated: 2 different images, 3 are needed' in out and 'no_attitude' in out
-    few = tmp_path / 'few.mcap'
-    with BagWriter(few) as writer:
-        for raw in reader.read_raw([TINY], [ATTITUDE]):
-            time_ns, xyzw = attitude_from_message(reader.decode(raw))
-            writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
-        for image in tiny_images()[:2]:
-            writer.write_image(IMAGE, image, 'camera')
+    few = write_tiny(tmp_path / 'few.mcap', tiny_images()[:2])
     assert main.main(['diagnose', str(few)]) == 3
     assert '2 different images, 3 are needed' in capsys.readouterr().out
     assert main.main(['diagnose', str(few), '--params', str(PARAMS)]) == 3
@@ -268,10 +252,9 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
 def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
     direction: str, cause: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, last = tmp_path / 'more.mcap', tiny_images()[-1]
-    with BagWriter(path) as writer:
-        for k in (1, 2):
-            writer.write_image(IMAGE, Image(last.time_ns + k * 10**11, last.pixels), 'camera')
+    last = tiny_images()[-1]
+    later = (Image(last.time_ns + k * 10**11, last.pixels) for k in (1, 2))
+    path = write_tiny(tmp_path / 'more.mcap', later, ())
     given = ['--params', str(params_with(tmp_path, attitude_direction=direction))]
     assert main.main(['diagnose', str(TINY), str(path), *given]) == (3 if cause != 'none' else 0)
     assert words in ' '.join(capsys.readouterr().out.split())

@@ -37,7 +37,6 @@ from starcal_ros.text import significant
 
 if TYPE_CHECKING:
     from starcal_ground.campaign import Campaign, Source
-    from starcal_ground.images.first_setup import FirstSetup
     from starcal_ros.records import Calibration, CameraGeometry
 
 _DIR = 'folder for the products, created if absent'
@@ -70,14 +69,15 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli import into_folder
+    from starcal_ground.images.first_setup import assumed
 
     if args.output is None:
         raise OptionError(f'-o/--output DIR: not given: the {_DIR}, e.g. -o out')
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
     with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-        first, source = _source(args, Path(folder))
-        with into_folder.digests(first.files) as inputs:
+        source, stated = _source(args, Path(folder))
+        with into_folder.digests(source.files) as inputs:
             selection = None
             if args.from_time or args.to_time:
                 selection = arguments.Selection(args.from_time, args.to_time)
@@ -87,18 +87,18 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         arguments.print_notes(made.notes[len(source.notes) :])
     if args.json:
-        arguments.print_json(answer_of(made, first, source, args.output))
+        arguments.print_json(answer_of(made, source, stated, args.output))
     elif not args.quiet:
         print_calibration(made.calibration, made.setup.prior)
-        _print_assumed(first.assumed(source.topics, made.ensemble), made.calibration)
+        _print_assumed(assumed(source, stated, made.ensemble), made.calibration)
         print_text(f'\nproducts written to {args.output}' + (f'\n{report}' if report else ''))
         _print_verdict(made.calibration)
     accepted = made.calibration.accepted
     return arguments.EXIT_ACCEPTED if accepted else arguments.EXIT_REFUSED
 
 
-def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Source]:
-    """The set-up that the arguments give, and its source; a failure is recorded in the folder."""
+def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[Source, Mapping[str, object]]:
+    """The source and the options that the arguments give; a failure is recorded in the folder."""
     from starcal_ground.campaign import chosen
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
@@ -124,19 +124,20 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[FirstSetup, Sou
             arguments.print_notes(notes)
 
     with failure_recorded(args.output, given.paths, NotFromStars):
-        first = first_setup.source_of(given, args.output, bag_folder, note)
+        source = first_setup.source_of(given, args.output, bag_folder, note)
     with failure_recorded(args.output, given.paths, OptionError):  # no alignment was found
-        source = chosen(first.source)
+        source = chosen(source)
     note(source.notes)
     if not given.states_camera:
-        first.write(args.output, source.topics)
-    return first, source
+        first_setup.write_setup(source, given.options, args.output)
+    return source, given.options
 
 
 def answer_of(
-    made: Campaign, first: FirstSetup, source: Source, folder: Path
+    made: Campaign, source: Source, stated: Mapping[str, object], folder: Path
 ) -> Mapping[str, object]:
     """Object that `--json` prints of a campaign whose products are in a folder."""
+    from starcal_ground.images.first_setup import assumed
     from starcal_ground.report import verdict
     from starcal_ros.assessment.gate import REQUIREMENTS
 
@@ -147,7 +148,7 @@ def answer_of(
         'not_checked': [check for check in calibration.gate if check.passed is None],
         'lens_model': calibration.geometry.camera.model,
         'found': made.notes,
-        'assumed': dict(first.assumed(source.topics, made.ensemble)),
+        'assumed': dict(assumed(source, stated, made.ensemble)),
         'precision': verdict.precision_sentences(calibration),
         'next_step': verdict.next_step(calibration),
         'folder': str(folder),

@@ -51,15 +51,15 @@ def run(args: argparse.Namespace) -> int:
     _ = given.checked  # a bad option is bad input; a set-up that is not found is diagnosed
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         try:
-            first = source_of(given, Path(name), Path(name), arguments.print_notes)
+            source = source_of(given, Path(name), Path(name), arguments.print_notes)
         except (NotFromStars, OptionError, BagError) as error:
             if given.photographs:
                 raise
             examined = without_setup(given.paths, given.topics, error)
         else:
-            arguments.print_notes(first.source.notes)
+            arguments.print_notes(source.notes)
             progress = functools.partial(terminal.progress_bar, label='images')
-            examined = examine(first.source, progress)
+            examined = examine(source, progress)
     arguments.print_notes(examined.notes)
     contents, diagnosis = examined.contents, examined.diagnosis
     accepted = diagnosis.cause == 'none'

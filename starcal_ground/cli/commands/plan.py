@@ -76,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
         args.slew,
     )
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
-        first = source_of(given, Path(name), Path(name), arguments.print_notes)
-        campaign = calibrate(observe(chosen(first.source)))
+        source = source_of(given, Path(name), Path(name), arguments.print_notes)
+        campaign = calibrate(observe(chosen(source)))
     arguments.print_notes(campaign.notes)
     plan = plan_pointings(campaign.ensemble, campaign.setup, request)
     if args.output:

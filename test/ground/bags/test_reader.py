@@ -306,33 +306,6 @@ def test_truncated_bag(tmp_path: Path, folder: Path) -> None:
     assert most == 6
 
 
-def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
-    """A flipped bit in a chunk is reported, and no wrong pixel is read."""
-    whole = next(folder.glob('*.mcap')).read_bytes()
-    sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
-    with next(folder.glob('*.mcap')).open('rb') as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    random = np.random.default_rng(5)
-    file = tmp_path / 'flipped.mcap'
-    for chunk in summary.chunk_indexes:
-        head = chunk.chunk_start_offset
-        # The kind of the record, its checksum's last bytes, and some of its content.
-        content = random.integers(head + 60, head + chunk.chunk_length, 8)
-        for offset in [head, *content]:
-            damaged = bytearray(whole)
-            damaged[offset] ^= 1 << int(random.integers(8))
-            file.write_bytes(damaged)
-            said: list[str] = []
-            images = images_of(file, on_damage=said.append)
-            assert said, offset
-            assert all('\n' not in text for text in said)
-            for image in images:
-                assert isinstance(image, Image)
-                k = (image.time_ns - START_NS) // SECOND_NS
-                np.testing.assert_array_equal(image.pixels, sound[k])
-
-
 @pytest.mark.parametrize('is_stated', [True, False])
 def test_a_checksum_of_all_data_is_compared(tmp_path: Path, is_stated: bool) -> None:
     """A bit outside all messages: what a file states is checked, most recorders state none."""
@@ -422,9 +395,9 @@ def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) 
 @given(data=st.data())
 def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> None:
     """
-    With any flipped bits and truncation, messages read were written, and losses are reported.
+    With any flipped bits, random bytes and truncation, messages read are those written.
 
-    With an intact summary the count of lost messages is exact.
+    Losses are reported, each in one line; with an intact summary their count is exact.
     """
     whole = small_chunks.read_bytes()
     sound = list(bag_reader.read_raw([small_chunks]))
@@ -434,7 +407,9 @@ def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> N
     offsets = st.integers(8, len(whole) - 1)
     flips = data.draw(st.lists(st.tuples(offsets, st.integers(0, 7)), max_size=3, unique=True))
     size = data.draw(st.one_of(st.just(len(whole)), offsets))
+    burst, at = data.draw(st.binary(max_size=64)), data.draw(st.integers(8, len(whole) - 64))
     damaged = bytearray(whole)
+    damaged[at : at + len(burst)] = burst
     for offset, bit in flips:
         damaged[offset] ^= 1 << bit
     file = small_chunks.with_name('damaged.mcap')
@@ -445,25 +420,12 @@ def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> N
     assert all(any(message == one for one in left) for message in read), 'in order, as written'
     missing = len(sound) - len(read)
     assert said or not missing
-    if size == len(whole) and all(offset < summary_start for offset, _ in flips):
+    assert all('\n' not in text for text in said)
+    ends = [at + len(burst), *(offset for offset, _ in flips)]
+    if size == len(whole) and max(ends) < summary_start:
         counted = [int(n) for text in said for n in re.findall(r'(\d+) of \d+ on ', text)]
         assert sum(counted) == missing
     bag_reader.topics([file], said.append)
-
-
-def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
-    """Reading a file with random bytes never raises an unexpected error."""
-    whole = np.frombuffer(next(folder.glob('*.mcap')).read_bytes(), np.uint8)
-    random = np.random.default_rng(6)
-    file = tmp_path / 'rubbish.mcap'
-    for _ in range(60):
-        damaged = whole.copy()
-        start = int(random.integers(8, len(damaged) - 64))
-        damaged[start : start + 64] = random.integers(0, 256, 64)
-        file.write_bytes(damaged.tobytes())
-        said: list[str] = []
-        images_of(file, on_damage=said.append)
-        bag_reader.topics([file], said.append)
 
 
 @pytest.mark.parametrize('indexed', [False, True])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
+from mission_files import attitudes, images, TINY, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
@@ -168,12 +168,8 @@ def test_attitudes_that_are_not_read_are_named_where_none_are_asked_for(
 
 def test_images_in_another_order_are_all_used(tmp_path: Path) -> None:
     """Six of ten were: each third image after one of a later stamp began a sequence."""
-    with BagWriter(tmp_path / 'bag') as writer:
-        for time_ns, xyzw in attitudes():
-            writer.write_attitude('/attitude', time_ns, xyzw, 'icrf')
-        for k in (3, 0, 2, 1):
-            writer.write_image('/image', images()[k], 'camera')
-    setup, paths = setup_with(), [tmp_path / 'bag']
+    paths = [write_tiny(tmp_path / 'bag', [images()[k] for k in (3, 0, 2, 1)])]
+    setup = setup_with()
     records = list(topics.read(paths, topics.choose_topics(paths, Topics(), setup), setup))
     expected = [images()[k].time_ns for k in (3, 0, 1, 2)]
     assert [(record.time_ns, record.refusal) for record in records] == [(t, '') for t in expected]

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
+from mission_files import attitudes, images, TINY, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import yaml
@@ -15,7 +15,7 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader, topics
 from starcal_ground.bags.topics import Topics
 from starcal_ground.cli.main import main
-from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ground.simulation.simulated_bag import IMAGE_TOPIC
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
@@ -24,12 +24,10 @@ from starcal_ros.formats.messages.message_codec import (
     quaternion_to_message,
     vector_to_message,
 )
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Image
 
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 ODOMETRY, POSE, TF = (
     'nav_msgs/msg/Odometry',
     'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -72,11 +70,9 @@ def attitude(kind: str, time_ns: int, xyzw: np.ndarray) -> Message:
 def write_bag(path: Path, kind: str) -> Path:
     """Write four images with the attitudes in messages of a type; none for an empty one."""
     with BagWriter(path) as writer:
-        for image in itertools.islice(reader.read_images([TINY], IMAGE_TOPIC), 4):
-            assert isinstance(image, Image)
+        for image in images()[:4]:
             writer.write_image(IMAGE_TOPIC, image, 'camera')
-        for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC] if kind else []):
-            time_ns, xyzw = attitude_from_message(reader.decode(raw))
+        for time_ns, xyzw in attitudes() if kind else ():
             writer.write('/gnc/state', kind, time_ns, attitude(kind, time_ns, xyzw))
     return path
 
@@ -167,17 +163,10 @@ def test_a_clock_that_was_never_set_is_named(
 ) -> None:
     reader.log_damage.cache_clear()
     bag = tmp_path / 'bag.mcap'
-    start_ns = next(reader.read_images([TINY], IMAGE_TOPIC)).time_ns
-    with BagWriter(bag) as writer:
-        for image in itertools.islice(reader.read_images([TINY], IMAGE_TOPIC), 2):
-            assert isinstance(image, Image)
-            unset = Image(image.time_ns - start_ns + 5 * 10**9, image.pixels)
-            writer.write_image(IMAGE_TOPIC, unset, 'camera')
-        for raw in reader.read_raw([TINY], [ATTITUDE_TOPIC]):
-            time_ns, xyzw = attitude_from_message(reader.decode(raw))
-            if time_ns - start_ns > -5 * 10**9:
-                after_ns = time_ns - start_ns + 5 * 10**9
-                writer.write_attitude(ATTITUDE_TOPIC, after_ns, xyzw, 'icrf')
+    back_ns = images()[0].time_ns - 5 * 10**9
+    unset = (Image(image.time_ns - back_ns, image.pixels) for image in images()[:2])
+    samples = ((ns - back_ns, xyzw) for ns, xyzw in attitudes() if ns > back_ns)
+    write_tiny(bag, unset, samples)
     name, *with_params = command.split()
     given = [*with_params, str(TINY / 'params.yaml')] if with_params else []
     out = ['-o', str(tmp_path / 'out'), '--no-report'] if name == 'calibrate' else []

@@ -17,7 +17,7 @@ import signal
 import subprocess
 import sys
 
-from mission_files import params_with, TINY  # type: ignore[import-not-found]
+from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
@@ -95,7 +95,6 @@ def test_a_command_line_imports_its_command_alone() -> None:
     ('arguments', 'words'),
     [
         (['fly'], ["'fly'"]),
-        (['inspect', 'a.mcap'], ['inspect: no such command', 'starcal diagnose lists']),
         (['calibrat'], ["'calibrat'", 'calibrate']),
         (['diagnose', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'diagnose --help']),
         (['diagnose', 'none.mcap'], ['none.mcap', 'no such file or folder']),
@@ -312,65 +311,58 @@ def test_outputs_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
     assert file.read_text() == 'in the way'
 
 
-def write_bag_of(path: Path, pixels: np.ndarray, attitudes: bool = True, count: int = 4) -> None:
-    """Images all alike, with or without the attitudes about them."""
-    with BagWriter(path) as writer:
-        for k in range(count):
-            time_ns = 1_800_000_000_000_000_000 + k * 10**9
-            if attitudes:
-                writer.write_attitude('/att', time_ns, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
-            writer.write_image('/image', Image(time_ns, pixels), 'camera')
-        if not attitudes:
-            writer.write_attitude('/att', 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+BLANK = np.full((512, 640), 33, np.uint16)
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+START_NS = 1_800_000_000_000_000_000
 
 
-def test_bags_without_a_usable_image(run: Run, tmp_path: Path) -> None:
-    blank = np.full((512, 640), 33, np.uint16)
-    for pixels, attitudes, reason in (
-        (blank, False, 'no_attitude'),
-        (blank, True, 'blank'),
-        (blank[:100], True, 'wrong_size'),
-    ):
-        bag = tmp_path / f'{reason}.mcap'
-        write_bag_of(bag, pixels, attitudes)
-        result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-        assert_refused(result, reason)
+def images_alike(
+    pixels: np.ndarray, with_attitudes: bool = True, colours: str = ''
+) -> Callable[[BagWriter], None]:
+    """Four images all alike, with or without the attitudes about them."""
+
+    def write(writer: BagWriter) -> None:
+        for time_ns in range(START_NS, START_NS + 4 * 10**9, 10**9):
+            if with_attitudes:
+                writer.write_attitude('/att', time_ns, STILL, 'icrf')
+            if colours:
+                three = np.repeat(pixels[..., None], 3, axis=2)
+                write_encoded(writer, '/image', Image(time_ns, pixels), colours, three)
+            else:
+                writer.write_image('/image', Image(time_ns, pixels), 'camera')
+        if not with_attitudes:
+            writer.write_attitude('/att', 0, STILL, 'icrf')
+
+    return write
 
 
-def test_images_of_a_wrong_encoding(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def two_cameras(writer: BagWriter) -> None:
+    for topic in ('/left', '/right'):
+        writer.write_image(topic, Image(5, BLANK), 'camera')
+
+
+@pytest.mark.parametrize(
+    ('write', 'words'),
+    [
+        (images_alike(BLANK, with_attitudes=False), ['no_attitude']),
+        (images_alike(BLANK), ['blank']),
+        (images_alike(BLANK[:100]), ['wrong_size']),
+        (images_alike(np.zeros((512, 640), np.uint8), colours='bgr8'), ['bad_encoding']),
+        (
+            lambda writer: writer.write_attitude('/att', 5, STILL, 'icrf'),
+            ['bag.mcap', 'no topic of type sensor_msgs/msg/Image'],
+        ),
+        (two_cameras, ['/left, /right']),
+    ],
+)
+def test_bags_without_a_usable_image(
+    run: Run, tmp_path: Path, write: Callable[[BagWriter], None], words: list[str]
 ) -> None:
-    from starcal_ground.bag_writer import image_to_message
-    from starcal_ros.formats.messages.message_codec import Make, Message
-
-    def colour(image: Image, frame_id: str, make: Make) -> Message:
-        message = image_to_message(image, frame_id, make)
-        message.encoding = 'bgr8'
-        return message
-
-    monkeypatch.setattr('starcal_ground.bag_writer.image_to_message', colour)
-    bag = tmp_path / 'colour.mcap'
-    write_bag_of(bag, np.zeros((512, 640), np.uint8))
-    monkeypatch.undo()
-    result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    assert_refused(result, 'bad_encoding')
-
-
-def test_bag_with_attitudes_alone(run: Run, tmp_path: Path) -> None:
-    bag = tmp_path / 'attitudes.mcap'
+    bag = tmp_path / 'bag.mcap'
     with BagWriter(bag) as writer:
-        writer.write_attitude('/att', 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+        write(writer)
     result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    assert_refused(result, str(bag), 'no topic of type sensor_msgs/msg/Image')
-
-
-def test_several_image_topics_must_be_named(run: Run, tmp_path: Path) -> None:
-    bag = tmp_path / 'two.mcap'
-    with BagWriter(bag) as writer:
-        for topic in ('/left', '/right'):
-            writer.write_image(topic, Image(5, np.zeros((512, 640), np.uint8)), 'camera')
-    result = run('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    assert_refused(result, '/left, /right')
+    assert_refused(result, *words)
 
 
 def test_a_temperature_topic_must_be_there(run: Run, tmp_path: Path) -> None:
@@ -379,8 +371,8 @@ def test_a_temperature_topic_must_be_there(run: Run, tmp_path: Path) -> None:
     assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
     two = tmp_path / 'two.mcap'
     with BagWriter(two) as writer:
-        writer.write_image('/image', Image(5, np.zeros((512, 640), np.uint8)), 'camera')
-        writer.write_attitude('/att', 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+        writer.write_image('/image', Image(5, BLANK), 'camera')
+        writer.write_attitude('/att', 5, STILL, 'icrf')
         for topic in ('/lens', '/box'):
             writer.write_temperature(topic, 5, 20.0, 'camera')
     # Two thermometers: which one, is asked only where it matters.
@@ -501,15 +493,31 @@ def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> No
     assert sorted(word.strip() for word in found) == expected
 
 
-def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ('line', 'module', 'arguments'),
+    [
+        (
+            f'play {TINY} --rate 2 --remap a:=b --remap c:=d',
+            'bag_player',
+            f'--ros-args -p bag:={TINY.resolve()} -p rate:=2.0 --ros-args -r a:=b -r c:=d',
+        ),
+        # It was once renamed without its command.
+        (
+            'monitor --once 2.5 --remap __ns:=/cam1',
+            'starcal_ground.ros.monitor_client',
+            '--once 2.5 --ros-args -r __ns:=/cam1',
+        ),
+    ],
+)
+def test_a_command_becomes_its_node(
+    run: Run, monkeypatch: pytest.MonkeyPatch, line: str, module: str, arguments: str
+) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
-    run('play', TINY, '--rate', '2', '--remap', 'a:=b', '--remap', 'c:=d')
-    (command,) = called
-    start = [*module_command('starcal_ros.entry_points'), 'bag_player']
-    assert command[: len(start)] == start
-    assert f'bag:={TINY.resolve()}' in command and 'rate:=2.0' in command
-    assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']
+    run(*line.split())
+    entry = module_command('starcal_ros.entry_points')
+    assert called == [[*entry, module, *arguments.split()]]
+    assert '.' not in module or importlib.util.find_spec(module)
 
 
 def test_no_report_is_written_where_none_is_wanted(
@@ -521,16 +529,6 @@ def test_no_report_is_written_where_none_is_wanted(
     assert status == 0 and f'\nproducts written to {tmp_path}\n' in out
     assert (tmp_path / 'calibration.json').is_file()
     assert not (tmp_path / 'report.html').exists()
-
-
-def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[list[str]] = []
-    monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
-    run('monitor', '--once', '2.5', '--remap', '__ns:=/cam1')
-    module = [*module_command('starcal_ros.entry_points'), 'starcal_ground.ros.monitor_client']
-    assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
-    # The entry point imports that module of ros/; it was once renamed without its command.
-    assert importlib.util.find_spec('starcal_ground.ros.monitor_client')
 
 
 @pytest.mark.slow

@@ -38,6 +38,24 @@ def test_nothing_received_is_said() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ('namespace', 'nodes', 'remedy'),
+    [
+        ('', ['sat1/calibrator', 'sat1/star_observer'], '--remap __ns:=/sat1'),
+        ('sat2', ['sat1/calibrator', 'calibrator'], '--remap __ns:=/'),
+        ('sat1', ['sat1/calibrator', 'sat2/calibrator'], ''),
+        ('', ['calibrator', 'sat1/other'], ''),
+    ],
+)
+def test_nodes_in_another_namespace_are_named(
+    namespace: str, nodes: list[str], remedy: str
+) -> None:
+    health = dict.fromkeys(nodes, (0, 'ok'))
+    text = shown(Received(namespace=namespace, health=health))
+    asked = f'nothing of calibrator in /{namespace}: try {remedy} '
+    assert (asked in text) == bool(remedy) and ('no status received' in text) != bool(remedy)
+
+
 def test_images_are_counted_by_reason() -> None:
     received = Received()
     for refusal in ('', 'no_match', '', 'no_match', 'frozen'):

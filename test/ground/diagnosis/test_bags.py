@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import Topics
+from starcal_ground.campaign import chosen, Source
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes
-from starcal_ground.diagnosis.bags import aligned_by_bags
 from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ground.ros.setup_finder import Unmatched
 from starcal_ros.errors import OptionError
@@ -34,11 +34,12 @@ def unaligned() -> Setup:
 @pytest.mark.slow
 def test_an_alignment_not_given_is_found(unaligned: Setup) -> None:
     assert not unaligned.is_aligned
-    found, sentence = aligned_by_bags([TINY], Topics(), unaligned)
-    assert found.is_aligned and 'prior_alignment is not given: found [' in sentence
+    found = chosen(Source((TINY,), Topics(), unaligned))
+    (sentence,) = found.notes
+    assert found.setup.is_aligned and 'prior_alignment is not given: found [' in sentence
     assert 'from 8 images that agree' in sentence
     true = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
-    shown = Rotation.from_quat(found.prior.star_tracker_from_camera_xyzw)
+    shown = Rotation.from_quat(found.setup.prior.star_tracker_from_camera_xyzw)
     # The mounting is off by 150 arcsec an axis, the principal point by up to its prior.
     assert (shown.inv() * true).magnitude() < math.radians(0.2)
 
@@ -54,7 +55,7 @@ def test_an_alignment_not_found_is_said(unaligned: Setup) -> None:
     options = dataclasses.replace(unaligned.attitude, attitude_direction='inertial_to_st')
     wrong = dataclasses.replace(unaligned, attitude=options)
     with pytest.raises(OptionError, match='prior_alignment: not given, and not found: The atti'):
-        aligned_by_bags([TINY], Topics(), wrong)
+        chosen(Source((TINY,), Topics(), wrong))
 
 
 @pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])

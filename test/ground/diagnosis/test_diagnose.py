@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import erfa
 import numpy as np
 import pytest
@@ -38,11 +39,12 @@ NO_ATTITUDES = WireAttitudes(np.empty(0, np.int64), np.empty((0, 4)))
 
 @dataclass(frozen=True)
 class Night:
-    """Images, attitudes and a set-up that fit each other."""
+    """Images, attitudes and a set-up that fit each other; why a measurement refuses most."""
 
     images: tuple[Image, ...]
     attitudes: WireAttitudes
     setup: Setup
+    refused: str = ''
 
 
 def set_up(geometry: CameraGeometry) -> Setup:
@@ -152,199 +154,12 @@ def with_setup(night: Night, **changes: Any) -> Night:
 
 def found_in(night: Night, catalog: StarCatalog) -> Diagnosis:
     setup = dataclasses.replace(night.setup, catalog=catalog)
-    found = diagnose(night.images, night.attitudes, setup)
+    found = diagnose(night.images, night.attitudes, setup, refused=night.refused)
     assert found.cause in CAUSES and found.sentence.endswith('.')
     return found
 
 
-def test_nothing_is_wrong(night: Night, catalog: StarCatalog) -> None:
-    assert found_in(night, catalog).cause == 'none'
-
-
-def test_w_first(night: Night, catalog: StarCatalog) -> None:
-    found = found_in(with_quaternions(night, lambda q: q[:, [3, 0, 1, 2]]), catalog)
-    assert (found.cause, found.found) == ('quaternion_order', 'wxyz')
-
-
-def test_conjugated(night: Night, catalog: StarCatalog) -> None:
-    found = found_in(with_quaternions(night, lambda q: q * [-1, -1, -1, 1]), catalog)
-    assert (found.cause, found.found) == ('attitude_direction', 'inertial_to_st')
-    assert found.mend[0] == 'attitude_direction: inertial_to_st'
-
-
 DATE_JD = (2440587.5, START_NS / 86400e9)
-
-
-@pytest.mark.parametrize(
-    ('axes', 'from_icrf'),
-    [
-        ('the mean equator and equinox of date', erfa.pmat06(*DATE_JD)),
-        ('the ecliptic of J2000', Rotation.from_euler('x', -84381.406 / 3600, True).as_matrix()),
-    ],
-)
-def test_attitudes_in_other_axes(axes: str, from_icrf: Any, catalog: StarCatalog) -> None:
-    turn = Rotation.from_matrix(from_icrf)
-    for change in (lambda n: n, conjugated):
-        night = with_quaternions(
-            slewing_night(), lambda q: (turn * Rotation.from_quat(q)).as_quat()
-        )
-        found = found_in(change(night), catalog)
-        assert 'axes' in (found.cause, *found.also) and 'clock' not in found.also
-        assert axes in ' '.join((found.sentence, *found.evidence))
-        assert any(
-            line.endswith('send attitudes in axes of the ICRF (J2000)') for line in found.mend
-        )
-
-
-def test_attitudes_that_turn_with_the_earth(catalog: StarCatalog) -> None:
-    night = slewing_night()
-    days = night.attitudes.time_ns / 86400e9
-    earth_from_icrf = [
-        erfa.rz(erfa.gst06a(DATE_JD[0], day, DATE_JD[0], day), erfa.pnm06a(DATE_JD[0], day))
-        for day in days
-    ]
-    turns = Rotation.from_matrix(np.array(earth_from_icrf))
-    sent = with_quaternions(night, lambda q: (turns * Rotation.from_quat(q)).as_quat())
-    found = found_in(sent, catalog)
-    assert (found.cause, found.found) == ('axes', 'the rotating Earth')
-
-
-def test_wrong_attitude_direction(night: Night, catalog: StarCatalog) -> None:
-    options = AttitudeOptions(attitude_direction='inertial_to_st')
-    found = found_in(with_setup(night, attitude=options), catalog)
-    assert (found.cause, found.found) == ('attitude_direction', 'st_to_inertial')
-
-
-@pytest.mark.parametrize('missing', [False, True])
-def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
-    right = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw)
-    if missing:
-        wrong = unaligned(night)
-    else:
-        wrong = with_alignment(night, Rotation.from_euler('x', 10.0, degrees=True))
-    found = found_in(wrong, catalog)
-    assert found.cause == 'prior_alignment'
-    # The prior of the rendered night is off by 150 arcsec an axis; a lost principal point of 1 px
-    # would be 100 arcsec. Within the degree and a half that is searched, it will do.
-    assert isinstance(found.found, list)
-    # It goes with the principal point stated: that of the real night is off by 49 of 2656 px.
-    assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.2)
-
-
-def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog) -> None:
-    """Eighty wide spots, most of them brighter than the stars: the compact sources are known."""
-    rng = np.random.default_rng(5)
-
-    def with_corona(pixels: Any) -> Any:
-        v, u = np.indices(pixels.shape)
-        light = np.zeros(pixels.shape)
-        for _ in range(80):
-            u0, v0 = rng.uniform((0.0, 0.0), pixels.shape[::-1])
-            spread = np.exp(-((u - u0) ** 2 + (v - v0) ** 2) / (2 * 3.0**2))
-            light += 10 ** rng.uniform(1.5, 2.3) * spread
-        return np.minimum(pixels + light, 4095.0).astype(pixels.dtype)
-
-    night = with_pixels(slewing_night(), with_corona)
-    found = found_in(with_alignment(night, Rotation.from_rotvec([0.4, 0.3, 1.0])), catalog)
-    assert (found.cause, found.images) == ('prior_alignment', 3)
-
-
-@pytest.mark.parametrize('degrees', [90.0, 180.0])
-def test_rolled_alignment(night: Night, catalog: StarCatalog, degrees: float) -> None:
-    wrong = with_alignment(night, Rotation.from_euler('z', -degrees, degrees=True))
-    found = found_in(wrong, catalog)
-    assert (found.cause, found.found) == ('rotated', degrees)
-
-
-@pytest.mark.parametrize(
-    ('how', 'change'),
-    [('left to right', lambda p: p[:, ::-1]), ('top to bottom', lambda p: p[::-1])],
-)
-def test_mirrored(night: Night, catalog: StarCatalog, how: str, change: Any) -> None:
-    found = found_in(with_pixels(night, change), catalog)
-    assert (found.cause, found.found) == ('mirrored', how)
-
-
-def test_rotated_image(night: Night, catalog: StarCatalog) -> None:
-    found = found_in(with_pixels(night, lambda p: p[::-1, ::-1]), catalog)
-    assert (found.cause, found.found) == ('rotated', 180.0)
-
-
-@pytest.mark.parametrize('share', [0.8, 1.2])
-def test_focal_length(night: Night, catalog: StarCatalog, share: float) -> None:
-    camera = night.setup.prior.camera
-    fx, _, fy = camera.intrinsics[:3]
-    wide = camera.replace(fx=share * float(fx), fy=share * float(fy))
-    wrong = with_setup(night, prior=dataclasses.replace(night.setup.prior, camera=wide))
-    found = found_in(wrong, catalog)
-    assert found.cause == 'focal_length'
-    # One image tells it to a few parts in a thousand, its distortion being unknown.
-    assert found.found == pytest.approx(float(fx), rel=0.01)
-
-
-@pytest.mark.parametrize('late_s', [-47.0, -1.5, 3.0, 58.0])
-def test_clock(catalog: StarCatalog, late_s: float) -> None:
-    night = with_stamps(slewing_night(), late_s)
-    found = found_in(night, catalog)
-    assert found.cause == 'clock'
-    # A tenth of a second of 2 degrees a second is what the star tracker's mounting would hide.
-    assert found.found == pytest.approx(-late_s, abs=0.1)
-
-
-@pytest.mark.parametrize('late_s', [-41.0, 33.0])
-def test_clock_of_a_camera_that_rests(catalog: StarCatalog, late_s: float) -> None:
-    found = found_in(with_stamps(granasat_night(), late_s), catalog)
-    assert found.cause == 'clock'
-    # The attitudes are known for half a second before and after each image, at rest: the middle.
-    assert found.found == pytest.approx(-late_s, abs=0.1)
-
-
-def test_no_stars(night: Night, catalog: StarCatalog) -> None:
-    rng = np.random.default_rng(1)
-    dark = with_pixels(night, lambda p: rng.poisson(50, p.shape).astype(p.dtype))
-    assert found_in(dark, catalog).cause == 'no_stars'
-
-
-def test_images_without_stars_before_those_with(night: Night, catalog: StarCatalog) -> None:
-    cap_on = tuple(
-        Image(night.images[0].time_ns - 1000 * (k + 1), np.zeros_like(night.images[0].pixels))
-        for k in range(12)
-    )
-    assert found_in(dataclasses.replace(night, images=cap_on + night.images), catalog).cause == (
-        'none'
-    )
-
-
-@pytest.mark.parametrize('length', [12, 40])  # up to 10 px they are measured
-def test_smear(night: Night, catalog: StarCatalog, length: int) -> None:
-    def smeared(pixels: Any) -> Any:
-        level = np.median(pixels)
-        light = np.stack([np.roll(pixels, k, axis=1) for k in range(length)]).astype(float)
-        streaks = level + (light - level).sum(axis=0) / 6
-        return streaks.clip(0, np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else 4095)
-
-    made = with_pixels(night, lambda p: smeared(p).astype(p.dtype))
-    found = found_in(made, catalog)
-    assert found.cause == 'smear'
-    # A streak longer than the window of 13 px is cut: so much is stated as a lower bound.
-    assert found.found == pytest.approx(min(length, 13), abs=2)
-    assert ('at least' in found.sentence) == (length > 13)
-
-
-def test_tone_curve(night: Night, catalog: StarCatalog) -> None:
-    def curved(pixels: Any) -> Any:
-        light = np.maximum(pixels.astype(float) - np.median(pixels), 0.0) / pixels.max()
-        return (10 + 0.8 * pixels.max() * light ** (1 / 2.2)).astype(pixels.dtype)
-
-    found = found_in(with_pixels(night, curved), catalog)
-    assert found.cause == 'not_linear'
-
-
-@pytest.mark.parametrize(('turns', 'way'), [(1, 'counterclockwise'), (-1, 'clockwise')])
-def test_sides_exchanged(night: Night, catalog: StarCatalog, turns: int, way: str) -> None:
-    found = found_in(with_pixels(night, lambda p: np.rot90(p, turns)), catalog)
-    assert (found.cause, found.found) == ('rotated', 90.0)
-    assert found.sentence.endswith(f'degrees {way}.')
 
 
 def turned(night: Night, degrees: float) -> Night:
@@ -360,72 +175,68 @@ def conjugated(night: Night) -> Night:
     return with_quaternions(night, lambda q: q * [-1, -1, -1, 1])
 
 
-def half_turned(night: Night) -> Night:
-    return with_alignment(night, Rotation.from_euler('z', 180.0, degrees=True))
-
-
 def unaligned(night: Night) -> Night:
     return with_setup(night, is_aligned=False)
 
 
-@pytest.mark.parametrize(
-    ('changes', 'causes'),
-    [
-        ((conjugated, lambda n: turned(n, 40)), ['attitude_direction', 'prior_alignment']),
-        ((conjugated, half_turned), ['attitude_direction', 'rotated']),
-        ((conjugated, unaligned), ['attitude_direction', 'prior_alignment']),
-        ((conjugated, w_first), ['quaternion_order', 'attitude_direction']),
-        ((w_first, lambda n: turned(n, 6)), ['quaternion_order', 'prior_alignment']),
-        ((w_first, unaligned), ['quaternion_order', 'prior_alignment']),
-        ((half_turned, lambda n: turned(n, 12)), ['prior_alignment']),
-        ((lambda n: with_stamps(n, 20.0), conjugated), ['attitude_direction', 'clock']),
-        ((lambda n: with_stamps(n, 20.0), unaligned), ['clock', 'prior_alignment']),
-    ],
-)
-def test_two_mistakes(night: Night, catalog: StarCatalog, changes: Any, causes: list[str]) -> None:
-    for change in changes:
-        night = change(night)
-    found = found_in(night, catalog)
-    assert [found.cause, *found.also] == causes
+def with_direction(direction: str) -> Callable[[Night], Night]:
+    options = AttitudeOptions(attitude_direction=direction)
+    return lambda night: with_setup(night, attitude=options)
 
 
-def test_two_mistakes_of_which_one_is_in_the_images(night: Night, catalog: StarCatalog) -> None:
-    found = found_in(with_pixels(conjugated(night), lambda p: p[:, ::-1]), catalog)
-    assert [found.cause, *found.also] == ['mirrored', 'attitude_direction']
+def rolled(degrees: float) -> Callable[[Night], Night]:
+    turn = Rotation.from_euler('z', degrees, degrees=True)
+    return lambda night: with_alignment(night, turn)
 
 
-def test_attitudes_of_something_else(night: Night, catalog: StarCatalog) -> None:
+half_turned = rolled(180.0)
+
+
+def of_pixels(change: Callable[[Any], Any]) -> Callable[[Night], Night]:
+    return lambda night: with_pixels(night, change)
+
+
+def dark(night: Night) -> Night:
+    rng = np.random.default_rng(1)
+    return with_pixels(night, lambda p: rng.poisson(50, p.shape).astype(p.dtype))
+
+
+def capped_at_first(night: Night) -> Night:
+    cap_on = tuple(
+        Image(night.images[0].time_ns - 1000 * (k + 1), np.zeros_like(night.images[0].pixels))
+        for k in range(12)
+    )
+    return dataclasses.replace(night, images=cap_on + night.images)
+
+
+def curved(pixels: Any) -> Any:
+    light = np.maximum(pixels.astype(float) - np.median(pixels), 0.0) / pixels.max()
+    return (10 + 0.8 * pixels.max() * light ** (1 / 2.2)).astype(pixels.dtype)
+
+
+def smeared(length: int) -> Callable[[Night], Night]:
+    def change(pixels: Any) -> Any:
+        level = np.median(pixels)
+        light = np.stack([np.roll(pixels, k, axis=1) for k in range(length)]).astype(float)
+        streaks = level + (light - level).sum(axis=0) / 6
+        most = np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else 4095
+        return streaks.clip(0, most).astype(pixels.dtype)
+
+    return of_pixels(change)
+
+
+def with_focal_length(share: float) -> Callable[[Night], Night]:
+    def change(night: Night) -> Night:
+        camera = night.setup.prior.camera
+        fx, _, fy = camera.intrinsics[:3]
+        return with_camera(night, camera.replace(fx=share * float(fx), fy=share * float(fy)))
+
+    return change
+
+
+def of_something_else(night: Night) -> Night:
     rng = np.random.default_rng(3)
-    others = with_quaternions(night, lambda q: Rotation.random(len(q), random_state=rng).as_quat())
-    assert found_in(others, catalog).cause == 'unknown'
-
-
-def at_rest(count: int) -> Night:
-    """Images of one attitude, which all ways to read the quaternions fit."""
-    scenario = dataclasses.replace(
-        synthetic.scenario('tiny', seed=3),
-        pointing=synthetic.Inertial(((250.0, 32.0, 10.0),)),
-        image_count=count,
-    )
-    samples = [s for k in range(count) for s in synthetic.attitude_samples(scenario, k)]
-    stamps_ns = np.array([sample.time_ns for sample in samples])
-    sent = np.array([sample.icrf_from_star_tracker_xyzw for sample in samples])
-    prior = scenario.prior
-    return Night(
-        tuple(rendering.images(scenario)),
-        WireAttitudes(stamps_ns, sent),
-        set_up(prior),
-    )
-
-
-@pytest.mark.parametrize('count', [1, 4])
-def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
-    resting = at_rest(count)
-    assert found_in(resting, catalog).cause == 'none'
-    assert found_in(conjugated(resting), catalog).cause == 'attitude_direction'
-    assert found_in(turned(resting, 10), catalog).cause == 'prior_alignment'
-    # Which of the two is wrong cannot be seen: neither is blamed.
-    assert found_in(turned(conjugated(resting), 30), catalog).cause == 'unknown'
+    return with_quaternions(night, lambda q: Rotation.random(len(q), random_state=rng).as_quat())
 
 
 def in_axes(matrix: Any) -> Callable[[Night], Night]:
@@ -495,13 +306,200 @@ def of_camera(night: Night) -> Night:
 
 
 def without_tracker(night: Night) -> Night:
-    """Images without attitudes: those in the bag are of their stars."""
+    """Take the attitudes for those of the stars, as in bags that are made of photographs."""
     frames = dataclasses.replace(night.setup.frames, star_tracker_frame='')
-    return conjugated(with_setup(night, frames=frames))
+    return with_setup(night, frames=frames)
+
+
+def blurred(light: Callable[[Any, Any], Any], refused: str = 'too_few_stars') -> Any:
+    """Spread each star over the pixels (u, v) about its own where a function is positive."""
+    v, u = np.mgrid[-15:16, -15:16].astype(float)
+    kernel = np.maximum(light(u, v), 0.0)
+    kernel /= kernel.sum()
+
+    def spread(pixels: Any) -> Any:
+        level = np.median(pixels)
+        noise = 1.48 * np.median(np.abs(pixels - level))
+        stars = cv2.filter2D(pixels - level, -1, kernel[::-1, ::-1])
+        # The filter averages the noise, which does not depend on the lens.
+        made = level + stars + np.random.default_rng(0).normal(0.0, noise, pixels.shape)
+        return made.clip(0, 65535).astype(pixels.dtype)
+
+    def change(night: Night) -> Night:
+        return dataclasses.replace(with_pixels(night, spread), refused=refused)
+
+    return change
+
+
+def disc(outer_px: float, inner_px: float = -1.0) -> Callable[[Any, Any], Any]:
+    def light(u: Any, v: Any) -> Any:
+        radius_px = np.hypot(u, v)
+        return (radius_px <= outer_px) & (radius_px > inner_px)
+
+    return light
+
+
+def comet(u: Any, v: Any) -> Any:
+    """A head with a tail of 12 px towards +u that becomes wider and fainter."""
+    along = np.maximum(u, 0.0)
+    across = np.hypot(np.minimum(u, 0.0), v) / (0.7 + 0.3 * along)
+    return np.exp(-0.5 * across**2 - along / 6.0) * (u < 12)
 
 
 def together(*changes: Callable[[Night], Night]) -> Callable[[Night], Night]:
     return lambda night: functools.reduce(lambda made, change: change(made), changes, night)
+
+
+def with_the_earth(night: Night) -> Night:
+    """Send attitudes in axes that turn with the Earth."""
+    earth_from_icrf = [
+        erfa.rz(erfa.gst06a(DATE_JD[0], day, DATE_JD[0], day), erfa.pnm06a(DATE_JD[0], day))
+        for day in night.attitudes.time_ns / 86400e9
+    ]
+    turns = Rotation.from_matrix(np.array(earth_from_icrf))
+    return with_quaternions(night, lambda q: (turns * Rotation.from_quat(q)).as_quat())
+
+
+def expanded(pixels: Any) -> Any:
+    """Undo the curve of sRGB in linear pixels of 8 bits, with stars that stand out."""
+    light = np.clip((pixels.astype(float) - np.median(pixels)) / pixels.max(), 0.0, 1.0)
+    noise = np.random.default_rng(0).normal(100.0, 2.0, pixels.shape)
+    return (noise + 60000.0 * light**2.2).clip(0, 65535).astype(np.uint16)
+
+
+def late(seconds: float) -> Callable[[Night], Night]:
+    return lambda night: with_stamps(night, seconds)
+
+
+def off(degrees: float) -> Callable[[Night], Night]:
+    return lambda night: turned(night, degrees)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'causes', 'value', 'words'),
+    [
+        ([], ['none'], None, ''),
+        ([w_first], ['quaternion_order'], 'wxyz', ''),
+        ([conjugated], ['attitude_direction'], 'inertial_to_st', 'on: inertial_to_st'),
+        ([with_direction('inertial_to_st')], ['attitude_direction'], 'st_to_inertial', ''),
+        ([rolled(-90.0)], ['rotated'], 90.0, ''),
+        ([half_turned], ['rotated'], 180.0, ''),
+        ([of_pixels(lambda p: p[:, ::-1])], ['mirrored'], 'left to right', ''),
+        ([of_pixels(lambda p: p[::-1])], ['mirrored'], 'top to bottom', ''),
+        ([of_pixels(lambda p: p[::-1, ::-1])], ['rotated'], 180.0, ''),
+        ([of_pixels(np.rot90)], ['rotated'], 90.0, 'degrees counterclockwise.'),
+        ([of_pixels(lambda p: np.rot90(p, -1))], ['rotated'], 90.0, 'degrees clockwise.'),
+        # One image shows it to a few parts in a thousand, its distortion being unknown.
+        ([with_focal_length(0.8)], ['focal_length'], 'fx to 0.01', ''),
+        ([with_focal_length(1.2)], ['focal_length'], 'fx to 0.01', ''),
+        ([dark], ['no_stars'], None, ''),
+        ([capped_at_first], ['none'], None, ''),
+        # Up to 10 px they are measured; one longer than the window of 13 px is cut.
+        ([smeared(12)], ['smear'], pytest.approx(12, abs=2), 'about'),
+        ([smeared(40)], ['smear'], pytest.approx(13, abs=2), 'at least'),
+        ([of_pixels(curved)], ['not_linear'], None, ''),
+        ([of_something_else], ['unknown'], None, ''),
+        # Two mistakes.
+        ([conjugated, off(40)], ['attitude_direction', 'prior_alignment'], None, ''),
+        ([conjugated, half_turned], ['attitude_direction', 'rotated'], None, ''),
+        ([conjugated, unaligned], ['attitude_direction', 'prior_alignment'], None, ''),
+        ([conjugated, w_first], ['quaternion_order', 'attitude_direction'], None, ''),
+        ([w_first, off(6)], ['quaternion_order', 'prior_alignment'], None, ''),
+        ([w_first, unaligned], ['quaternion_order', 'prior_alignment'], None, ''),
+        ([half_turned, off(12)], ['prior_alignment'], None, ''),
+        ([late(20.0), conjugated], ['attitude_direction', 'clock'], None, ''),
+        ([late(20.0), unaligned], ['clock', 'prior_alignment'], None, ''),
+        (
+            [conjugated, of_pixels(lambda p: p[:, ::-1])],
+            ['mirrored', 'attitude_direction'],
+            None,
+            '',
+        ),
+    ],
+)
+def test_mistakes_of_a_rendered_and_of_a_real_night(
+    night: Night, catalog: StarCatalog, changes: Any, causes: list[str], value: Any, words: str
+) -> None:
+    found = found_in(together(*changes)(night), catalog)
+    assert [found.cause, *found.also] == causes
+    assert words in ' '.join([found.sentence, *found.mend])
+    if value == 'fx to 0.01':
+        value = pytest.approx(float(night.setup.prior.camera.parameters[0]), rel=0.01)
+    assert value is None or found.found == value
+
+
+@pytest.mark.parametrize('missing', [False, True])
+def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
+    right = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw)
+    tilted = with_alignment(night, Rotation.from_euler('x', 10.0, degrees=True))
+    found = found_in(unaligned(night) if missing else tilted, catalog)
+    assert found.cause == 'prior_alignment'
+    # The prior of the rendered night is off by 150 arcsec an axis; a lost principal point of 1 px
+    # would be 100 arcsec. Within the degree and a half that is searched, it will do.
+    assert isinstance(found.found, list)
+    # It goes with the principal point stated: that of the real night is off by 49 of 2656 px.
+    assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.2)
+
+
+def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog) -> None:
+    """Eighty wide spots, most of them brighter than the stars: the compact sources are known."""
+    rng = np.random.default_rng(5)
+
+    def with_corona(pixels: Any) -> Any:
+        v, u = np.indices(pixels.shape)
+        light = np.zeros(pixels.shape)
+        for _ in range(80):
+            u0, v0 = rng.uniform((0.0, 0.0), pixels.shape[::-1])
+            spread = np.exp(-((u - u0) ** 2 + (v - v0) ** 2) / (2 * 3.0**2))
+            light += 10 ** rng.uniform(1.5, 2.3) * spread
+        return np.minimum(pixels + light, 4095.0).astype(pixels.dtype)
+
+    night = with_pixels(slewing_night(), with_corona)
+    found = found_in(with_alignment(night, Rotation.from_rotvec([0.4, 0.3, 1.0])), catalog)
+    assert (found.cause, found.images) == ('prior_alignment', 3)
+
+
+@pytest.mark.parametrize(
+    ('night_of', 'late_s'),
+    [
+        *[(slewing_night, late_s) for late_s in (-47.0, -1.5, 3.0, 58.0)],
+        *[(granasat_night, late_s) for late_s in (-41.0, 33.0)],
+    ],
+)
+def test_clock(catalog: StarCatalog, night_of: Callable[[], Night], late_s: float) -> None:
+    found = found_in(with_stamps(night_of(), late_s), catalog)
+    assert found.cause == 'clock'
+    # A tenth of a second of 2 degrees a second is what the star tracker's mounting would hide.
+    # At rest, the attitudes are known for half a second before and after each image: the middle.
+    assert found.found == pytest.approx(-late_s, abs=0.1)
+
+
+def at_rest(count: int) -> Night:
+    """Images of one attitude, which all ways to read the quaternions fit."""
+    scenario = dataclasses.replace(
+        synthetic.scenario('tiny', seed=3),
+        pointing=synthetic.Inertial(((250.0, 32.0, 10.0),)),
+        image_count=count,
+    )
+    samples = [s for k in range(count) for s in synthetic.attitude_samples(scenario, k)]
+    stamps_ns = np.array([sample.time_ns for sample in samples])
+    sent = np.array([sample.icrf_from_star_tracker_xyzw for sample in samples])
+    prior = scenario.prior
+    return Night(
+        tuple(rendering.images(scenario)),
+        WireAttitudes(stamps_ns, sent),
+        set_up(prior),
+    )
+
+
+@pytest.mark.parametrize('count', [1, 4])
+def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
+    resting = at_rest(count)
+    assert found_in(resting, catalog).cause == 'none'
+    assert found_in(conjugated(resting), catalog).cause == 'attitude_direction'
+    assert found_in(turned(resting, 10), catalog).cause == 'prior_alignment'
+    # Which of the two is wrong cannot be seen: neither is blamed.
+    assert found_in(turned(conjugated(resting), 30), catalog).cause == 'unknown'
 
 
 GALACTIC = np.array(
@@ -515,94 +513,102 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
 
 
 @pytest.mark.parametrize(
-    ('change', 'causes', 'words'),
+    ('changes', 'causes', 'words'),
     [
         # Inertial axes: those with a name, two reversed, any fixed ones.
-        (in_axes(GALACTIC), ['axes'], 'in axes of the galactic system, not of the ICRF'),
-        (in_axes(erfa.ecm06(*DATE_JD)), ['axes'], 'in axes of the ecliptic of date'),
-        (in_axes(erfa.pmat76(2433282.423, 0.0)), ['axes'], 'mean equator and equinox of B1950'),
-        (in_axes(REVERSED), ['axes'], 'a frame whose x, y, z are x, -y, -z of the ICRF'),
-        (in_axes(OWN), ['axes'], 'a frame turned by 75.6 degrees about RA 63, Dec -32'),
+        ([in_axes(GALACTIC)], ['axes'], 'in axes of the galactic system, not of the ICRF'),
+        ([with_the_earth], ['axes'], 'in axes of the rotating Earth, not of the ICRF'),
+        ([in_axes(erfa.pmat06(*DATE_JD))], ['axes'], 'the mean equator and equinox of date'),
         (
-            together(in_axes(ECLIPTIC), conjugated),
+            [in_axes(erfa.pmat06(*DATE_JD)), conjugated],
             ['attitude_direction', 'axes'],
-            'ecliptic of J2',
+            'the mean equator and equinox of date',
         ),
+        ([in_axes(ECLIPTIC)], ['axes'], 'send attitudes in axes of the ICRF (J2000)'),
+        ([in_axes(erfa.ecm06(*DATE_JD))], ['axes'], 'in axes of the ecliptic of date'),
+        ([in_axes(erfa.pmat76(2433282.423, 0.0))], ['axes'], 'mean equator and equinox of B1950'),
+        ([in_axes(REVERSED)], ['axes'], 'a frame whose x, y, z are x, -y, -z of the ICRF'),
+        ([in_axes(OWN)], ['axes'], 'a frame turned by 75.6 degrees about RA 63, Dec -32'),
+        ([in_axes(ECLIPTIC), conjugated], ['attitude_direction', 'axes'], 'ecliptic of J2'),
         # Orders and signs of the numbers: reversed order, one sign, left-handed axes, exchanged.
+        ([sent_as([3, 2, 1, 0])], ['quaternion_order'], 'of the attitudes hold w, z, y, x.'),
+        ([ONE_SIGN], ['quaternion_order'], 'hold x, y, -z, w.'),
+        ([LEFT_HANDED], ['quaternion_order'], 'hold -x, -y, z, w.'),
+        ([sent_as([1, 0, 2, 3])], ['quaternion_order'], 'hold y, x, z, w.'),
         (
-            sent_as([3, 2, 1, 0]),
-            ['quaternion_order'],
-            'of the attitudes hold w, z, y, x.',
-        ),
-        (ONE_SIGN, ['quaternion_order'], 'hold x, y, -z, w.'),
-        (LEFT_HANDED, ['quaternion_order'], 'hold -x, -y, z, w.'),
-        (sent_as([1, 0, 2, 3]), ['quaternion_order'], 'hold y, x, z, w.'),
-        (
-            together(LEFT_HANDED, lambda n: with_pixels(n, lambda p: p[:, ::-1])),
+            [LEFT_HANDED, of_pixels(lambda p: p[:, ::-1])],
             ['mirrored', 'quaternion_order'],
             'mirrored left to right',
         ),
         # Without an alignment two explain the stars equally, and both are named.
         (
-            together(ONE_SIGN, unaligned),
+            [ONE_SIGN, unaligned],
             ['quaternion_order'],
             'hold x, y, -z, w, or are inertial_to_st (x, y, z, w) in axes of a frame whose x',
         ),
-        (frozen, ['frozen_attitude'], 'The attitudes stay the same while the stars turn by'),
-        (inverse_alignment, ['prior_alignment'], 'the inverse of it: camera from star tracker'),
-        (of_camera, ['prior_alignment'], 'the attitudes are those of the camera itself'),
+        ([frozen], ['frozen_attitude'], 'The attitudes stay the same while the stars turn by'),
+        ([inverse_alignment], ['prior_alignment'], 'the inverse of it: camera from star tracker'),
+        ([of_camera], ['prior_alignment'], 'the attitudes are those of the camera itself'),
         # The camera matrix.
-        (with_centre(0.3, 0.2), ['principal_point'], 'The principal point of the prior camera'),
+        ([with_centre(0.3, 0.2)], ['principal_point'], 'The principal point of the prior camera'),
         (
-            together(with_centre(0.3, 0.2), lambda n: turned(n, 40)),
+            [with_centre(0.3, 0.2), off(40)],
             ['principal_point', 'prior_alignment'],
             'prior_alignment points',
         ),
         (
-            together(with_centre(0.1, -0.05), conjugated),
+            [with_centre(0.1, -0.05), conjugated],
             ['attitude_direction', 'principal_point'],
             'The principal point',
         ),
         (
-            together(region(0.25, 0.95, 0.1, 0.8), with_size),
+            [region(0.25, 0.95, 0.1, 0.8), with_size],
             ['principal_point'],
             'a camera matrix of the whole detector with the size of a region looks so',
         ),
-        (region(0.25, 0.95, 0.1, 0.8), ['wrong_size'], 'a region of the detector (roi of Camera'),
+        (
+            [region(0.25, 0.95, 0.1, 0.8)],
+            ['wrong_size'],
+            'a region of the detector (roi of',
+        ),
         # Half as wide and high, but no bins: the stars tell.
-        (region(0.4, 0.9, 0.1, 0.6), ['wrong_size'], 'a region of the detector (roi of CameraInf'),
-        (binned, ['wrong_size'], 'binned 2 x 2 (binning_x, binning_y of CameraInfo)'),
         (
-            together(binned, with_size),
-            ['focal_length'],
-            'is of pixels before 2 x 2 binning',
+            [region(0.4, 0.9, 0.1, 0.6)],
+            ['wrong_size'],
+            'a region of the detector (roi of',
         ),
-        (
-            together(binned, lambda n: turned(n, 40)),
-            ['wrong_size', 'prior_alignment'],
-            'prior_alignment points',
-        ),
-        (lambda n: with_pixels(n, lambda p: p.T), ['mirrored', 'rotated'], 'sides are those'),
+        ([binned], ['wrong_size'], 'binned 2 x 2 (binning_x, binning_y of CameraInfo)'),
+        ([binned, with_size], ['focal_length'], 'is of pixels before 2 x 2 binning'),
+        ([binned, off(40)], ['wrong_size', 'prior_alignment'], 'prior_alignment points'),
+        ([of_pixels(lambda p: p.T)], ['mirrored', 'rotated'], 'sides are those'),
+        ([of_pixels(expanded)], ['not_linear'], 'a tone curve that they never had'),
+        # One shape of all stars: discs and rings of a lens out of focus, comets, and as wide that
+        # the images are identified in bins of pixels only. None where they are measured.
+        ([blurred(disc(4.0, 2.0))], ['one_shape'], 'All stars are wide discs or rings alike'),
+        ([blurred(disc(5.0))], ['one_shape'], 'focus the lens'),
+        ([blurred(disc(8.0), 'no_match')], ['one_shape'], 'in bins of 4 x 4 pixels only'),
+        ([blurred(disc(9.0, 5.0), 'no_match')], ['one_shape'], 'in bins of 4 x 4 pixels only'),
+        ([blurred(comet)], ['one_shape'], 'All stars are elongated alike, '),
+        ([blurred(disc(4.0, 2.0)), conjugated], ['attitude_direction'], 'quaternions are'),
+        ([blurred(disc(3.0), '')], [], 'Attitudes, alignment and camera fit the images.'),
         # What a calibration can take up is nobody's mistake.
-        (with_centre(0.03, 0.0), [], 'Attitudes, alignment and camera fit the images.'),
+        ([with_centre(0.03, 0.0)], [], 'Attitudes, alignment and camera fit the images.'),
         (
-            lambda n: with_setup(
-                n, frames=dataclasses.replace(n.setup.frames, star_tracker_frame='')
-            ),
+            [without_tracker],
             [],
             'The images show stars of the catalog; no camera and no attitudes are stated.',
         ),
     ],
 )
 def test_a_mistake_is_named_and_nothing_else(
-    change: Callable[[Night], Night],
+    changes: Sequence[Callable[[Night], Night]],
     causes: list[str],
     words: str,
     catalog: StarCatalog,
 ) -> None:
-    found = found_in(change(slewing_night()), catalog)
+    found = found_in(together(*changes)(slewing_night()), catalog)
     assert [found.cause, *found.also] == (causes or ['none'])
-    assert words in ' '.join([found.sentence, *found.evidence])
+    assert words in ' '.join([found.sentence, *found.evidence, *found.mend])
     assert bool(found.mend) == bool(causes)
     assert not {'unknown', 'none'} & {*found.also}
 
@@ -649,18 +655,6 @@ def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: St
     found = found_in(with_stamps(of_a_day, late_s), catalog)
     assert found.cause == 'clock' and words in ' '.join(found.evidence)
     assert found.found == pytest.approx(-late_s, abs=0.1)  # as in `test_clock`
-
-
-def test_a_tone_curve_that_was_undone_but_never_there(catalog: StarCatalog) -> None:
-    """Linear pixels of 8 bits that were read as sRGB, with stars that stand out."""
-
-    def expanded(pixels: Any) -> Any:
-        light = np.clip((pixels.astype(float) - np.median(pixels)) / pixels.max(), 0.0, 1.0)
-        noise = np.random.default_rng(0).normal(100.0, 2.0, pixels.shape)
-        return (noise + 60000.0 * light**2.2).clip(0, 65535).astype(np.uint16)
-
-    found = found_in(with_pixels(slewing_night(), expanded), catalog)
-    assert found.cause == 'not_linear' and 'a tone curve that they never had' in found.sentence
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,13 @@ from pathlib import Path
 import re
 import shutil
 
-from mission_files import frames_of, images, TINY, write_encoded, write_pngs  # type: ignore[import-not-found]
+from mission_files import attitudes, frames_of, images, TINY, write_encoded, write_pngs, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 
@@ -30,13 +28,8 @@ LENS = ('--focal-length-mm', '18', '--pixel-size-um', '10')  # of this camera, w
 
 def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
     """The bag with attitudes that are late, or inverted (-1): from ICRF to the star tracker."""
-    with BagWriter(path) as writer:
-        for raw in reader.read_raw([TINY], [ATTITUDES]):
-            time_ns, xyzw = attitude_from_message(reader.decode(raw))
-            time_ns += shift_s * 10**9
-            writer.write_attitude(ATTITUDES, time_ns, xyzw * [sign, sign, sign, 1], 'star_tracker')
-        for image in images():
-            writer.write_image(IMAGES, image, 'camera')
+    samples = ((ns + shift_s * 10**9, q * [sign, sign, sign, 1]) for ns, q in attitudes())
+    write_tiny(path, images(), samples)
     return path
 
 
