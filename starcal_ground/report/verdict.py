@@ -12,14 +12,9 @@ import numpy as np
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import (
-    of_held,
-    REMEDIES,
-    remedy_against,
-    requirement_answers,
-    REQUIREMENTS,
-)
-from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.assessment.gate import of_held
+from starcal_ros.assessment.remedies import REMEDIES, remedy_against
+from starcal_ros.assessment.requirements import QUANTITIES, requirement_answers, REQUIREMENTS
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.text import p_value_text, significant, to_sigma
@@ -35,13 +30,15 @@ _MATTERS = 0.05  # fraction of the variance
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
 
 
-_UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
-    'focal_temperature_1': ' /degC',
-    'focal_temperature_2': ' /degC²',
-    'tau_x': ' rad',
-    'tau_y': ' rad',
+_UNITS = {
+    **{name: quantity.units[0] for name, quantity in QUANTITIES.items()},
+    **{f'{name}_temperature': 'arcsec/degC' for name in records.ALIGNMENT_NAMES},
+    'focal_temperature_1': '/degC',
+    'focal_temperature_2': '/degC²',
+    'tau_x': 'rad',
+    'tau_y': 'rad',
 }
-"""By parameter; the coefficients of the lens have none."""
+"""By parameter; other coefficients of the lens have none."""
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
@@ -139,34 +136,21 @@ def in_sentences(calibration: records.Calibration) -> list[str]:
 
 
 def next_step(calibration: records.Calibration) -> str:
-    """The measures against the largest causes of the sigma; a reason to refuse has its own."""
+    """
+    The measure that lowers a missed requirement, or else a sigma most; empty if there is none.
+
+    A reason to refuse has its own remedy.
+    """
     if calibration.accepted:
-        return ' '.join(_against_sigma(calibration))
-    failed = {check.option for check in calibration.gate if check.passed is False}
-    text = (
+        return ' '.join(f'To lower a sigma most, {row}.' for row in calibration.statements[:1])
+    failed = [check for check in calibration.gate if check.passed is False]
+    if {check.option for check in failed} == {REQUIREMENTS}:
+        # Behind the first semicolon of the note is the remedy of the largest cause.
+        steps = dict.fromkeys(filter(None, (one.note.partition('; ')[2] for one in failed)))
+        return f'{"; ".join(["The sigmas hold, but miss a requirement", *steps])}.'
+    return (
         'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'
     )
-    if failed == {REQUIREMENTS}:
-        text = 'The sigmas hold, but miss a requirement.'
-    steps = _against_sigma(calibration) if REQUIREMENTS in failed else []
-    return ' '.join([text, *steps])
-
-
-def _against_sigma(calibration: records.Calibration) -> list[str]:
-    """A sentence with the measure against the largest cause of each sigma."""
-    causes = parts_that_matter(calibration.sigma_budget)[1:]
-    if not causes:
-        return []
-    steps = []
-    scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
-    for scope, of in scopes if calibration.has_alignment else scopes[:1]:
-        largest = max(causes, key=lambda part: getattr(part, of))
-        remedy = remedy_against(largest.cause)
-        if remedy:
-            steps.append(
-                f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
-            )
-    return steps + [f'To lower a sigma most, {row}.' for row in calibration.statements[:1]]
 
 
 @dataclass(frozen=True)
@@ -272,7 +256,7 @@ def parameter_rows(
         rows.append(
             Row(
                 name=name,
-                unit='px' if name in INTRINSIC_NAMES else '',
+                unit=_UNITS.get(name, ''),
                 value=to_sigma(camera.parameters[k], sigma[k]),
                 sigma=held + (significant(sigma[k], 2) if known else ''),
                 prior=significant(prior.camera.parameters[k], 8) if prior else '',
@@ -352,7 +336,7 @@ def sigma_text(name: str, sigma: float) -> str:
     """1-sigma of a parameter with its unit."""
     if not math.isfinite(sigma):
         return 'unobservable'
-    if name.startswith('alignment'):
-        per = '/degC' if name.endswith('_temperature') else ''
-        return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
-    return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
+    unit = _UNITS.get(name, '')
+    if unit.startswith('arcsec'):
+        return f'{sigma / ARCSECOND_RAD:.2f} {unit}'
+    return f'{significant(sigma, 2)} {unit}'.rstrip()

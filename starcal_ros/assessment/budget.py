@@ -122,7 +122,7 @@ def statements(
         for scope, of in scopes if option else ():
             before, gone = getattr(total, of), getattr(part, of)
             after = math.sqrt(max(before**2 - (1.0 - left) * gone**2, 0.0))
-            rows.append(Statement(option, value, scope, before, after))
+            rows.append(Statement(option, value, scope, before, after, part.cause))
     by_option: dict[str, Statement] = {}
     for row in sorted(rows, key=lambda row: row.after_arcsec / max(row.before_arcsec, 1e-300)):
         if row.after_arcsec < _WORTH_STATING * row.before_arcsec:

@@ -430,7 +430,8 @@ class Statement:
     A value of a data sheet that no option states, with the 1-sigma before and after stating it.
 
     ``scope`` is ``pointing``, lines of sight in the star tracker frame, or ``camera``, those of
-    the camera alone, RMS over the detector; ``value`` is what the option would be set to.
+    the camera alone, RMS over the detector; ``value`` is what the option would be set to, and
+    ``cause`` the `SigmaPart` that it lowers, empty where not recorded.
 
     >>> str(Statement('star_tracker_slow_arcsec', '5', 'pointing', 77.0, 11.0))
     'state star_tracker_slow_arcsec: pointing 77″ becomes 11″ if it is 5'
@@ -441,12 +442,17 @@ class Statement:
     scope: str
     before_arcsec: float
     after_arcsec: float
+    cause: str = ''
+
+    @property
+    def gain(self) -> str:
+        """The sigmas in words."""
+        before, after = (significant(s, 2) for s in (self.before_arcsec, self.after_arcsec))
+        return f'{before}″ becomes {after}″ if it is {self.value}'
 
     def __str__(self) -> str:
         """Sentence for a user."""
-        before, after = (significant(s, 2) for s in (self.before_arcsec, self.after_arcsec))
-        text = f'state {self.option}: {self.scope} {before}″ becomes {after}″'
-        return f'{text} if it is {self.value}'
+        return f'state {self.option}: {self.scope} {self.gain}'
 
 
 @dataclass(frozen=True, eq=False, repr=False)

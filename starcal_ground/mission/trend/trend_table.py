@@ -27,8 +27,8 @@ import numpy as np
 
 from starcal_ros import untrusted
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import requirement_answers
 from starcal_ros.assessment.lookup import Derivatives
+from starcal_ros.assessment.requirements import requirement_answers
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import ProductError

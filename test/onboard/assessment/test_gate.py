@@ -159,7 +159,7 @@ def test_a_good_calibration_passes() -> None:
             (f'line_of_sight={SIGHT_ARCSEC}arcsec',),
             ('line_of_sight=1.9arcsec',),
             (
-                'largest 1-sigma of a line of sight is 2 arcsec, over the limit of 1.9 arcsec '
+                'largest 1-sigma of line_of_sight is 2 arcsec, over the limit of 1.9 arcsec '
                 '(requirements); missed by 0.1 arcsec; state the velocity (topic, '
                 'observer_velocity_m_s; photographs: observer)'
             ),
