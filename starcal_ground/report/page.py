@@ -356,7 +356,6 @@ def charts_of(
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, svg.Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
-        'distortion': detector_figures.distortion_magnitude(camera),
         'sky': detector_figures.pointings(observations, geometry),
     }
     if prior is not None:
@@ -370,7 +369,6 @@ def charts_of(
     if calibration.sigma_budget:
         parts = verdict.parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
-        charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if residuals is not None and residuals.used.any():
         charts |= _residual_charts(calibration, residuals)
         if prior is not None:
@@ -384,7 +382,6 @@ def _residual_charts(
     camera = calibration.geometry.camera
     sigma_arcsec = calibration.star_tracker_sigma_arcsec
     return {
-        'coverage': detector_figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
         'field': detector_figures.mean_residuals(residuals, camera),
         'histogram': figures.histogram(residuals),

@@ -35,10 +35,8 @@ from starcal_ros.ros.archive import Archive
 from starcal_ros.text import significant
 
 FIGURES = (
-    'coverage',
     'cells',
     'vectors',
-    'distortion',
     'change',
     'sky',
     'before',
@@ -50,7 +48,6 @@ FIGURES = (
     'colour',
     'phase',
     'budget',
-    'causes',
     'line_of_sight',
     'shape',
     'alignment',
