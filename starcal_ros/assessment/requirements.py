@@ -38,7 +38,8 @@ REQUIREMENTS, _NONE = 'requirements', 'none'
 LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
 FOCAL_LENGTHS = ('fx', 'fy')
 _LARGEST, _RMS = 'largest ', 'rms '  # over the detector
-_FORM = re.compile(r'\s*(\w+)\s*=\s*([\d.]+(?:e-?\d+)?)\s*([a-z]*)\s*(?:@\s*([\d.]+)\s*%\s*)?')
+_NUMBER = r'((?:\d+\.?\d*|\.\d+)(?:e-?\d+)?)'
+_FORM = re.compile(rf'\s*(\w+)\s*=\s*{_NUMBER}\s*([a-z]*)\s*(?:@\s*{_NUMBER}\s*%\s*)?')
 
 
 @dataclass(frozen=True)
@@ -155,10 +156,7 @@ class Requirement:
             over = f'@{percent}%' if percent and has_share else ''
             written = ' or '.join(f'{name}={number}{known}{over}' for known in quantity.units)
             raise OptionError(f'{REQUIREMENTS}: {text}: the unit does not fit: write {written}')
-        try:
-            limit, share = float(number), float(percent or 100.0) / 100.0
-        except ValueError as error:
-            raise OptionError(f'{REQUIREMENTS}: {text}: not a number') from error
+        limit, share = float(number), float(percent or 100.0) / 100.0
         if percent and not has_share:
             raise OptionError(
                 f'{REQUIREMENTS}: {text}: only line_of_sight and map are over a share'

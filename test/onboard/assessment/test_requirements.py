@@ -142,7 +142,7 @@ def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
         ('line_of_sight=5px', 'write line_of_sight=5arcsec'),
         ('map=5', 'write map=5arcsec or map=5px'),
         ('k1=1px', 'write k1=1'),
-        ('f=0.1.2px', 'not a number'),
+        ('f=0.1.2px', 'is not of the form'),
         ('f=0.1px@98%', 'only line_of_sight and map are over a share'),
         ('map=0px', 'finite and above 0, and the share at most 100 %'),
         ('map=1e999px', 'finite and above 0'),
