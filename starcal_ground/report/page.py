@@ -211,7 +211,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'observations': observations,
         'refused_images': Counter(calibration.images_refused).most_common(),
         'refused_stars': [one for one in refused_stars.most_common() if one[1]],
-        'model_rows': verdict.model_rows(calibration),
+        'model_sentences': verdict.model_sentences(calibration),
         'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
         'pictures': {one.time_ns: one for one in pictures if not one.is_expected},
         'options': _options(calibration),

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -12,11 +12,8 @@ import numpy as np
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import of_held
-from starcal_ros.assessment.remedies import REMEDIES, remedy_against
 from starcal_ros.assessment.requirements import QUANTITIES, requirement_answers, REQUIREMENTS
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
@@ -153,79 +150,27 @@ def next_step(calibration: records.Calibration) -> str:
     )
 
 
-@dataclass(frozen=True)
-class ModelRow:
-    """An assumption, what the stars show of it, its p-value as text and the remedy if it fails."""
-
-    assumption: str
-    found: str
-    p_value: str
-    remedy: str
-
-
-def model_rows(calibration: records.Calibration) -> list[ModelRow]:
-    """Rows for the assumptions that a calibration tested; none of one that tested none."""
+def model_sentences(calibration: records.Calibration) -> list[str]:
+    """Sentences on the field, a camera without it, and changes; none where not recorded."""
     checks = calibration.model_checks
     if checks is None:
         return []
-    step, cost_px = checks.step, calibration.zero_skew_cost_px
     minutes = (calibration.time_ns - calibration.first_image_ns) / NANOSECONDS_PER_SECOND / 60
-    field = (
-        f'field of {_px(checks.field_rms_px)} rms per axis, at most {_px(checks.field_worst_px)}'
-    )
+    field = f'{_px(checks.field_rms_px)} rms per axis, at most {_px(checks.field_worst_px)}'
     if checks.field_worst_px < VISIBLE_PX:
-        field = f'field of {_px(checks.field_worst_px)} everywhere'
+        field = f'{_px(checks.field_worst_px)} everywhere'
+    cost, varies = _px(calibration.zero_skew_cost_px), _px(checks.image_variation_px)
+    mean = f'the mean over the {significant(minutes, 2)} minutes of the images'
     return [
-        ModelRow(
-            'The lens model describes the lens',
-            f'{field}; camera_info, without field and skew, differs from the calibration by at '
-            f'most {_px(cost_px)}',
-            '',
-            'choose another lens_model; for lines of sight with the field use starcal lookup',
-        ),
-        *_held(checks.held),
-        ModelRow(
-            'The detector has no step',
-            f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
-            _p(step.p_value),
-            REMEDIES['detector step'],
-        ),
-        ModelRow(
-            'The camera is the same in all images',
-            f'varies by {_px(checks.image_variation_px)} in a corner; the calibration is that of'
-            f' the mean over the {significant(minutes, 2)} minutes of the images',
-            '',
-            remedy_against(CHANGE),
-        ),
+        f'Field in addition to the lens model: {field}; another lens_model may lower it.',
+        f'camera_info, without field and skew, differs from the calibration by at most {cost}.',
+        'For lines of sight with the field use starcal lookup.',
+        f'The camera varies by {varies} in a corner; the calibration is that of {mean}.',
     ]
-
-
-def _held(held: Sequence[records.HeldTerm]) -> Iterator[ModelRow]:
-    """One row for each value that the stars contradict, and one for all others together."""
-    agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
-    for term in held:
-        if term.significance >= INFORMATIVE_SIGMAS:
-            note, remedy = of_held(term)
-            yield ModelRow(
-                f'{term.name} is as assumed',
-                f'{note}: {term.significance:.1f} sigma of the difference',
-                _p(math.erfc(term.significance / math.sqrt(2))),
-                remedy,
-            )
-    if agreeing:
-        names = ', '.join(f'{term.name} is {significant(term.assumed, 6)}' for term in agreeing)
-        worst = max(term.significance for term in agreeing)
-        found = f'the stars agree, within {worst:.1f} sigma of the difference'
-        yield ModelRow(names, found, _p(math.erfc(worst / math.sqrt(2))), '')
 
 
 def _px(value: float) -> str:
     return f'less than {VISIBLE_PX:g} px' if value < VISIBLE_PX else f'{significant(value, 3)} px'
-
-
-def _p(value: float) -> str:
-    """A p-value as text; empty where nothing was tested."""
-    return '' if math.isnan(value) else p_value_text(value)
 
 
 @dataclass(frozen=True)

@@ -371,16 +371,11 @@ def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
     )
     if math.isnan(term.significance):
         return dataclasses.replace(check, passed=None, note=_NOT_BY_STARS)
-    note, remedy = of_held(term)
-    return dataclasses.replace(check, note=note if check.passed else f'{note}; {remedy}')
-
-
-def of_held(term: HeldTerm) -> tuple[str, str]:
-    """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
-    test = prior_test_of(term.name)
-    estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
-    note = f'{estimated} by the stars, {assumed} assumed'
-    return f'the stars add {estimated} to it' if test.is_added else note, test.remedy
+    test, estimated = prior_test_of(term.name), significant(term.estimated, 6)
+    note = f'{estimated} by the stars, {significant(term.assumed, 6)} assumed'
+    if test.is_added:
+        note = f'the stars add {estimated} to it'
+    return dataclasses.replace(check, note=note if check.passed else f'{note}; {test.remedy}')
 
 
 def _group(part: ResidualBin) -> str:

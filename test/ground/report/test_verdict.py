@@ -99,6 +99,38 @@ def test_the_next_step_is_the_remedy_of_the_requirement_that_is_missed(
         assert verdict.next_step(dataclasses.replace(judged, statements=())) == ''
 
 
+@pytest.mark.parametrize(
+    ('worst_px', 'variation_px', 'field', 'varies'),
+    [
+        (0.86, 0.02, '0.25 px rms per axis, at most 0.86 px', '0.02 px'),
+        (1e-4, 4e-6, 'less than 0.001 px everywhere', 'less than 0.001 px'),
+    ],
+)
+def test_a_length_that_no_image_shows_has_no_digits(
+    tiny_products: Path, worst_px: float, variation_px: float, field: str, varies: str
+) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    assert calibration.model_checks is not None
+    checks = dataclasses.replace(
+        calibration.model_checks,
+        field_rms_px=0.25,
+        field_worst_px=worst_px,
+        image_variation_px=variation_px,
+    )
+    first_ns = calibration.time_ns - 540 * 10**9
+    shown = dataclasses.replace(
+        calibration, model_checks=checks, zero_skew_cost_px=0.5, first_image_ns=first_ns
+    )
+    mean = 'the calibration is that of the mean over the 9 minutes of the images'
+    assert verdict.model_sentences(shown) == [
+        f'Field in addition to the lens model: {field}; another lens_model may lower it.',
+        'camera_info, without field and skew, differs from the calibration by at most 0.5 px.',
+        'For lines of sight with the field use starcal lookup.',
+        f'The camera varies by {varies} in a corner; {mean}.',
+    ]
+    assert verdict.model_sentences(dataclasses.replace(shown, model_checks=None)) == []
+
+
 def test_the_summary_is_a_line() -> None:
     terms = TemperatureTerms(
         20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
