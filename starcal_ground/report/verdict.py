@@ -63,9 +63,7 @@ def check_rows(
         if check.unit == 'sigma' and value and math.isfinite(check.found):
             value = f'{check.found:.1f} sigma'
             note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
-        if note == 'no limit is set':
-            limit = 'none'
-        elif check.option:
+        if check.option:
             limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
         rows.append((check, _RESULTS[check.passed], value, limit, note))
     return rows
