@@ -47,9 +47,17 @@ class Quantity:
     """
     A 1-sigma that may be limited, or lowered by a plan.
 
-    ``sigma`` returns it by calibration and unit, NaN where it is not estimated; of one that is
-    the largest over the detector, all its values.  ``of_camera`` and ``of_alignment`` state
-    whether the camera alone and the alignment contribute to it.
+    Attributes
+    ----------
+    units : tuple of str
+        Units of a limit, the default first; empty text for a pure number.
+    sigma : callable
+        Returns it by calibration and unit, NaN where it is not estimated; all values over the
+        detector if ``statistic`` is their largest.
+    statistic : str
+        `_LARGEST` or `_RMS` over the detector; empty for a parameter.
+    of_camera, of_alignment : bool
+        True if the camera alone, or the alignment, contributes to it.
     """
 
     units: tuple[str, ...]
@@ -114,7 +122,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     **{name: _parameters('arcsec', name, of_alignment=True) for name in ALIGNMENT_NAMES},
     **{name: _parameters('', name) for lens in LENSES.values() for name in lens.coefficients},
 }
-"""Name -> what it is; `Requirement` describes them."""
+"""Name -> row; `Requirement` describes each."""
 
 
 @dataclass(frozen=True)
