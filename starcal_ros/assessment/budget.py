@@ -182,26 +182,23 @@ class _Seen:
 def _seen(estimate: Estimate) -> tuple[_Seen, Floats]:
     """Return the effect of the shared unknowns, and that (2 + n,) of a displaced pixel."""
     camera = estimate.geometry.camera
-    grid = grid_derivatives(camera)
-    common = common_rotation(camera, grid)
-    means, of_pixel = mean_squares(estimate, grid)
+    means, of_pixel = mean_squares(estimate)
     found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
     layout = estimate.linear.layout
     J = np.zeros((len(found.J), 3, layout.count))
-    J[:, :, layout.line_of_sight_at] = np.nan_to_num(found.of_shape(camera, common))
+    J[:, :, layout.line_of_sight_at] = np.nan_to_num(found.of_shape(camera))
     by_pixel = np.nan_to_num((found.by_pixel**2).sum(axis=(1, 2)))
     return _Seen(means, J), np.concatenate([[of_pixel, of_pixel], by_pixel])
 
 
-def mean_squares(estimate: Estimate, grid: Derivatives | None = None) -> tuple[Floats, float]:
+def mean_squares(estimate: Estimate) -> tuple[Floats, float]:
     """
     Return the mean of ``J' J`` over the detector for map and pointing, (2, P, P).
 
-    By the shared unknowns; with that of a displacement of the pixel along both axes.  ``grid``:
-    the `grid_derivatives` of the camera, where they are at hand.
+    By the shared unknowns; with that of a displacement of the pixel along both axes.
     """
     camera, layout = estimate.geometry.camera, estimate.linear.layout
-    grid = grid or grid_derivatives(camera)
+    grid = grid_derivatives(camera)
     common, seen = common_rotation(camera, grid), np.isfinite(grid.directions[:, 0])
     squares = np.zeros((2, layout.count, layout.count))
     rows = estimate.linear.layout.line_of_sight_at
