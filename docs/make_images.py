@@ -26,7 +26,7 @@ from starcal_ground.cli import main as cli
 from starcal_ground.products import write_camera_info
 from starcal_ground.report.detector_figures import (
     cell_counts,
-    distortion_magnitude,
+    detector_map,
     distortion_vectors,
     star_cloud,
 )
@@ -36,6 +36,7 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats, Picture
 from starcal_ros.assessment.observability import coverage
+from starcal_ros.camera import distortion_px, pixel_grid
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe as observing
@@ -141,9 +142,10 @@ def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     calibration = solve.solve(ensemble, setup)
     camera = calibration.geometry.camera
     stars = np.concatenate([observed.measured_px for observed in ensemble.images])
+    length_px = np.hypot(*distortion_px(camera, pixel_grid(camera, 60, 48)).T).reshape(48, 60)
     drawn = sheet(
         [
-            [distortion_vectors(camera).svg, distortion_magnitude(camera).svg],
+            [distortion_vectors(camera).svg, detector_map(length_px, camera, ' px')],
             [star_cloud(stars, camera), cell_counts(coverage(ensemble, camera), camera).svg],
         ],
         f'distortion; {calibration.stars_used} stars in {calibration.images_used} images',

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.topics import OnImage, Topics, Wanted
-from starcal_ros.assessment.gate import REQUIREMENTS
 from starcal_ros.assessment.predictions import Residuals
+from starcal_ros.assessment.requirements import REQUIREMENTS
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import check_site, Setup

@@ -21,11 +21,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from starcal_ground.report import svg
-from starcal_ground.report.detector_figures import (
-    distortion_magnitude,
-    distortion_vectors,
-    star_cloud,
-)
+from starcal_ground.report.detector_figures import detector_map, distortion_vectors, star_cloud
 from starcal_ground.report.figures import outline
 from starcal_ground.report.svg import Curve, Drawing, Panel, plot, SERIES, sheet
 from starcal_ground.simulation.rendering import fixed_pattern, render
@@ -281,10 +277,12 @@ def page(found: PaperStudy, software: str) -> str:
 
 def svgs(found: PaperStudy) -> Mapping[str, str]:
     """Text of the SVG file of each figure, by name."""
-    distortion = [distortion_vectors(found.camera).svg, distortion_magnitude(found.camera).svg]
+    camera = found.camera
+    length_px = np.hypot(*distortion_px(camera, pixel_grid(camera, 60, 48)).T).reshape(48, 60)
+    distortion = [distortion_vectors(camera).svg, detector_map(length_px, camera, ' px')]
     stars = f'{found.stars:,} star centroids in {found.images - found.refused} images'
     drawn = {
-        'figure_5': sheet([[star_cloud(found.judged.measured_px, found.camera)]], stars),
+        'figure_5': sheet([[star_cloud(found.judged.measured_px, camera)]], stars),
         'figure_6': sheet([distortion], 'distortion: vectors, enlarged, and magnitude'),
         'figure_7': sheet([[_images(found), _histogram(found)], [_plane(found), _counts(found)]]),
     }

@@ -368,9 +368,9 @@ def _with_odd_rows_shifted(pixels: Pixels, size: int) -> Pixels:
 
 
 _FIELD = ('residual over predicted sigma',)
-_LARGE = (*_FIELD, '1-sigma of the distortion map')
+_LARGE = (*_FIELD, '1-sigma of map')
 _CHANGE = ('image to image',)
-_WANDER = ('1-sigma of a line of sight',)
+_WANDER = ('1-sigma of line_of_sight',)
 _LENSES = partial(_by_lens, (0, 1))
 _LENSES_ABBBA = partial(_by_lens, _ABBBA)
 WORLDS = (

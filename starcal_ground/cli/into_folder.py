@@ -76,7 +76,7 @@ def calibrate_into(
 
     Also returns where the report is, or why there is none.
     """
-    album, drawings = thumbnails.Album(source.image_count, source.setup), Drawings()
+    album, drawings = thumbnails.Album(source.setup), Drawings()
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
         with drawings.kind('pictures of images'):

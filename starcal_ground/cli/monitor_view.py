@@ -17,7 +17,7 @@ from rich.text import Text
 
 from starcal_ground.report import verdict
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import REQUIREMENTS
+from starcal_ros.assessment.requirements import REQUIREMENTS
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
 from starcal_ros.text import counted, printable

@@ -21,7 +21,7 @@ from starcal_ground.bags.topics import Topics
 from starcal_ground.blind.images import LOOKED_AT
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
 from starcal_ground.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
-from starcal_ros.assessment.gate import REMEDIES
+from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.pipeline.observe import check_order

@@ -24,8 +24,19 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.campaign import Campaign
 from starcal_ros.arrays import Floats, Indices, Mask
-from starcal_ros.assessment import gate
 from starcal_ros.assessment.budget import mean_squares
+from starcal_ros.assessment.gate import reasons_of
+from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.requirements import (
+    FOCAL,
+    FOCAL_LENGTHS,
+    LINE_OF_SIGHT,
+    MAP,
+    POINTING,
+    QUANTITIES,
+    REQUIREMENTS,
+    requirements_of,
+)
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.calibrate import Estimate
@@ -44,7 +55,6 @@ from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, GateCheck, StarObservations
 from starcal_ros.text import significant
 
-MAP, LINE_OF_SIGHT = 'map', 'line_of_sight'
 _GROUPS = 20  # each group of neighbours in magnitude has a twentieth of the information
 _ROUNDING = float(np.finfo(float).eps)  # held unknowns have no variance
 _SHOWN = 4.0  # 2 log L of a variance that the stars show: two sigma
@@ -74,24 +84,28 @@ class Target:
 
 def target(estimate: Estimate, name: str) -> Target:
     """
-    Return the sigma of a name.
+    Return the sigma of a name of `QUANTITIES`, or of another unknown by its label.
 
-    ``line_of_sight``: of directions in the star tracker frame, RMS over the detector; ``map``: the
-    same without the rotation common to the detector; or a camera parameter or alignment angle.
+    Sigmas over the detector, and that of both focal lengths, are RMS: ``line_of_sight`` is
+    ``pointing`` then.
 
     Raises OptionError if nothing that is estimated has this name.
     """
     layout = estimate.linear.layout
-    if name in (MAP, LINE_OF_SIGHT):
+    if name in (MAP, LINE_OF_SIGHT, POINTING):
         (of_map, of_pointing), of_pixel = mean_squares(estimate)
         unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
         squares = of_map if name == MAP else of_pointing
         return Target(f'{name}_arcsec', squares, unresolved, ARCSECOND_RAD)
-    if name not in layout.labels:
-        allowed = ', '.join([LINE_OF_SIGHT, MAP, *layout.labels[: layout.field_at[0]]])
+    labels = FOCAL_LENGTHS if name == FOCAL else (name,)
+    if not {*labels} <= {*layout.labels}:
+        known = {LINE_OF_SIGHT, MAP, POINTING, FOCAL, *layout.labels}
+        allowed = ', '.join(name for name in QUANTITIES if name in known)
         raise OptionError(f'{name!r} is not estimated; a sigma to lower is one of: {allowed}')
-    of_name = np.equal(layout.labels, name).astype(np.float64)
-    return Target(name, np.diag(of_name), 0.0, 1.0)
+    of_name = np.isin(layout.labels, labels) / len(labels)
+    unit = QUANTITIES[name].units[0] if name in QUANTITIES else ''
+    scale = ARCSECOND_RAD if unit == 'arcsec' else 1.0
+    return Target('_'.join(filter(None, [name, unit])), np.diag(of_name), 0.0, scale)
 
 
 def expected_noise_px2(estimate: Estimate, magnitude: Floats) -> Floats:
@@ -303,14 +317,13 @@ class Request:
     """
     Wishes and bounds of a plan.
 
-    ``minimise`` is ``line_of_sight``, ``map``, or a camera parameter or alignment angle; see
-    `target`.  ``pointings`` are allowed, each at most once; empty: any of
-    ``within``.  No boresight comes into ``avoid``, as the Sun, the Moon and the Earth.  A slew is
-    between the boresights of one image and the next.
+    ``minimise`` is the name of a requirement, see `target`.  ``pointings`` are allowed, each at
+    most once; empty: any of ``within``.  No boresight comes into ``avoid``, as the Sun, the Moon
+    and the Earth.  A slew is between the boresights of one image and the next.
     """
 
     images: int
-    minimise: str = 'line_of_sight'
+    minimise: str = LINE_OF_SIGHT
     pointings: tuple[Pointing, ...] = ()
     within: Cone = Cone(0.0, 0.0, 180.0)
     avoid: tuple[Cone, ...] = ()
@@ -471,22 +484,21 @@ def with_images_to_reach(campaign: Campaign) -> Campaign:
 
     The sigma that a plan lowers is an RMS: a requirement over a share falls in proportion.
     """
-    wanted = iter(gate.requirements_of(campaign.setup.gate.requirements))
+    wanted = iter(requirements_of(campaign.setup.gate.requirements))
     checks = tuple(
-        _planned(campaign, next(wanted).quantity, one) if one.option == gate.REQUIREMENTS else one
+        _planned(campaign, next(wanted).name, one) if one.option == REQUIREMENTS else one
         for one in campaign.calibration.gate
     )
     if checks == campaign.calibration.gate:
         return campaign
-    reasons = gate.reasons_of(checks)
+    reasons = reasons_of(checks)
     calibration = dataclasses.replace(campaign.calibration, gate=checks, reasons=reasons)
     return dataclasses.replace(campaign, calibration=calibration)
 
 
-def _planned(campaign: Campaign, quantity: str, check: GateCheck) -> GateCheck:
+def _planned(campaign: Campaign, minimise: str, check: GateCheck) -> GateCheck:
     if not check.found > check.limit:
         return check
-    minimise = {gate.POINTING: LINE_OF_SIGHT, gate.FOCAL: 'fx'}.get(quantity, quantity)
     try:
         request = Request(_MOST_IMAGES, minimise)
         plan = plan_pointings(campaign.ensemble, campaign.setup, request)
@@ -495,7 +507,7 @@ def _planned(campaign: Campaign, quantity: str, check: GateCheck) -> GateCheck:
     scale = check.found / plan.sigma
     enough = [k for k, step in enumerate(plan.steps, 1) if scale * step.sigma <= check.limit]
     if not enough:
-        if not check.note.endswith(gate.REMEDIES['stars']):
+        if not check.note.endswith(REMEDIES['stars']):
             return check  # its remedy is another
         last = significant(scale * plan.steps[-1].sigma, 2)
         unit = check.unit and f' {check.unit}'

@@ -28,9 +28,6 @@ _LEVELS = 5
 _BAR = 84.0  # width, in units of the view box, for the colour bar of a map
 _TOP, _BELOW = 26.0, 40.0
 _DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps; the same on a dark page
-_BUDGET_MAPS = 6
-_BUDGET_SHARE = 0.1  # fraction of the sigma; the map of a smaller cause would be dark everywhere
-_GAP = 10.0
 _SHORT = 20  # columns, of which one is the longest arrow from the middle of a cell
 _FOOTPRINTS = 200  # most footprints drawn on the sky
 
@@ -59,13 +56,6 @@ def star_cloud(measured_px: Floats, camera: CameraModel) -> svg.Drawing:
     radius = float(np.clip(60.0 / np.sqrt(max(len(measured_px), 1)), 0.7, 1.8))
     panel.cloud(measured_px, radius, 0.8)
     return _drawn(panel)
-
-
-def star_coverage(residuals: Residuals, camera: CameraModel) -> svg.Chart:
-    """Positions of all used stars on the detector (paper, Fig. 5)."""
-    measured_px = residuals.measured_px[residuals.used]
-    text = f'All {len(measured_px):,} used star observations of all images.'
-    return svg.Chart('Star positions', star_cloud(measured_px, camera), text)
 
 
 def cell_counts(stars: NDArray[np.int64], camera: CameraModel) -> svg.Chart:
@@ -100,16 +90,6 @@ def distortion_vectors(camera: CameraModel) -> svg.Chart:
         arrows(camera, places, shift_px, columns),
         'Displacement of a star from its position with an ideal lens (dot). Arrows are '
         'enlarged; the arrow above the figure is their scale.',
-    )
-
-
-def distortion_magnitude(camera: CameraModel) -> svg.Chart:
-    """Length of the distortion in pixels (paper, Fig. 6 right)."""
-    length_px = np.hypot(*distortion_px(camera, pixel_grid(camera, 60, 48)).T)
-    return svg.Chart(
-        'Distortion magnitude',
-        detector_map(length_px.reshape(48, 60), camera, ' px'),
-        f'Length of the distortion vectors: at most {significant(np.nanmax(length_px), 3)} px.',
     )
 
 
@@ -211,44 +191,6 @@ def line_of_sight_sigma(
         detector_map(sigma, camera, '″'),
         f'1-sigma of the line of sight of each pixel, {text}: {significant(sigma.min(), 4)}″ to '
         f'{significant(sigma.max(), 4)}″. The colours start at zero.',
-    )
-
-
-def budget_over_detector(
-    parts: Sequence[records.SigmaPart], camera: CameraModel
-) -> svg.Chart | None:
-    """1-sigma of the camera alone over the detector, in total and by cause, on one scale."""
-    shown = [part for part in parts if part.map_over_detector_arcsec]
-    least = _BUDGET_SHARE * max((part.map_arcsec for part in shown), default=0.0)
-    shown = [part for part in shown if part.map_arcsec > least][:_BUDGET_MAPS]
-    if not shown or not shown[0].map_arcsec > _ROUNDING_PX:
-        return None
-    top = max(shown[0].map_over_detector_arcsec)
-    across = 2 if len(shown) <= 4 else 3
-    wide = (svg.WIDTH - _BAR - 4.0 - _GAP * (across - 1)) / across
-    high = wide * camera.height / camera.width
-    panels = []
-    for k, part in enumerate(shown):
-        row, column = divmod(k, across)
-        left, upper = 4.0 + column * (wide + _GAP), _TOP + row * (high + _TOP)
-        panel = svg.Panel(
-            svg.Scale(0.0, 1.0, left, left + wide), svg.Scale(0.0, 1.0, upper, upper + high)
-        )
-        sigma = np.reshape(
-            part.map_over_detector_arcsec, (records.BUDGET_ROWS, records.BUDGET_COLUMNS)
-        )
-        panel.picture(_coloured(cv2.resize(255 * sigma / top, (90, 70))))
-        panel.outside.append(svg.words(left, upper - 7, part.cause, 'start'))
-        panels.append(panel)
-    last = panels[min(len(panels), across) - 1]
-    height = panels[-1].y.end + 8.0
-    sizes = ', '.join(
-        f'{significant(max(part.map_over_detector_arcsec), 2)}″ {part.cause}' for part in shown
-    )
-    return svg.Chart(
-        'Causes over the detector',
-        panels[0].drawing(height, *panels[1:], _bar(last, top, '″')),
-        f'1-sigma of the line of sight of each pixel, camera alone; largest values: {sizes}.',
     )
 
 

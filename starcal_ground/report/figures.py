@@ -91,8 +91,8 @@ def before_and_after(
         'Residuals before and after',
         svg.plot(curves, 'distance from the prediction (px)', 'stars within it (%)', x=(low, None),
                  y=(0.0, 100.0), log='x', is_left=True),
-        'Distance of the stars from their prediction: by the attitude that the star tracker '
-        'reported and the prior, and after the calibration.',
+        'Distance of the stars from their prediction: by the attitude of the image and the prior, '
+        'and after the calibration.',
     )  # fmt: skip
 
 

@@ -94,79 +94,20 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     return results
 
 
-_LISTED_REFUSED = 200
-
-
-def picture(thumbnail: Thumbnail) -> Markup:
+def data_url(thumbnail: Thumbnail) -> Markup:
     """Data URL of a picture."""
     kind = 'image/jpeg' if thumbnail.name.endswith('.jpg') else 'image/png'
     # Safe as markup: base64 has no special characters.
     return Markup(f'data:{kind};base64,{base64.b64encode(thumbnail.encoded).decode("ascii")}')
 
 
-def refused_images(
-    counts: Mapping[str, int],
-    observations: Sequence[StarObservations],
-    thumbnails: Sequence[Thumbnail],
-) -> list[Mapping[str, object]]:
-    """For each reason its count, the refused images, and pictures of some of them."""
-    pictures = {t.time_ns: t for t in thumbnails if not t.is_expected}
-    groups: list[Mapping[str, object]] = []
-    for reason, count in Counter(counts).most_common():
-        images = [o for o in observations if o.refusal == reason]
-        groups.append(
-            {
-                'reason': reason,
-                'meaning': IMAGE_REFUSALS.get(reason, ''),
-                'count': count,
-                'images': [(utc_text(o.time_ns), o.detail) for o in images[:_LISTED_REFUSED]],
-                'pictures': [
-                    (picture(pictures[o.time_ns]), utc_text(o.time_ns), o.detail)
-                    for o in images
-                    if o.time_ns in pictures
-                ],
-            }
-        )
-    return groups
-
-
-def _counts(observations: Sequence[StarObservations]) -> Counter[str]:
-    """Refused stars of all images by reason."""
-    counts: Counter[str] = Counter()
-    for observed in observations:
-        counts.update(observed.refused_stars)
-    return counts
-
-
-def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str, str]]:
-    """Colour, letter and reason of the marks of refused stars in the pictures."""
-    return [
-        (
-            '#{:02x}{:02x}{:02x}'.format(*reversed(annotation.STAR_MARKS[reason].color)),
-            _LETTERS[annotation.STAR_MARKS[reason].shape],
-            reason,
-        )
-        for reason, count in _counts(observations).items()
-        if count and reason in annotation.STAR_MARKS
-    ]
-
-
-def refused_stars(observations: Sequence[StarObservations]) -> list[tuple[str, str, int]]:
-    """Reason, most frequent first, meaning, and count."""
-    counts = _counts(observations).most_common()
-    return [(reason, STAR_REFUSALS.get(reason, ''), count) for reason, count in counts if count]
-
-
-def used_images(
-    observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
-) -> list[tuple[Markup, str, int]]:
-    """Picture, stamp and number of stars of each used image."""
-    stars = {o.time_ns: len(o) for o in observations if not o.refusal}
-    return [
-        (picture(t), utc_text(t.time_ns), stars[t.time_ns])
-        for t in thumbnails
-        if not t.is_expected and t.time_ns in stars
-    ]
+def star_mark(reason: str) -> tuple[str, str] | None:
+    """Colour and letter of the mark of refused stars in the pictures; None without a mark."""
+    mark = annotation.STAR_MARKS.get(reason)
+    if mark is None:
+        return None
+    blue, green, red = mark.color
+    return f'#{red:02x}{green:02x}{blue:02x}', _LETTERS[mark.shape]
 
 
 @dataclass(frozen=True)
@@ -242,7 +183,9 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     calibration, residuals, pictures = contents.calibration, contents.residuals, contents.pictures
     observations = contents.observations or ()
     prior = products.prior_of(calibration)
-    refused = calibration.images_refused
+    refused_stars: Counter[str] = Counter()
+    for observed in observations:
+        refused_stars.update(observed.refused_stars)
     written = [
         name
         for name in products.PRODUCT_FILES
@@ -250,10 +193,8 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     ]
     return {
         'calibration': calibration,
-        'time': utc_text(calibration.time_ns),
         'times_of': calibration.provenance.get(solve.TIMES, ''),
         'pixels_of': calibration.provenance.get(PIXELS_OF, ''),
-        'active_since': utc_text(calibration.active_since_ns),
         'parameters': verdict.parameter_rows(calibration, prior),
         'alignment': verdict.alignment_rows(calibration, prior),
         'tiles': tiles(calibration),
@@ -267,13 +208,12 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
-        'refused_images': refused_images(refused, observations, pictures),
-        'refused_stars': refused_stars(observations),
-        'model_rows': verdict.model_rows(calibration),
-        'star_marks': star_marks(observations),
+        'observations': observations,
+        'refused_images': Counter(calibration.images_refused).most_common(),
+        'refused_stars': [one for one in refused_stars.most_common() if one[1]],
+        'model_sentences': verdict.model_sentences(calibration),
         'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
-        'has_images': any(not one.is_expected for one in pictures),
-        'used_images': used_images(observations, pictures),
+        'pictures': {one.time_ns: one for one in pictures if not one.is_expected},
         'options': _options(calibration),
     }
 
@@ -304,16 +244,8 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
 
     Raises ProductError when the page cannot be written.
     """
-    pictures = [
-        (picture(one), utc_text(one.time_ns))
-        for one in thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
-        if one.is_expected
-    ]
-    refused = [
-        (count, reason, IMAGE_REFUSALS.get(reason, ''))
-        for reason, count in record.images_refused.items()
-    ]
-    text = page_template('failure.html').render(record=record, pictures=pictures, refused=refused)
+    pictures = thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
+    text = page_template('failure.html').render(record=record, pictures=pictures)
     path = folder / products.REPORT_FILE
     product_files.write_atomically(path, text)
     return path
@@ -356,7 +288,6 @@ def charts_of(
     camera, maps = geometry.camera, calibration.maps
     charts: dict[str, svg.Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
-        'distortion': detector_figures.distortion_magnitude(camera),
         'sky': detector_figures.pointings(observations, geometry),
     }
     if prior is not None:
@@ -370,7 +301,6 @@ def charts_of(
     if calibration.sigma_budget:
         parts = verdict.parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
-        charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if residuals is not None and residuals.used.any():
         charts |= _residual_charts(calibration, residuals)
         if prior is not None:
@@ -384,7 +314,6 @@ def _residual_charts(
     camera = calibration.geometry.camera
     sigma_arcsec = calibration.star_tracker_sigma_arcsec
     return {
-        'coverage': detector_figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
         'field': detector_figures.mean_residuals(residuals, camera),
         'histogram': figures.histogram(residuals),
@@ -405,5 +334,10 @@ def page_template(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters['significant'] = significant
+    environment.filters |= {'significant': significant, 'utc': utc_text, 'data_url': data_url}
+    environment.globals |= {
+        'IMAGE_REFUSALS': IMAGE_REFUSALS,
+        'STAR_REFUSALS': STAR_REFUSALS,
+        'star_mark': star_mark,
+    }
     return environment.get_template(name)

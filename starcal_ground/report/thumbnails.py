@@ -71,22 +71,16 @@ class Album:
     """
     Selects thumbnails from a stream of images.
 
-    Keeps some used images, evenly spread, and the first images of each refusal reason.
-    ``expected`` images, if known, are spread from the start; more or fewer may come.  With a
+    Keeps some used images, evenly spread, and the first images of each refusal reason.  With a
     setup, ``unmatched`` are the first images that match no star, with the stars expected there.
     """
 
-    expected: int = 0
     setup: Setup | None = None
     unmatched: list[Thumbnail] = field(default_factory=list)
     used: list[_Reduced] = field(default_factory=list)
     refused: dict[str, list[_Reduced]] = field(default_factory=dict)
     _stride: int = 1
     _seen: int = 0
-
-    def __post_init__(self) -> None:
-        """Reduce no image that is not likely to be kept."""
-        self._stride = max(1, -(-self.expected // (2 * _USED - 1)))
 
     def show(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
         """Add an image, its observations and the geometry that predicted its stars."""

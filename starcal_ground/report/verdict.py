@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -12,16 +12,8 @@ import numpy as np
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ros import records
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import (
-    of_held,
-    REMEDIES,
-    remedy_against,
-    requirement_answers,
-    REQUIREMENTS,
-)
-from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.assessment.requirements import QUANTITIES, requirement_answers, REQUIREMENTS
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.text import p_value_text, significant, to_sigma
 
 INFORMATIVE_SIGMAS = 2.0
@@ -35,13 +27,15 @@ _MATTERS = 0.05  # fraction of the variance
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
 
 
-_UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
-    'focal_temperature_1': ' /degC',
-    'focal_temperature_2': ' /degC²',
-    'tau_x': ' rad',
-    'tau_y': ' rad',
+_UNITS = {
+    **{name: quantity.units[0] for name, quantity in QUANTITIES.items()},
+    **{f'{name}_temperature': 'arcsec/degC' for name in records.ALIGNMENT_NAMES},
+    'focal_temperature_1': '/degC',
+    'focal_temperature_2': '/degC²',
+    'tau_x': 'rad',
+    'tau_y': 'rad',
 }
-"""By parameter; the coefficients of the lens have none."""
+"""By parameter; other coefficients of the lens have none."""
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
@@ -69,9 +63,7 @@ def check_rows(
         if check.unit == 'sigma' and value and math.isfinite(check.found):
             value = f'{check.found:.1f} sigma'
             note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
-        if note == 'no limit is set':
-            limit = 'none'
-        elif check.option:
+        if check.option:
             limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
         rows.append((check, _RESULTS[check.passed], value, limit, note))
     return rows
@@ -139,109 +131,44 @@ def in_sentences(calibration: records.Calibration) -> list[str]:
 
 
 def next_step(calibration: records.Calibration) -> str:
-    """The measures against the largest causes of the sigma; a reason to refuse has its own."""
+    """
+    The measure that lowers a missed requirement, or else a sigma most; empty if there is none.
+
+    A reason to refuse has its own remedy.
+    """
     if calibration.accepted:
-        return ' '.join(_against_sigma(calibration))
-    failed = {check.option for check in calibration.gate if check.passed is False}
-    text = (
+        return ' '.join(f'To lower a sigma most, {row}.' for row in calibration.statements[:1])
+    failed = [check for check in calibration.gate if check.passed is False]
+    if {check.option for check in failed} == {REQUIREMENTS}:
+        # Behind the first semicolon of the note is the remedy of the largest cause.
+        steps = dict.fromkeys(filter(None, (one.note.partition('; ')[2] for one in failed)))
+        return f'{"; ".join(["The sigmas hold, but miss a requirement", *steps])}.'
+    return (
         'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'
     )
-    if failed == {REQUIREMENTS}:
-        text = 'The sigmas hold, but miss a requirement.'
-    steps = _against_sigma(calibration) if REQUIREMENTS in failed else []
-    return ' '.join([text, *steps])
 
 
-def _against_sigma(calibration: records.Calibration) -> list[str]:
-    """A sentence with the measure against the largest cause of each sigma."""
-    causes = parts_that_matter(calibration.sigma_budget)[1:]
-    if not causes:
-        return []
-    steps = []
-    scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
-    for scope, of in scopes if calibration.has_alignment else scopes[:1]:
-        largest = max(causes, key=lambda part: getattr(part, of))
-        remedy = remedy_against(largest.cause)
-        if remedy:
-            steps.append(
-                f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
-            )
-    return steps + [f'To lower a sigma most, {row}.' for row in calibration.statements[:1]]
-
-
-@dataclass(frozen=True)
-class ModelRow:
-    """An assumption, what the stars show of it, its p-value as text and the remedy if it fails."""
-
-    assumption: str
-    found: str
-    p_value: str
-    remedy: str
-
-
-def model_rows(calibration: records.Calibration) -> list[ModelRow]:
-    """Rows for the assumptions that a calibration tested; none of one that tested none."""
+def model_sentences(calibration: records.Calibration) -> list[str]:
+    """Sentences on the field, a camera without it, and changes; none where not recorded."""
     checks = calibration.model_checks
     if checks is None:
         return []
-    step, cost_px = checks.step, calibration.zero_skew_cost_px
     minutes = (calibration.time_ns - calibration.first_image_ns) / NANOSECONDS_PER_SECOND / 60
-    field = (
-        f'field of {_px(checks.field_rms_px)} rms per axis, at most {_px(checks.field_worst_px)}'
-    )
+    field = f'{_px(checks.field_rms_px)} rms per axis, at most {_px(checks.field_worst_px)}'
     if checks.field_worst_px < VISIBLE_PX:
-        field = f'field of {_px(checks.field_worst_px)} everywhere'
+        field = f'{_px(checks.field_worst_px)} everywhere'
+    cost, varies = _px(calibration.zero_skew_cost_px), _px(checks.image_variation_px)
+    mean = f'the mean over the {significant(minutes, 2)} minutes of the images'
     return [
-        ModelRow(
-            'The lens model describes the lens',
-            f'{field}; camera_info, without field and skew, differs from the calibration by at '
-            f'most {_px(cost_px)}',
-            '',
-            'choose another lens_model; for lines of sight with the field use starcal lookup',
-        ),
-        *_held(checks.held),
-        ModelRow(
-            'The detector has no step',
-            f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
-            _p(step.p_value),
-            REMEDIES['detector step'],
-        ),
-        ModelRow(
-            'The camera is the same in all images',
-            f'varies by {_px(checks.image_variation_px)} in a corner; the calibration is that of'
-            f' the mean over the {significant(minutes, 2)} minutes of the images',
-            '',
-            remedy_against(CHANGE),
-        ),
+        f'Field in addition to the lens model: {field}; another lens_model may lower it.',
+        f'camera_info, without field and skew, differs from the calibration by at most {cost}.',
+        'For lines of sight with the field use starcal lookup.',
+        f'The camera varies by {varies} in a corner; the calibration is that of {mean}.',
     ]
-
-
-def _held(held: Sequence[records.HeldTerm]) -> Iterator[ModelRow]:
-    """One row for each value that the stars contradict, and one for all others together."""
-    agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
-    for term in held:
-        if term.significance >= INFORMATIVE_SIGMAS:
-            note, remedy = of_held(term)
-            yield ModelRow(
-                f'{term.name} is as assumed',
-                f'{note}: {term.significance:.1f} sigma of the difference',
-                _p(math.erfc(term.significance / math.sqrt(2))),
-                remedy,
-            )
-    if agreeing:
-        names = ', '.join(f'{term.name} is {significant(term.assumed, 6)}' for term in agreeing)
-        worst = max(term.significance for term in agreeing)
-        found = f'the stars agree, within {worst:.1f} sigma of the difference'
-        yield ModelRow(names, found, _p(math.erfc(worst / math.sqrt(2))), '')
 
 
 def _px(value: float) -> str:
     return f'less than {VISIBLE_PX:g} px' if value < VISIBLE_PX else f'{significant(value, 3)} px'
-
-
-def _p(value: float) -> str:
-    """A p-value as text; empty where nothing was tested."""
-    return '' if math.isnan(value) else p_value_text(value)
 
 
 @dataclass(frozen=True)
@@ -272,7 +199,7 @@ def parameter_rows(
         rows.append(
             Row(
                 name=name,
-                unit='px' if name in INTRINSIC_NAMES else '',
+                unit=_UNITS.get(name, ''),
                 value=to_sigma(camera.parameters[k], sigma[k]),
                 sigma=held + (significant(sigma[k], 2) if known else ''),
                 prior=significant(prior.camera.parameters[k], 8) if prior else '',
@@ -352,7 +279,7 @@ def sigma_text(name: str, sigma: float) -> str:
     """1-sigma of a parameter with its unit."""
     if not math.isfinite(sigma):
         return 'unobservable'
-    if name.startswith('alignment'):
-        per = '/degC' if name.endswith('_temperature') else ''
-        return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
-    return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
+    unit = _UNITS.get(name, '')
+    if unit.startswith('arcsec'):
+        return f'{sigma / ARCSECOND_RAD:.2f} {unit}'
+    return f'{significant(sigma, 2)} {unit}'.rstrip()

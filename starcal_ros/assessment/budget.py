@@ -15,7 +15,7 @@ share is absent, A has no term of it and the weights stay.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import itertools
@@ -41,20 +41,6 @@ _WORTH_STATING = 0.9  # a fall of the sigma by less than a tenth is not worth a 
 _SHOWN = 3.0  # a slow error beyond three times the noise is in the images: no data sheet lowers it
 
 
-@dataclass(frozen=True)
-class _Cause:
-    """
-    A cause: the variances that would be gone, rad^2.
-
-    The mean over the detector of the map and of the pointing, then of the map at each pixel of the
-    budget.
-    """
-
-    name: str
-    variance_rad2: Floats  # (k,)
-    assumption: str
-
-
 def sigma_budget(
     estimate: Estimate, options: CalibrationOptions, has_alignment: bool = True
 ) -> tuple[SigmaPart, ...]:
@@ -69,38 +55,46 @@ def sigma_budget(
     in_root = seen.turned(errors.root)
     unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
     rows = estimate.linear.layout.line_of_sight_at
-    part = np.ix_(rows, rows)
     of_rows = seen.turned(np.eye(len(errors.root))[:, rows])
     covariance = estimate.map_covariance.matrix
-    held = of_rows.variances(covariance - estimate.posterior.covariance[part])
+    held = covariance - estimate.posterior.covariance[np.ix_(rows, rows)]
     shapes = _of_shapes(estimate, errors)
-    by_cause = _names_by_cause(estimate.linear.layout)
-    common = common_shape(estimate.linear.layout, estimate.posterior.shapes.common_px2)
-    causes = [
-        _Cause('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
-        *_unknowns(estimate, options, errors, in_root),
-        _Cause(
+    changes = estimate.posterior.shapes
+    common = common_shape(estimate.linear.layout, changes.common_px2)
+    trends = _names_by_cause(estimate.linear.layout).get(CHANGE, [])
+    of_change = _gain(errors, _known(errors, estimate, trends, shapes), in_root)
+    change_px = float(np.linalg.norm(changes.sigma_px))
+    parts = [
+        _part('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
+        *_of_unknowns(estimate, options, errors, in_root),
+        _part(
             CHANGE,
-            _gain(errors, _known(errors, estimate, by_cause.get(CHANGE, []), shapes), in_root)
-            + seen.variances(common),
-            _estimated(
-                float(np.linalg.norm(estimate.posterior.shapes.sigma_px)),
-                estimate.posterior.shapes.amplitudes.likelihood_ratio,
-            ),
+            of_change + seen.variances(common),
+            _estimated(change_px, changes.amplitudes.likelihood_ratio),
         ),
-        *_shared(estimate, options, errors, in_root, unresolved),
-        _Cause('held parameters', held, _of_held(estimate)),
+        *_of_errors(estimate, options, errors, in_root, unresolved),
+        _part('held parameters', of_rows.variances(held), _of_held(estimate)),
     ]
-    total = of_rows.variances(covariance) + unresolved
-    parts = [_Cause(TOTAL, total, ''), *(cause for cause in causes if cause.assumption)]
-    found = tuple(_part(cause) for cause in parts)
-    if has_alignment:
-        return found
-    return tuple(
-        dataclasses.replace(part, pointing_arcsec=part.map_arcsec)
-        for part in found
-        if part.cause not in _causes_of_trackers()
-    )
+    total = _part(TOTAL, of_rows.variances(covariance) + unresolved, '')
+    parts = [total, *(part for part in parts if part.assumption)]
+    if not has_alignment:
+        parts = [
+            dataclasses.replace(part, pointing_arcsec=part.map_arcsec)
+            for part in parts
+            if part.cause not in _causes_of_trackers()
+        ]
+    return tuple(parts)
+
+
+def _part(cause: str, variance_rad2: Floats, assumption: str) -> SigmaPart:
+    """
+    Return a part of the budget by variances (k,).
+
+    The mean over the detector of the map and of the pointing, then of the map at each pixel.
+    """
+    sigma_arcsec = np.sqrt(np.maximum(variance_rad2, 0.0)) / ARCSECOND_RAD
+    of_map, of_pointing, *over_detector = sigma_arcsec.tolist()
+    return SigmaPart(cause, of_map, of_pointing, assumption, tuple(over_detector))
 
 
 def statements(
@@ -122,7 +116,7 @@ def statements(
         for scope, of in scopes if option else ():
             before, gone = getattr(total, of), getattr(part, of)
             after = math.sqrt(max(before**2 - (1.0 - left) * gone**2, 0.0))
-            rows.append(Statement(option, value, scope, before, after))
+            rows.append(Statement(option, value, scope, before, after, part.cause))
     by_option: dict[str, Statement] = {}
     for row in sorted(rows, key=lambda row: row.after_arcsec / max(row.before_arcsec, 1e-300)):
         if row.after_arcsec < _WORTH_STATING * row.before_arcsec:
@@ -161,12 +155,6 @@ def _to_state(cause: str, estimate: Estimate, options: CalibrationOptions) -> Op
     return next((option for option in given if option is not NO_OPTION), NO_OPTION)
 
 
-def _part(cause: _Cause) -> SigmaPart:
-    sigma = np.sqrt(np.maximum(cause.variance_rad2, 0.0)) / ARCSECOND_RAD
-    of_map, of_pointing, *over_detector = sigma.tolist()
-    return SigmaPart(cause.name, of_map, of_pointing, cause.assumption, tuple(over_detector))
-
-
 @dataclass(frozen=True)
 class _Seen:
     """
@@ -194,26 +182,23 @@ class _Seen:
 def _seen(estimate: Estimate) -> tuple[_Seen, Floats]:
     """Return the effect of the shared unknowns, and that (2 + n,) of a displaced pixel."""
     camera = estimate.geometry.camera
-    grid = grid_derivatives(camera)
-    common = common_rotation(camera, grid)
-    means, of_pixel = mean_squares(estimate, grid)
+    means, of_pixel = mean_squares(estimate)
     found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
     layout = estimate.linear.layout
     J = np.zeros((len(found.J), 3, layout.count))
-    J[:, :, layout.line_of_sight_at] = np.nan_to_num(found.of_shape(camera, common))
+    J[:, :, layout.line_of_sight_at] = np.nan_to_num(found.of_shape(camera))
     by_pixel = np.nan_to_num((found.by_pixel**2).sum(axis=(1, 2)))
     return _Seen(means, J), np.concatenate([[of_pixel, of_pixel], by_pixel])
 
 
-def mean_squares(estimate: Estimate, grid: Derivatives | None = None) -> tuple[Floats, float]:
+def mean_squares(estimate: Estimate) -> tuple[Floats, float]:
     """
     Return the mean of ``J' J`` over the detector for map and pointing, (2, P, P).
 
-    By the shared unknowns; with that of a displacement of the pixel along both axes.  ``grid``:
-    the `grid_derivatives` of the camera, where they are at hand.
+    By the shared unknowns; with that of a displacement of the pixel along both axes.
     """
     camera, layout = estimate.geometry.camera, estimate.linear.layout
-    grid = grid or grid_derivatives(camera)
+    grid = grid_derivatives(camera)
     common, seen = common_rotation(camera, grid), np.isfinite(grid.directions[:, 0])
     squares = np.zeros((2, layout.count, layout.count))
     rows = estimate.linear.layout.line_of_sight_at
@@ -268,12 +253,11 @@ def _noise(estimate: Estimate, errors: ErrorParts, shapes: Floats, seen: _Seen) 
     return seen.variances(T @ noise @ T.T)
 
 
-def _unknowns(
+def _of_unknowns(
     estimate: Estimate, options: CalibrationOptions, errors: ErrorParts, seen: _Seen
-) -> list[_Cause]:
-    """Return the causes that are unknowns with a prior, or without one."""
+) -> Iterator[SigmaPart]:
+    """Yield the causes that are unknowns with a prior, or without one."""
     layout, found = estimate.linear.layout, estimate.posterior
-    causes = []
     for cause, names in _names_by_cause(layout).items():
         if cause == CHANGE:
             continue
@@ -281,39 +265,31 @@ def _unknowns(
         text = entry.kind.assumption(layout, found.mean, options)
         if entry is layout.field:
             text = _estimated(_field_px(estimate), found.field.likelihood_ratio)
-        gained = _gain(errors, _known(errors, estimate, names), seen)
-        causes.append(_Cause(cause, gained, text))
-    return causes
+        yield _part(cause, _gain(errors, _known(errors, estimate, names), seen), text)
 
 
-def _shared(
+def _of_errors(
     estimate: Estimate,
     options: CalibrationOptions,
     errors: ErrorParts,
     seen: _Seen,
     unresolved: Floats,
-) -> list[_Cause]:
-    """Return the causes that are errors which observations or attitudes share."""
+) -> Iterator[SigmaPart]:
+    """Yield the causes that are errors which observations or attitudes share."""
 
-    def absent(names: Sequence[str]) -> Floats:
+    def absent(names: Iterable[str]) -> Floats:
         shared = [errors.shared[name] for name in names if name in errors.shared]
-        return seen.variances(np.sum(shared, axis=0) if shared else np.zeros_like(errors.excess))
+        return seen.variances(sum(shared, np.zeros_like(errors.excess)))
 
-    causes = []
-    for name, of_star in (('star places', True), ('fine structure', False)):
+    for cause, of_star in (('star places', True), ('fine structure', False)):
         group = [error for error in estimate.weights.errors if error.of_star == of_star]
         if group:
-            text = _estimated(
-                math.sqrt(sum(error.variance_px2 for error in group)),
-                max(error.likelihood_ratio for error in group),
-            )
-            variance = absent([error.name for error in group])
-            causes.append(_Cause(name, variance + (0.0 if of_star else unresolved), text))
-    noise = _of_noise(estimate, options)
-    causes.append(_Cause(TRACKER_NOISE, absent([TRACKER_NOISE]), noise))
-    slow = _of_slow(estimate, options)
-    causes.append(_Cause(TRACKER_SLOW, absent([TRACKER_SLOW]), slow))
-    return causes
+            rms_px = math.sqrt(sum(error.variance_px2 for error in group))
+            text = _estimated(rms_px, max(error.likelihood_ratio for error in group))
+            variance = absent(error.name for error in group)
+            yield _part(cause, variance if of_star else variance + unresolved, text)
+    yield _part(TRACKER_NOISE, absent([TRACKER_NOISE]), _of_noise(estimate, options))
+    yield _part(TRACKER_SLOW, absent([TRACKER_SLOW]), _of_slow(estimate, options))
 
 
 def _estimated(rms_px: float, likelihood_ratio: float) -> str:

@@ -765,7 +765,7 @@ def _velocity_option(layout: Layout, options: CalibrationOptions) -> Option:
     if options.velocity_sigma_m_s >= 0:
         return NO_OPTION
     left = (10.0 / layout['velocity'].sigma[0]) ** 2
-    return 'observer_velocity_m_s, or record the topic velocity', 'known to 10 m/s', left
+    return 'observer_velocity_m_s (or topic velocity)', 'known to 10 m/s', left
 
 
 def _refraction_text(layout: Layout, *_: object) -> str:

@@ -26,7 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros import options
 from starcal_ros.arrays import AnyArray, Floats, Indices, Pixels
-from starcal_ros.assessment.gate import GateOptions, requirements_of
+from starcal_ros.assessment.gate import GateOptions
+from starcal_ros.assessment.requirements import requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert

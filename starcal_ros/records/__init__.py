@@ -8,3 +8,4 @@ are the only description of a record: `record_fields` reads and writes JSON and 
 
 from starcal_ros.records.calibration import *
 from starcal_ros.records.observations import *
+from starcal_ros.records.residual_field import *

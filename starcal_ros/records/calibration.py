@@ -3,14 +3,13 @@
 Records of a calibration: camera and alignment, covariance, gate checks and provenance.
 
 Its parts are the model checks, the star trackers, the budget of the sigma, and the field over the
-detector in addition to the lens model, with the covariance of lines of sight.
+detector with the covariance of lines of sight (`residual_field`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-import functools
 import math
 import secrets
 from typing import Annotated, TYPE_CHECKING
@@ -20,9 +19,9 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.record_fields import Count, Finite, Quaternion, Record, Shape, Stamp, Within
+from starcal_ros.record_fields import Count, Finite, Quaternion, Record, Shape, Stamp
+from starcal_ros.records.residual_field import MapCovariance, ResidualField
 from starcal_ros.text import significant, to_sigma
 
 if TYPE_CHECKING:
@@ -430,7 +429,8 @@ class Statement:
     A value of a data sheet that no option states, with the 1-sigma before and after stating it.
 
     ``scope`` is ``pointing``, lines of sight in the star tracker frame, or ``camera``, those of
-    the camera alone, RMS over the detector; ``value`` is what the option would be set to.
+    the camera alone, RMS over the detector; ``value`` is what the option would be set to, and
+    ``cause`` the `SigmaPart` that it lowers, empty where not recorded.
 
     >>> str(Statement('star_tracker_slow_arcsec', '5', 'pointing', 77.0, 11.0))
     'state star_tracker_slow_arcsec: pointing 77″ becomes 11″ if it is 5'
@@ -441,110 +441,17 @@ class Statement:
     scope: str
     before_arcsec: float
     after_arcsec: float
+    cause: str = ''
+
+    @property
+    def gain(self) -> str:
+        """The sigmas in words."""
+        before, after = (significant(s, 2) for s in (self.before_arcsec, self.after_arcsec))
+        return f'{before}″ becomes {after}″ if it is {self.value}'
 
     def __str__(self) -> str:
         """Sentence for a user."""
-        before, after = (significant(s, 2) for s in (self.before_arcsec, self.after_arcsec))
-        text = f'state {self.option}: {self.scope} {before}″ becomes {after}″'
-        return f'{text} if it is {self.value}'
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MapCovariance(Record):
-    """
-    Covariance of all that moves a line of sight.
-
-    ``matrix`` is (k, k), of the numbers of `Derivatives.of_shape`; ``unresolved_px`` the
-    1-sigma per axis of an independent displacement of each pixel, by structure of the detector
-    finer than the field.
-
-    >>> import starcal_ros
-    >>> calibration = starcal_ros.read_calibration('out')
-    >>> camera_and_alignment = calibration.map_covariance.matrix[:13, :13]
-    >>> bool(abs(camera_and_alignment / calibration.covariance - 1).max() < 1e-3)
-    True
-    """
-
-    matrix: Floats
-    unresolved_px: float = 0.0
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ResidualField(Record):
-    """
-    Field over the detector in addition to the lens model.
-
-    With coefficients of zero none was found; its covariance is that of the fields that the stars
-    do not rule out.  ``covariance`` is ``F F'``, plus ``R R'`` in the rows of the coefficients,
-    where F is the factor and R the lower triangle with the rows ``remainder_unit_px * remainder``.
-    Every sigma of a line of sight holds to 1e-3.
-
-    Raises ValueError when remainder and units do not fit.
-
-    Attributes
-    ----------
-    octaves : int
-        Of its cosines; `detector_field.basis` has them.
-    coefficients : (2, t)
-        px, for u and for v; a star that the lens model places at u is measured at u + f(u).
-    unresolved_px : float
-        1-sigma per axis of structure finer than the field.
-    covariance_factor : (p + 2 t, r)
-        F, of the parameters of the calibration and the coefficients of u, then of v.
-    remainder_unit_px : (2 t,)
-    remainder : (t (2 t + 1),) int16
-        Rows of the triangle, one after the other: the coefficients, the parameters known.
-
-    Examples
-    --------
-    >>> import starcal_ros
-    >>> field = starcal_ros.read_calibration('out').field
-    >>> terms = field.coefficients.shape[1]
-    >>> field.covariance.shape == (13 + 2 * terms, 13 + 2 * terms)
-    True
-    """
-
-    octaves: Annotated[int, Within(1, 8)]
-    coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
-    unresolved_px: Annotated[float, Finite()]
-    covariance_factor: Annotated[Floats, Finite(), Shape(('factor_rows', 'factor_cols'))]
-    remainder_unit_px: Annotated[Floats, Finite(), Shape(('c',))]
-    remainder: Annotated[NDArray[np.int16], Shape(('n',))]
-
-    def __post_init__(self) -> None:
-        """Check the size of the remainder."""
-        count, all_of_them = len(self.remainder_unit_px), self.coefficients.size
-        in_triangle = count * (count + 1) // 2
-        if len(self.remainder) != in_triangle:
-            raise ValueError(f'remainder: {len(self.remainder)} numbers, not {in_triangle}')
-        if count not in (0, all_of_them) or count > len(self.covariance_factor):
-            raise ValueError(f'remainder_unit_px: {count} numbers, not {all_of_them}')
-
-    @property
-    def rows(self) -> int:
-        """Number of rows of the covariance."""
-        return len(self.covariance_factor)
-
-    @functools.cached_property
-    def covariance(self) -> Floats:
-        """(p + 2 t, p + 2 t): of the parameters of the calibration and the coefficients."""
-        F = self.covariance_factor
-        covariance: Floats = F @ F.T
-        count = len(self.remainder_unit_px)
-        triangle = np.zeros((count, count))
-        triangle[np.tril_indices(count)] = self.remainder
-        triangle *= self.remainder_unit_px[:, None]
-        first = len(F) - count
-        covariance[first:, first:] += triangle @ triangle.T
-        return covariance
-
-    def on(self, width: int, height: int) -> DetectorField:
-        """Return the field on a detector; raises ValueError for a wrong number of terms."""
-        given = self.coefficients.shape[1]
-        expected = term_count(width, height, self.octaves)
-        if given != expected:
-            raise ValueError(f'field.coefficients: {given} for an axis, not {expected}')
-        return DetectorField(width, height, self.octaves, self.coefficients)
+        return f'state {self.option}: {self.scope} {self.gain}'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -786,50 +693,3 @@ def check_drawable(geometry: CameraGeometry) -> None:
     rotation = geometry.star_tracker_from_camera_xyzw
     if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
         raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
-
-
-_DIGITS = 9  # parameters and field cancel to a thousandth and less in the factor
-# Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 6e-4.
-_STEPS = 5000
-_NO_VARIANCE = 1e-12  # times the largest eigenvalue: smaller ones are rounding
-
-
-def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualField:
-    """
-    Return the record of a field with the covariance of lines of sight as factor and remainder.
-
-    The factor has the parameters exactly, and the field as it follows them.  The remainder, that
-    of the field with the parameters known, displaces pixels with little cancellation: steps of
-    a `_STEPS`-th of the sigma of each coefficient are enough.
-    """
-    count, matrix = of.coefficients.size, covariance.matrix
-    p = len(matrix) - count
-    known = np.sqrt(np.diag(matrix)[:p])
-    scale = np.where(known > 0, known, 1.0)
-    values, vectors = np.linalg.eigh(matrix[:p, :p] / np.outer(scale, scale))
-    used = values > _NO_VARIANCE * values.max()
-    vectors, root = vectors[:, used], np.sqrt(values[used])
-    factor = np.concatenate(
-        [known[:, None] * vectors * root, matrix[p:, :p] / scale @ vectors / root]
-    )
-    factor = _to_digits(factor, _DIGITS)
-    remaining = matrix[p:, p:] - factor[p:] @ factor[p:].T
-    unit_px = _to_digits(np.sqrt(np.diag(remaining).clip(0.0)) / _STEPS, 4)
-    steps = np.where(unit_px > 0, unit_px, np.inf)
-    values, vectors = np.linalg.eigh(remaining / np.outer(steps, steps))
-    # The triangle of the QR decomposition of a root exists for deficient rank too.
-    _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
-    return ResidualField(
-        octaves=of.octaves,
-        coefficients=of.coefficients,
-        unresolved_px=covariance.unresolved_px,
-        covariance_factor=factor,
-        remainder_unit_px=unit_px,
-        remainder=np.rint(upper.T[np.tril_indices(count)]).astype(np.int16),
-    )
-
-
-def _to_digits(values: Floats, digits: int) -> Floats:
-    """Return numbers rounded to so many significant digits: texts of them are as short."""
-    rounded = [float(f'{value:.{digits - 1}e}') for value in values.ravel().tolist()]
-    return np.array(rounded, np.float64).reshape(values.shape)

@@ -12,13 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_ros import errors, records
-from starcal_ros.assessment.gate import (
-    judge,
-    reasons_of,
-    REMEDIES,
-    requirement_answers,
-    REQUIREMENTS,
-)
+from starcal_ros.assessment.gate import judge, reasons_of
+from starcal_ros.assessment.remedies import REMEDIES
+from starcal_ros.assessment.requirements import requirement_answers, REQUIREMENTS
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method

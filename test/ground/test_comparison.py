@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import json
 from pathlib import Path
 import shutil
+from typing import Any
 
 from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
@@ -24,6 +26,8 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_calibration, write_calibration
 from starcal_ros.records import Calibration, TemperatureTerms
+
+Compared = Callable[..., tuple[str, dict[str, Any]]]
 
 
 @pytest.fixture(scope='module')
@@ -50,6 +54,22 @@ def moved(
         star_tracker_from_camera_xyzw=turned.as_quat(),
     )
     return dataclasses.replace(calibration, geometry=geometry)
+
+
+@pytest.fixture
+def compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Compared:
+    """Text and JSON object of `starcal compare`."""
+
+    def run(*calibrations: Calibration) -> tuple[str, dict[str, Any]]:
+        files = [tmp_path / f'{name}.json' for name in 'ab']
+        for path, calibration in zip(files, calibrations, strict=True):
+            write_calibration(calibration, path)
+        assert main.main(['compare', *map(str, files)]) == 0
+        text = capsys.readouterr().out
+        assert main.main(['compare', *map(str, files), '--json']) == 0
+        return text, json.loads(capsys.readouterr().out)
+
+    return run
 
 
 def test_nothing_differs_from_itself(tiny: Calibration) -> None:
@@ -189,22 +209,16 @@ def test_notes_say_what_weakens_the_sigmas(tiny: Calibration) -> None:
 
 
 def test_cameras_alone_are_compared_without_an_alignment(
-    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Calibration, compared: Compared
 ) -> None:
     """Their alignment is of the prior camera: 82 arcsec of sigma, and no fit of any size."""
     alone = dataclasses.replace(tiny, parent_frame='')
     turned = dataclasses.replace(moved(tiny, (1e-2, 0.0, 0.0), fx=0.01), parent_frame='')
     found = compare(alone, turned)
     assert found.total.degrees_of_freedom == 10 and found.total.p_value > 0.99
-    for name, calibration in (('a', alone), ('b', turned)):
-        write_calibration(calibration, tmp_path / f'{name}.json')
-    command = ['compare', str(tmp_path / 'a.json'), str(tmp_path / 'b.json')]
-    assert main.main(command) == 0
-    said = capsys.readouterr().out
+    said, content = compared(alone, turned)
     assert 'alignment x' not in said and 'as calibrated' not in said
     assert 'the cameras alone are compared' in said and '10 degrees of freedom' in said
-    assert main.main([*command, '--json']) == 0
-    content = json.loads(capsys.readouterr().out)
     assert content['alignment_arcsec'] is content['lines_of_sight'] is None
 
 
@@ -219,7 +233,7 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
 
 @pytest.mark.parametrize('model', ['rational_polynomial', 'equidistant'])
 def test_two_lens_models_are_compared_by_their_lines_of_sight(
-    tiny: Calibration, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Calibration, model: str, compared: Compared
 ) -> None:
     camera, worst_px = convert(tiny.geometry.camera, model)
     count = len(camera.parameters) + 3
@@ -230,32 +244,17 @@ def test_two_lens_models_are_compared_by_their_lines_of_sight(
     # The conversion states its error in pixels; the angle of one is at most that of the centre.
     assert found.before.length_px.max() <= 1.01 * worst_px + 1e-9
     assert np.isfinite(found.after.sigmas).all() and found.total.degrees_of_freedom == 0
-    for name, calibration in (('a', tiny), ('b', other)):
-        write_calibration(calibration, tmp_path / f'{name}.json')
-    command = ['compare', str(tmp_path / 'a.json'), str(tmp_path / 'b.json')]
-    assert main.main(command) == 0
-    said = capsys.readouterr().out
+    said, content = compared(tiny, other)
     assert f'lens model plumb_bob, B {model}' in said and 'parameter  ' not in said
     assert 'common rotation' in said and 'sigma' in said
-    assert main.main([*command, '--json']) == 0
-    content = json.loads(capsys.readouterr().out)
     assert content['parameter_names'] == content['difference'] == []
 
 
-def test_the_tool_compares(
-    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name, calibration in (('a', tiny), ('b', moved(tiny, fx=0.5))):
-        (tmp_path / name).mkdir()
-        write_calibration(calibration, tmp_path / name / 'calibration.json')
-    folders = [str(tmp_path / 'a'), str(tmp_path / 'b' / 'calibration.json')]
-    assert main.main(['compare', *folders]) == 0
-    out = capsys.readouterr().out
+def test_the_tool_compares(tiny: Calibration, compared: Compared) -> None:
+    out, made = compared(tiny, moved(tiny, fx=0.5))
     (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
     sigma = np.sqrt(2) * tiny.sigma[0]
     assert row[3:] == ['+0.500', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
-    assert main.main(['compare', *folders, '--json']) == 0
-    made = json.loads(capsys.readouterr().out)
     assert made['difference'][0] == pytest.approx(0.5)
     # The outermost column lies 319.5 px from cx: half a pixel of focal length moves it by this.
     assert made['lines_of_sight']['worst_px'] == pytest.approx(0.5 * 319.5 / 1801, rel=0.1)

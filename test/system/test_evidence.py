@@ -83,7 +83,7 @@ def row(**values: object) -> dict[str, object]:
         ('sound missions refused though right, %', {'accepted': False, 'reasons': ['x']}, 'NO'),
         (
             'sound missions refused though right, %',
-            {'accepted': False, 'reasons': ['largest 1-sigma of the distortion map is 0.6 px']},
+            {'accepted': False, 'reasons': ['largest 1-sigma of map is 0.6 px']},
             'yes',
         ),
         ('bodies: refused', {}, '-'),

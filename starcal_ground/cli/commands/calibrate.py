@@ -103,7 +103,7 @@ def _source(args: argparse.Namespace, bag_folder: Path) -> tuple[Source, Mapping
     from starcal_ground.cli.into_folder import check_folder, failure_recorded
     from starcal_ground.images import first_setup
     from starcal_ground.products import check_outputs, make_folder, same_as_one_of
-    from starcal_ros.assessment.gate import requirements_of
+    from starcal_ros.assessment.requirements import requirements_of
 
     requirements_of(args.require or ())
     given = arguments.given(args, **({'requirements': args.require} if args.require else {}))
@@ -139,7 +139,7 @@ def answer_of(
     """Object that `--json` prints of a campaign whose products are in a folder."""
     from starcal_ground.images.first_setup import assumed
     from starcal_ground.report import verdict
-    from starcal_ros.assessment.gate import REQUIREMENTS
+    from starcal_ros.assessment.requirements import REQUIREMENTS
 
     calibration = made.calibration
     return {
@@ -211,7 +211,7 @@ def _print_budget(calibration: Calibration) -> None:
 def _print_assumed(assumed: Sequence[tuple[str, str]], calibration: Calibration) -> None:
     """Print what nobody stated, with what stating it would gain."""
     gains = {
-        row.option.split()[0].strip(','): str(row).partition(': ')[2]
+        row.option.split()[0].strip(','): f'{row.scope} {row.gain}'
         for row in calibration.statements
     }
     assumptions = {name: f'assumed {text}' for name, text in assumed}

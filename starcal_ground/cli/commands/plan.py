@@ -36,7 +36,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     images = arguments.number(int, 1, 1000)
     what = 'images that may be taken (default: 10)'
     add('--images', type=images, default=10, metavar='N', help=what)
-    what = 'sigma to lower: line_of_sight (default), map, or a parameter such as fx or k1'
+    what = (
+        'sigma to lower, by the names of --require: line_of_sight (default), map, pointing, f, or'
+        ' a parameter such as k1'
+    )
     add('--minimise', default='line_of_sight', metavar='NAME', help=what)
     allowed = command.add_mutually_exclusive_group()
     what = 'CSV of the allowed pointings, with the columns ra_deg, dec_deg and, if fixed, roll_deg'
@@ -126,7 +129,7 @@ def _csv(plan: Plan) -> str:
 
 
 def _table(plan: Plan) -> tuple[list[str], list[list[str]]]:
-    header = ['image', 'ra', 'dec', 'roll', 'stars', plan.name]
+    header = ['image', *_COLUMNS, 'stars', plan.name]
     rows = [['now', '', '', '', '', text.significant(plan.sigma, 4)]]
     for k, step in enumerate(plan.steps, 1):
         place = step.pointing

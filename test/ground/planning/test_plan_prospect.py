@@ -8,13 +8,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from starcal_ground.planning.plan import expected_noise_px2, LINE_OF_SIGHT, MAP, prospect, target
+from starcal_ground.planning.plan import expected_noise_px2, prospect, target
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
+from starcal_ros.assessment.requirements import MAP
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.records import Ensemble
+from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
 
 _OPTIONS = CalibrationOptions()
 
@@ -83,17 +85,28 @@ def test_information_does_not_depend_on_the_order_of_the_candidates(
     np.testing.assert_allclose(ahead, back[::-1], atol=1e-9 * ahead.max())  # order of sums
 
 
-def test_sigmas_by_name(first: Estimate) -> None:
-    """Of the map below that of lines of sight, which has the alignment; of a parameter its own."""
+def test_sigmas_have_the_names_and_units_of_requirements(first: Estimate) -> None:
+    """The map has a smaller one than lines of sight, which have the alignment."""
     covariance = first.posterior.covariance
-    of_map, of_sight = target(first, MAP), target(first, LINE_OF_SIGHT)
-    assert of_map.sigma(covariance) < of_sight.sigma(covariance)
-    names = first.geometry.camera.parameter_names
-    sigma = float(np.sqrt(first.covariance[names.index('k1'), names.index('k1')]))
-    assert target(first, 'k1').sigma(covariance) == pytest.approx(sigma, rel=1e-9)  # rounding
-    with pytest.raises(
-        OptionError, match=r"'k9' is not estimated.*one of: line_of_sight, map, fx"
+
+    def planned(name: str, unit: str) -> float:
+        wanted = target(first, name)
+        assert wanted.name == name + unit
+        return wanted.sigma(covariance)
+
+    assert planned('map', '_arcsec') < planned('line_of_sight', '_arcsec')
+    assert planned('pointing', '_arcsec') == planned('line_of_sight', '_arcsec')
+    names = (*first.geometry.camera.parameter_names, *ALIGNMENT_NAMES)
+    sigma = dict(zip(names, np.sqrt(np.diag(first.covariance)), strict=True))
+    for name, unit, expected in (
+        ('k1', '', sigma['k1']),
+        ('fx', '_px', sigma['fx']),
+        ('f', '_px', np.hypot(sigma['fx'], sigma['fy']) / np.sqrt(2.0)),
+        ('alignment_y', '_arcsec', sigma['alignment_y'] / ARCSECOND_RAD),
     ):
+        assert planned(name, unit) == pytest.approx(expected, rel=1e-9)  # rounding
+    allowed = 'one of: line_of_sight, map, pointing, f, fx, .*, alignment_z, k1, k2, k3, p1, p2$'
+    with pytest.raises(OptionError, match=f"^'k9' is not estimated; .* is {allowed}"):
         target(first, 'k9')
 
 

@@ -30,15 +30,13 @@ from starcal_ros.formats.products.product_files import (
     write_calibration,
 )
 from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Activation, Ensemble
+from starcal_ros.records import Activation, Calibration, Ensemble
 from starcal_ros.ros.archive import Archive
 from starcal_ros.text import significant
 
 FIGURES = (
-    'coverage',
     'cells',
     'vectors',
-    'distortion',
     'change',
     'sky',
     'before',
@@ -50,7 +48,6 @@ FIGURES = (
     'colour',
     'phase',
     'budget',
-    'causes',
     'line_of_sight',
     'shape',
     'alignment',
@@ -70,7 +67,15 @@ def page(folder: Path) -> str:
     return (folder / REPORT_FILE).read_text()
 
 
-def page_of(folder: Path) -> str:
+@pytest.fixture(scope='module')
+def calibration(folder: Path) -> Calibration:
+    return read_calibration(folder / CALIBRATION_FILE)
+
+
+def page_of(calibration: Calibration, folder: Path, **changes: Any) -> str:
+    """Page of a calibration with some fields changed, beside whatever a folder has."""
+    changed = dataclasses.replace(calibration, **changes)
+    write_calibration(changed, folder / CALIBRATION_FILE)
     return report.write_report(folder).read_text()
 
 
@@ -91,8 +96,7 @@ def test_of_a_state_folder_the_last_calibration_and_its_images(
     assert '<svg' in page and 'no residuals of single stars (residuals.npz)' in page
 
 
-def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
-    calibration = read_calibration(folder / CALIBRATION_FILE)
+def test_the_page_shows_what_the_calibration_holds(calibration: Calibration, page: str) -> None:
     assert '✓ Accepted' in page and '″, at most 300″ required: met.' in page  # one sign
     fx, sigma = calibration.geometry.camera.parameters[0], calibration.sigma[0]
     assert f'<td>{fx:.3f}</td>' in page  # to a hundredth of the sigma of 0.05 px
@@ -135,33 +139,28 @@ def test_report_rebuilds_the_same_page(folder: Path, page: str) -> None:
 
 
 def test_a_folder_with_a_calibration_alone_says_what_is_missing(
-    folder: Path, tmp_path: Path
+    calibration: Calibration, tmp_path: Path
 ) -> None:
-    shutil.copy(folder / CALIBRATION_FILE, tmp_path)
-    text = page_of(tmp_path)
+    text = page_of(calibration, tmp_path)
     assert 'no residuals of single stars (residuals.npz)' in text
     assert 'without access to the images' in text
     assert 'id="figure-vectors"' in text and 'id="figure-images"' not in text
 
 
-def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
-    calibration = read_calibration(folder / CALIBRATION_FILE)
+def test_a_refused_calibration_says_why(calibration: Calibration, tmp_path: Path) -> None:
     reasons = ('residual 2 px & more is over the limit',)
-    refused = dataclasses.replace(calibration, accepted=False, reasons=reasons)
-    write_calibration(refused, tmp_path / CALIBRATION_FILE)
-    text = page_of(tmp_path)
+    text = page_of(calibration, tmp_path, accepted=False, reasons=reasons)
     assert '✕ Refused' in text and '✓ Accepted' not in text
     assert 'Residual 2 px &amp; more is over the limit.' in text
 
 
-def test_of_the_camera_alone_nothing_is_said_of_an_alignment(folder: Path, tmp_path: Path) -> None:
-    calibration = read_calibration(folder / CALIBRATION_FILE)
+def test_of_the_camera_alone_nothing_is_said_of_an_alignment(
+    folder: Path, calibration: Calibration, tmp_path: Path
+) -> None:
     times = 'of the file: 10 of 10 images state none'
     provenance = {**calibration.provenance, TIMES: times}
-    alone = dataclasses.replace(calibration, parent_frame='', provenance=provenance)
-    write_calibration(alone, tmp_path / CALIBRATION_FILE)
     shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
-    text = page_of(tmp_path)
+    text = page_of(calibration, tmp_path, parent_frame='', provenance=provenance)
     for words in ('Orientation of', 'x, y, z, w', 'href="#alignment"',
                   'Alignment: small rotation', ' on <code></code>', ' on </td>'):  # fmt: skip
         assert words not in text, words
@@ -169,23 +168,24 @@ def test_of_the_camera_alone_nothing_is_said_of_an_alignment(folder: Path, tmp_p
     assert text.count(times) == 2  # of the header and of the table to sign
 
 
-def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
-    calibration = read_calibration(folder / CALIBRATION_FILE)
+def test_the_gate_is_shown_as_the_calibration_holds_it(
+    calibration: Calibration, tmp_path: Path
+) -> None:
     assert len(calibration.gate) >= 15  # nine limits, and each unknown with a prior
     checks = {check.option: check for check in calibration.gate}
     failed = dataclasses.replace(checks['max_rejected_fraction'], found=8.125, passed=False)
     not_checked = dataclasses.replace(
         checks['max_rotation_deg'], found=math.nan, passed=None, note='nothing to compare with'
     )
-    shown = dataclasses.replace(calibration, gate=(failed, not_checked))
-    write_calibration(shown, tmp_path / CALIBRATION_FILE)
+    text = page_of(calibration, tmp_path, gate=(failed, not_checked))
     table = re.findall(
-        r'<section id="gate">.*?<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL
+        r'<section id="gate">.*?<table class="limits">.*?</table>', text, re.DOTALL
     )[0]
     rows = [re.findall(r'<t[hd][^>]*>(.*?)</t[hd]>', row) for row in table.split('<tr>')[2:]]
     limit = f'at most {not_checked.limit_text}'
     names = [
-        f'{check.name} <code>{check.option.replace("_", "_<wbr>")}</code>' for check in shown.gate
+        f'{check.name} <code>{check.option.replace("_", "_<wbr>")}</code>'
+        for check in (failed, not_checked)
     ]
     assert rows == [
         [names[0], 'failed', '8.125', 'at most 0.25', ''],
@@ -193,44 +193,35 @@ def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: P
     ]
 
 
-def test_a_calibration_of_before_the_gate_told_says_so(folder: Path, tmp_path: Path) -> None:
-    calibration = read_calibration(folder / CALIBRATION_FILE)
-    write_calibration(dataclasses.replace(calibration, gate=()), tmp_path / CALIBRATION_FILE)
-    text = page_of(tmp_path)
+def test_a_calibration_of_before_the_gate_told_says_so(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    text = page_of(calibration, tmp_path, gate=())
     assert 'does not record the gate checks' in text
     assert 'The gate checks are not recorded' in text
 
 
-def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
+def test_names_are_text_and_never_markup(
+    folder: Path, calibration: Calibration, tmp_path: Path
+) -> None:
     evil = '</script><script>alert(1)</script><img src=x onerror=alert(1)>'
-    calibration = read_calibration(folder / CALIBRATION_FILE)
-    calibration = dataclasses.replace(
+    shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
+    text = page_of(
         calibration,
+        tmp_path,
         child_frame=evil,
         weakest_direction=evil,
         provenance={**calibration.provenance, evil: evil, 'options': 'no JSON', 'prior': '[1]'},
         images_refused={evil: 1},
     )
-    write_calibration(calibration, tmp_path / CALIBRATION_FILE)
-    shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
-    text = page_of(tmp_path)
     assert '<script>alert' not in text and '<img src=x' not in text
     assert '<th scope="col">prior</th>' not in text  # not known: no empty columns
 
 
-def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
+def test_numbers_that_are_none_do_no_harm(
+    folder: Path, calibration: Calibration, tmp_path: Path
+) -> None:
     """A calibration with nothing finite in it, and residuals of which none was used."""
-    calibration = read_calibration(folder / CALIBRATION_FILE)
-    calibration = dataclasses.replace(
-        calibration,
-        covariance=np.full((13, 13), np.nan),
-        residual_rms_px=np.nan,
-        variance_factor=np.nan,
-        maps=None,
-        correlation=None,
-        time_ns=0,
-    )
-    write_calibration(calibration, tmp_path / CALIBRATION_FILE)
     left = products.read_residuals(folder / products.RESIDUALS_FILE)
     nothing = dataclasses.replace(
         left,
@@ -238,7 +229,10 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         attitude_error_arcsec=np.full_like(left.attitude_error_arcsec, np.nan),
     )
     products.write_residuals(nothing, tmp_path / products.RESIDUALS_FILE)
-    assert '<html' in page_of(tmp_path)
+    none = {'maps': None, 'correlation': None, 'time_ns': 0}
+    nan = {'residual_rms_px': np.nan, 'variance_factor': np.nan}
+    covariance = np.full((13, 13), np.nan)
+    assert '<html' in page_of(calibration, tmp_path, covariance=covariance, **none, **nan)
 
 
 @pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])

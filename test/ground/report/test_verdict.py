@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from starcal_ground.report import verdict
 from starcal_ros.formats.products.product_files import read_calibration
@@ -59,37 +60,75 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
         'Camera alone: the 1-sigma of a line of sight is 0.25″ rms over the detector, at most '
         '0.2″ over 98 % of it, 9″ at worst. Largest causes: stars (0.2″), fine structure (0.15″).'
     )
-    assert 'camera (largest cause: stars), take more images' in verdict.next_step(shown)
-    refused = dataclasses.replace(shown, accepted=False)
-    assert verdict.next_step(refused).startswith('Do not use it for navigation')
 
 
-def test_the_statement_that_lowers_a_sigma_most_is_the_last_of_the_next_step(
-    tiny_products: Path,
+MEND = 'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'
+
+
+@pytest.mark.parametrize(
+    ('failed', 'note', 'step'),
+    [
+        ((), 'met', 'To lower a sigma most, {statement}.'),
+        (
+            ('requirements',),
+            'missed by 4 arcsec; take more images',
+            'The sigmas hold, but miss a requirement; take more images.',
+        ),
+        (('requirements',), 'missed by 4', 'The sigmas hold, but miss a requirement.'),
+        (('requirements', 'min_images'), 'missed by 4 arcsec; take more images', MEND),
+        (('min_images',), 'met', MEND),
+    ],
+)
+def test_the_next_step_is_the_remedy_of_the_requirement_that_is_missed(
+    tiny_products: Path, failed: tuple[str, ...], note: str, step: str
 ) -> None:
+    """A sound calibration gets the statement that lowers a sigma most, or nothing."""
     calibration = read_calibration(tiny_products / 'calibration.json')
     assert calibration.statements[0].option == 'star_tracker_slow_arcsec'
-    assert verdict.next_step(calibration).endswith(
-        f'To lower a sigma most, {calibration.statements[0]}.'
+    gate = tuple(
+        dataclasses.replace(
+            check,
+            passed=check.passed and check.option not in failed,
+            note=note if check.option == 'requirements' else check.note,
+        )
+        for check in calibration.gate
     )
+    judged = dataclasses.replace(calibration, accepted=not failed, gate=gate)
+    assert verdict.next_step(judged) == step.format(statement=calibration.statements[0])
+    if not failed:
+        assert verdict.next_step(dataclasses.replace(judged, statements=())) == ''
 
 
-def test_a_refusal_that_misses_a_requirement_states_what_lowers_a_sigma(
-    tiny_products: Path,
+@pytest.mark.parametrize(
+    ('worst_px', 'variation_px', 'field', 'varies'),
+    [
+        (0.86, 0.02, '0.25 px rms per axis, at most 0.86 px', '0.02 px'),
+        (1e-4, 4e-6, 'less than 0.001 px everywhere', 'less than 0.001 px'),
+    ],
+)
+def test_a_length_that_no_image_shows_has_no_digits(
+    tiny_products: Path, worst_px: float, variation_px: float, field: str, varies: str
 ) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
-
-    def step(*failed: str) -> str:
-        gate = tuple(
-            dataclasses.replace(check, passed=check.passed and check.option not in failed)
-            for check in calibration.gate
-        )
-        return verdict.next_step(dataclasses.replace(calibration, accepted=False, gate=gate))
-
-    missed = 'The sigmas hold, but miss a requirement. To reduce the sigma of the'
-    assert step('requirements').startswith(missed)
-    assert 'Do not use it' in step('requirements', 'min_images')
-    assert step('min_images').endswith('Mend the causes of the failed checks and calibrate again.')
+    assert calibration.model_checks is not None
+    checks = dataclasses.replace(
+        calibration.model_checks,
+        field_rms_px=0.25,
+        field_worst_px=worst_px,
+        image_variation_px=variation_px,
+    )
+    first_ns = calibration.time_ns - 540 * 10**9
+    shown = dataclasses.replace(
+        calibration, model_checks=checks, zero_skew_cost_px=0.5, first_image_ns=first_ns
+    )
+    mean = 'the calibration is that of the mean over the 9 minutes of the images'
+    assert verdict.model_sentences(shown) == [
+        f'Field in addition to the lens model: {field}; another lens_model may lower it.',
+        'camera_info, without field and skew, differs from the calibration by at most 0.5 px.',
+        'For lines of sight with the field use starcal lookup.',
+        f'The camera varies by {varies} in a corner; {mean}.',
+    ]
+    assert verdict.model_sentences(dataclasses.replace(shown, model_checks=None)) == []
 
 
 def test_the_summary_is_a_line() -> None:

@@ -14,8 +14,9 @@ from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment.budget import sigma_budget, statements
-from starcal_ros.assessment.gate import GateOptions, model_gate, remedy_against
+from starcal_ros.assessment.gate import GateOptions, model_gate
 from starcal_ros.assessment.model_checks import model_checks
+from starcal_ros.assessment.remedies import remedy_against
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation import unknowns
 from starcal_ros.estimation.calibrate import Estimate

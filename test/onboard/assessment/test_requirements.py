@@ -9,19 +9,14 @@ import numpy as np
 import pytest
 from sample_records import calibration  # type: ignore[import-not-found]
 
-from starcal_ros.assessment.gate import (
-    reasons_of,
-    REMEDIES,
-    remedy_against,
-    Requirement,
-    requirement_checks,
-    requirements_of,
-)
+from starcal_ros.assessment.gate import reasons_of
+from starcal_ros.assessment.remedies import REMEDIES, remedy_against
+from starcal_ros.assessment.requirements import Requirement, requirement_checks, requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.unknowns import UNKNOWNS
-from starcal_ros.records import Calibration, CameraGeometry, DetectorMaps, SigmaPart
+from starcal_ros.records import Calibration, CameraGeometry, DetectorMaps, SigmaPart, Statement
 
 CAMERA = CameraModel(640, 512, np.r_[1800.0, 0.0, 1801.0, 319.5, 255.5, np.zeros(5)])
 SIGMA = np.r_[0.1, 0.0, 0.2, 0.3, 0.4, 5 * [0.01], 3 * [4.0 * ARCSECOND_RAD]]
@@ -102,6 +97,22 @@ def test_what_is_missed_names_what_lowers_that_sigma_most() -> None:
     assert notes == [remedy_against('read-out'), slow, remedy_against('read-out'), slow]
 
 
+def test_a_missed_requirement_has_the_gain_of_stating_its_largest_cause() -> None:
+    """Only of the scope that is limited, and of no other cause."""
+    slow = 'star tracker slow error'
+    found = dataclasses.replace(
+        with_causes(SigmaPart('stars', 0.6, 0.7, ''), SigmaPart(slow, 0.0, 8.9, '')),
+        statements=(
+            Statement('velocity', 'known', 'pointing', 9.0, 1.0, 'velocity'),
+            Statement('star_tracker_slow_arcsec', '5', 'pointing', 9.0, 1.4, slow),
+        ),
+    )
+    texts = 'line_of_sight=1arcsec', 'alignment_x=0.1arcsec', 'map=1e-3arcsec'
+    notes = [check.note.partition('; ')[2] for check in requirement_checks(found, texts)]
+    gain = 'state star_tracker_slow_arcsec: 9″ becomes 1.4″ if it is 5'
+    assert notes == [gain, gain, 'take more images']
+
+
 def test_the_reason_that_a_requirement_is_missed_has_at_most_200_characters() -> None:
     maps = DetectorMaps(np.ones((10, 10), np.int64), 1234.5 * CELLS, 123.45 * CELLS)
     texts = 'line_of_sight=1234arcsec', 'map=123.4arcsec@99.5%', 'pointing=1.234arcsec'
@@ -131,7 +142,7 @@ def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
         ('line_of_sight=5px', 'write line_of_sight=5arcsec'),
         ('map=5', 'write map=5arcsec or map=5px'),
         ('k1=1px', 'write k1=1'),
-        ('f=0.1.2px', 'not a number'),
+        ('f=0.1.2px', 'is not of the form'),
         ('f=0.1px@98%', 'only line_of_sight and map are over a share'),
         ('map=0px', 'finite and above 0, and the share at most 100 %'),
         ('map=1e999px', 'finite and above 0'),

@@ -9,7 +9,7 @@ import re
 import pytest
 
 import starcal_ros
-from starcal_ros.assessment.gate import REMEDIES
+from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.estimation.unknowns import UNKNOWNS
 from starcal_ros.options import names_of
 from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES

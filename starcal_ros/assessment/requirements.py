@@ -1,0 +1,249 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Requirements on sigmas: their names and units, their texts, and the answer of a calibration.
+
+`QUANTITIES` has the names, which ``starcal plan --minimise`` accepts too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+import functools
+import math
+import re
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.observability import map_sigma_px
+from starcal_ros.assessment.remedies import remedy_against
+from starcal_ros.camera import INTRINSIC_NAMES
+from starcal_ros.camera.lens import LENSES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.record_fields import nearest
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    DetectorMaps,
+    GateCheck,
+    SigmaPart,
+    TOTAL,
+)
+from starcal_ros.text import significant
+from starcal_ros.untrusted import shown
+
+REQUIREMENTS, _NONE = 'requirements', 'none'
+LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
+FOCAL_LENGTHS = ('fx', 'fy')
+_LARGEST, _RMS = 'largest ', 'rms '  # over the detector
+_NUMBER = r'((?:\d+\.?\d*|\.\d+)(?:e-?\d+)?)'
+_FORM = re.compile(rf'\s*(\w+)\s*=\s*{_NUMBER}\s*([a-z]*)\s*(?:@\s*{_NUMBER}\s*%\s*)?')
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """
+    A 1-sigma that may be limited, or lowered by a plan.
+
+    Attributes
+    ----------
+    units : tuple of str
+        Units of a limit, the default first; empty text for a pure number.
+    sigma : callable
+        Returns it by calibration and unit, NaN where it is not estimated; all values over the
+        detector if ``statistic`` is their largest.
+    statistic : str
+        `_LARGEST` or `_RMS` over the detector; empty for a parameter.
+    of_camera, of_alignment : bool
+        True if the camera alone, or the alignment, contributes to it.
+    """
+
+    units: tuple[str, ...]
+    sigma: Callable[[Calibration, str], Floats | float]
+    statistic: str = ''
+    of_camera: bool = True
+    of_alignment: bool = False
+
+    def variance_arcsec2(self, part: SigmaPart) -> float:
+        """Return the contribution of a cause to the variance, that of a map at its largest."""
+        of_map = part.map_arcsec
+        if self.statistic != _RMS:
+            of_map = max(part.map_over_detector_arcsec, default=of_map)
+        turned = part.pointing_arcsec**2 - part.map_arcsec**2
+        return of_map**2 * self.of_camera + turned * self.of_alignment
+
+
+def _maps(calibration: Calibration) -> DetectorMaps:
+    if calibration.maps is None:
+        raise ValueError('calibration: the gate needs its detector maps')
+    return calibration.maps
+
+
+def _line_of_sight(calibration: Calibration, _: str) -> Floats:
+    # Without an alignment the common rotation has no meaning.
+    maps, is_alone = _maps(calibration), not calibration.has_alignment
+    return maps.shape_sigma_arcsec if is_alone else maps.line_of_sight_sigma_arcsec
+
+
+def _map(calibration: Calibration, unit: str) -> Floats | float:
+    if unit == 'arcsec':
+        return _maps(calibration).shape_sigma_arcsec
+    try:
+        return map_sigma_px(calibration.geometry.camera, calibration.map_covariance)
+    except np.linalg.LinAlgError:
+        return math.nan
+
+
+def _pointing(calibration: Calibration, _: str) -> float:
+    budget = calibration.sigma_budget if calibration.has_alignment else ()
+    return next((part.pointing_arcsec for part in budget if part.cause == TOTAL), math.nan)
+
+
+def _of_parameters(names: tuple[str, ...], calibration: Calibration, unit: str) -> float:
+    sigma = dict(zip(calibration.parameter_names, calibration.sigma, strict=True))
+    # A held parameter has no sigma of its own.
+    known = [sigma.get(name, 0.0) or math.nan for name in names]
+    return float(np.max(known)) / (ARCSECOND_RAD if unit == 'arcsec' else 1.0)
+
+
+def _parameters(unit: str, *names: str, of_alignment: bool = False) -> Quantity:
+    sigma = functools.partial(_of_parameters, names)
+    return Quantity((unit,), sigma, of_camera=not of_alignment, of_alignment=of_alignment)
+
+
+QUANTITIES: Mapping[str, Quantity] = {
+    LINE_OF_SIGHT: Quantity(('arcsec',), _line_of_sight, _LARGEST, of_alignment=True),
+    MAP: Quantity(('arcsec', 'px'), _map, _LARGEST),
+    POINTING: Quantity(('arcsec',), _pointing, _RMS, of_alignment=True),
+    FOCAL: _parameters('px', *FOCAL_LENGTHS),
+    **{name: _parameters('px', name) for name in INTRINSIC_NAMES},
+    **{name: _parameters('arcsec', name, of_alignment=True) for name in ALIGNMENT_NAMES},
+    **{name: _parameters('', name) for lens in LENSES.values() for name in lens.coefficients},
+}
+"""Name -> row; `Requirement` describes each."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """
+    An upper limit of a 1-sigma.
+
+    ``name`` is ``line_of_sight``, ``map`` (the camera alone, the rotation common to the detector
+    removed), each over a ``share`` of the detector; ``pointing`` (lines of sight in the star
+    tracker frame, RMS over the detector), ``f`` (both focal lengths), or a parameter.
+
+    >>> Requirement.of('line_of_sight=5arcsec@98%')
+    Requirement(name='line_of_sight', limit=5.0, unit='arcsec', share=0.98)
+    """
+
+    name: str
+    limit: float
+    unit: str
+    share: float = 1.0
+
+    @classmethod
+    def of(cls, text: str) -> Requirement:
+        """Requirement of a text; raises OptionError with what is allowed."""
+        match = _FORM.fullmatch(text)
+        if match is None:
+            raise OptionError(
+                f'{REQUIREMENTS}: {shown(text)} is not of the form line_of_sight=5arcsec@98%,'
+                ' map=0.1px, pointing=10arcsec or f=0.1px'
+            )
+        name, number, unit, percent = match.groups()
+        if name not in QUANTITIES:
+            raise OptionError(
+                f'{REQUIREMENTS}: {name} is not line_of_sight, map, pointing, f or a'
+                f' parameter{nearest(name, QUANTITIES)}'
+            )
+        quantity = QUANTITIES[name]
+        has_share = quantity.statistic == _LARGEST
+        if unit not in quantity.units:
+            over = f'@{percent}%' if percent and has_share else ''
+            written = ' or '.join(f'{name}={number}{known}{over}' for known in quantity.units)
+            raise OptionError(f'{REQUIREMENTS}: {text}: the unit does not fit: write {written}')
+        limit, share = float(number), float(percent or 100.0) / 100.0
+        if percent and not has_share:
+            raise OptionError(
+                f'{REQUIREMENTS}: {text}: only line_of_sight and map are over a share'
+            )
+        if not (0.0 < limit < math.inf and 0.0 < share <= 1.0):
+            raise OptionError(
+                f'{REQUIREMENTS}: {text}: the sigma must be finite and above 0, and the share at'
+                ' most 100 %'
+            )
+        return cls(name, limit, unit, share)
+
+    @property
+    def quantity(self) -> Quantity:
+        """Row of `QUANTITIES`."""
+        return QUANTITIES[self.name]
+
+    def __str__(self) -> str:
+        """Return the limited sigma in words."""
+        if self.share < 1.0:
+            return f'1-sigma of {self.name} over {100 * self.share:g} %'
+        return f'{self.quantity.statistic}1-sigma of {self.name}'
+
+    def sigma(self, calibration: Calibration) -> float:
+        """
+        The sigma of a calibration in the unit; NaN where a part of it is not known.
+
+        Raises ValueError when the calibration has no maps.
+        """
+        sigma = np.ravel(self.quantity.sigma(calibration, self.unit))
+        known = np.where(np.isfinite(sigma), sigma, np.inf)
+        limit = float(np.quantile(known, self.share, method='inverted_cdf'))
+        return limit if math.isfinite(limit) else math.nan
+
+    def remedy(self, calibration: Calibration) -> str:
+        """Against the largest cause of the sigma: what to state, and its gain, or a remedy."""
+        causes = [part for part in calibration.sigma_budget if part.cause != TOTAL]
+        if not causes:
+            return ''
+        cause = max(causes, key=self.quantity.variance_arcsec2).cause
+        is_aligned = self.quantity.of_alignment and calibration.has_alignment
+        scope = 'pointing' if is_aligned else 'camera'
+        for one in calibration.statements:
+            if (one.cause, one.scope) == (cause, scope):
+                return f'state {one.option}: {one.gain}'
+        return remedy_against(cause)
+
+
+def requirements_of(texts: Iterable[str]) -> tuple[Requirement, ...]:
+    """Requirements of the option, none for ``none``; raises OptionError for any other text."""
+    texts = tuple(texts)
+    if '' in texts:  # a shell variable that is not set; without the option the defaults hold
+        raise OptionError(
+            f'{REQUIREMENTS}: an empty text is no requirement: leave the option out for the'
+            ' defaults, or write none to require no sigma'
+        )
+    return () if texts == (_NONE,) else tuple(map(Requirement.of, texts))
+
+
+def requirement_checks(calibration: Calibration, texts: Iterable[str]) -> Iterator[GateCheck]:
+    """
+    A check of each requirement, with by how much it is missed and what lowers the sigma.
+
+    Raises ValueError when the calibration has no maps.
+    """
+    for wanted in requirements_of(texts):
+        sigma = wanted.sigma(calibration)
+        passed = sigma <= wanted.limit  # NaN is not
+        note = 'met' if passed else 'it is not estimated'
+        if sigma > wanted.limit:
+            unit = wanted.unit and f' {wanted.unit}'
+            missed = f'missed by {significant(sigma - wanted.limit, 2)}{unit}'
+            note = '; '.join(filter(None, [missed, wanted.remedy(calibration)]))
+        yield GateCheck(str(wanted), REQUIREMENTS, sigma, wanted.limit, wanted.unit, passed, note)
+
+
+def requirement_answers(calibration: Calibration) -> tuple[str, ...]:
+    """A sentence on each requirement of a judged calibration: the sigma, the limit, the note."""
+    return tuple(
+        f'{check.name} {check.found_text}, at most {check.limit_text} required: {check.note}'
+        for check in calibration.gate
+        if check.option == REQUIREMENTS
+    )
