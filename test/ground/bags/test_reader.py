@@ -306,6 +306,33 @@ def test_truncated_bag(tmp_path: Path, folder: Path) -> None:
     assert most == 6
 
 
+def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
+    """A flipped bit in a chunk is reported, and no wrong pixel is read."""
+    whole = next(folder.glob('*.mcap')).read_bytes()
+    sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
+    with next(folder.glob('*.mcap')).open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    random = np.random.default_rng(5)
+    file = tmp_path / 'flipped.mcap'
+    for chunk in summary.chunk_indexes:
+        head = chunk.chunk_start_offset
+        # The kind of the record, its checksum's last bytes, and some of its content.
+        content = random.integers(head + 60, head + chunk.chunk_length, 8)
+        for offset in [head, *content]:
+            damaged = bytearray(whole)
+            damaged[offset] ^= 1 << int(random.integers(8))
+            file.write_bytes(damaged)
+            said: list[str] = []
+            images = images_of(file, on_damage=said.append)
+            assert said, offset
+            assert all('\n' not in text for text in said)
+            for image in images:
+                assert isinstance(image, Image)
+                k = (image.time_ns - START_NS) // SECOND_NS
+                np.testing.assert_array_equal(image.pixels, sound[k])
+
+
 @pytest.mark.parametrize('is_stated', [True, False])
 def test_a_checksum_of_all_data_is_compared(tmp_path: Path, is_stated: bool) -> None:
     """A bit outside all messages: what a file states is checked, most recorders state none."""
@@ -426,6 +453,21 @@ def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> N
         counted = [int(n) for text in said for n in re.findall(r'(\d+) of \d+ on ', text)]
         assert sum(counted) == missing
     bag_reader.topics([file], said.append)
+
+
+def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
+    """Reading a file with random bytes never raises an unexpected error."""
+    whole = np.frombuffer(next(folder.glob('*.mcap')).read_bytes(), np.uint8)
+    random = np.random.default_rng(6)
+    file = tmp_path / 'rubbish.mcap'
+    for _ in range(60):
+        damaged = whole.copy()
+        start = int(random.integers(8, len(damaged) - 64))
+        damaged[start : start + 64] = random.integers(0, 256, 64)
+        file.write_bytes(damaged.tobytes())
+        said: list[str] = []
+        images_of(file, on_damage=said.append)
+        bag_reader.topics([file], said.append)
 
 
 @pytest.mark.parametrize('indexed', [False, True])
