@@ -27,6 +27,7 @@ from starcal_ros.sky.attitude import Attitude, AttitudeHistory, attitudes_at
 from starcal_ros.stars.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.stars.hot_pixels import HotPixels, learn_hot_pixels
 from starcal_ros.stars.image_model import saturation_level
+from starcal_ros.stars.pixel_noise import quantisation_step_dn
 
 _SAME_ATTITUDE = 1e-12  # difference of a component; interpolation of equal samples rounds at 1e-16
 _TURN_SIGMAS = 2.0  # a coarse star tracker may repeat its output within its noise
@@ -232,7 +233,9 @@ def _without_dark(image: Image, setup: Setup) -> Image:
     level: Pixels = cv2.subtract(raised, dark - below)  # type: ignore[assignment]
     # Saturated pixels stay at the end of the range, so that they are still found.
     peak = int(pixels.max())
-    level[(level > peak) | (pixels >= (saturation_level(pixels, setup.centroid) or np.inf))] = peak
+    step_dn = quantisation_step_dn(pixels)
+    full_dn = saturation_level(pixels, setup.centroid, step_dn) or np.inf
+    level[(level > peak) | (pixels >= full_dn)] = peak
     return Image(image.time_ns, level)
 
 

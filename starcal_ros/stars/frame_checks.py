@@ -26,6 +26,7 @@ from starcal_ros.options import option
 from starcal_ros.records import Image
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 from starcal_ros.stars.detection import filled, smooth_mesh
+from starcal_ros.stars.pixel_noise import CONVERTER_ENDS, quantisation_step_dn, rounding_noise_dn
 
 _ROWS = 64
 _GOLDEN = 0.618034
@@ -39,8 +40,6 @@ _SLOPE_LEFT = 7.0 / 24.0
 _MAX_SATURATED_FRACTION = 0.2
 # In pixel noise per pixel; this slope pulls the centroid of a star of 1 px by 0.25 sigma.
 _MAX_SLOPE = 0.05
-# Largest values of converters of 8 to 16 bits, in the low or in the high bits of 16.
-_ENDS_DN = (255, 1023, 4095, 16383, 65472, 65520, 65532, 65535)
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,8 @@ class RowSample:
 
     ``row`` (k,) numbers of the rows, ``step`` their mean distance, px; ``pixels`` (k, width) the
     rows; ``below`` every eighth pixel of the rows below them; ``noisy`` (k, m) mask of the
-    segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value.
+    segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value;
+    ``step_dn`` the quantisation step of the frame.
     """
 
     row: Indices
@@ -86,6 +86,7 @@ class RowSample:
     below: Pixels
     noisy: Mask
     constant: Mask
+    step_dn: int
 
     @functools.cached_property
     def distinctive(self) -> Mask:
@@ -114,6 +115,7 @@ def sample_rows(pixels: Pixels) -> RowSample:
         # this many pixels differ; one or two stars do not.
         noisy=unlike > 0.249,
         constant=unlike == 0.0,
+        step_dn=quantisation_step_dn(pixels),
     )
 
 
@@ -182,7 +184,8 @@ def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
     """Least value of a saturated pixel."""
     peak = int(sample.pixels.max())
     if not saturation_dn:
-        saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
+        is_end = peak / sample.step_dn in CONVERTER_ENDS
+        saturation_dn = 0.98 * peak if is_end else peak + 1.0
     # An integer, since a comparison with a float converts every pixel.
     return math.ceil(saturation_dn)
 
@@ -251,8 +254,7 @@ def _noise_dn(sample: RowSample, alive: Mask) -> float:
     here = _segments(sample.pixels)[:, :, 0].astype(np.int32)
     below = sample.below[:, :: _SEGMENT_PX // _BELOW_STEP_PX][:, : here.shape[1]]
     spread = median(np.abs(here - below)[alive])
-    # The second value is the noise of rounding to whole DN.
-    return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), math.sqrt(1.0 / 12.0))
+    return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), rounding_noise_dn(sample.step_dn))
 
 
 def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> float:

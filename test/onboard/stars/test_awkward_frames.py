@@ -63,6 +63,37 @@ def test_a_black_sky_has_few_false_sources() -> None:
     assert len(sources.snr) <= 10
 
 
+@pytest.mark.parametrize('read_noise', [1.0, 3.0], ids=['under half a step', 'over a step'])
+@pytest.mark.parametrize('step_dn', [1, 16, 17, 257], ids='step of {}'.format)
+def test_values_that_step_are_measured_as_those_of_fewer_bits(
+    step_dn: int, read_noise: float
+) -> None:
+    """8 bits in the high ones of 12 (16) or scaled to 16 (257): the sigma is that of 8 bits."""
+    xy = star_grid(3)
+    detector = dataclasses.replace(
+        QUIET, bits=8, read_noise_electrons=read_noise, electrons_per_dn=3.0, offset_dn=10.0
+    )
+    flux = np.random.default_rng(4).uniform(50.0, 6000.0, len(xy))
+    shown = expose(star_electrons(xy, flux, 0.95, SHAPE), detector, np.random.default_rng(5))
+    assert shown.max() == 255
+    stepped = shown.astype(np.uint16) * step_dn
+    sample = sample_rows(stepped)
+    mark = fingerprint(Image(1, stepped), sample)
+    screen(sample, mark, None, 0.0, None, ScreeningOptions())
+    for measure in (measure_background, sample_background):
+        scaled = measure(stepped).noise_dn / step_dn
+        assert scaled == pytest.approx(measure(shown).noise_dn, rel=1e-5)
+    expected, found = measured(shown, xy), measured(stepped, xy)
+    np.testing.assert_array_equal(found.refusal, expected.refusal)
+    # Single precision of the background, whose level is 10 steps: 1e-6 of a step.
+    good = expected.refusal == StarRefusal.NONE
+    assert np.count_nonzero(good) > 150
+    np.testing.assert_allclose(found.xy_px[good], expected.xy_px[good], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        found.covariance_px2[good], expected.covariance_px2[good], rtol=1e-3, atol=1e-9
+    )
+
+
 def test_a_masked_border_does_not_raise_the_noise() -> None:
     pixels = np.random.default_rng(3).normal(1000.0, 20.0, SHAPE).round().astype(np.uint16)
     whole = measure_background(pixels)
