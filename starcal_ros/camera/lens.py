@@ -491,9 +491,7 @@ def from_ros_distortion(distortion_model: str, D: Sequence[float]) -> tuple[str,
     No coefficients at all are zeros.  Raises ValueError for an unknown model or a wrong number of
     coefficients.
     """
-    named = [
-        lens for lens in LENSES.values() if distortion_model in (lens.ros, *lens.ros_aliases)
-    ]
+    named = [lens for lens in LENSES.values() if distortion_model in (lens.ros, *lens.ros_aliases)]
     if not named:
         known = ', '.join(dict.fromkeys(lens.ros for lens in LENSES.values()))
         raise ValueError(f'{distortion_model!r} is not {known}, thin_prism or fisheye')

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Checks of a frame as a whole, before any star is searched.
+Checks of a frame as a whole, before any star is searched, and of a flat field.
 
 A sample of rows, each with the row below it, is enough for all checks: 5 % of the pixels of a
 five-megapixel frame.  Noise makes a row of an intact frame differ from every other row of any
@@ -19,13 +19,13 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Indices, Mask, Pixels, Singles
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import Image
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
-from starcal_ros.stars.detection import filled, smooth_mesh
+from starcal_ros.stars.detection import detect, filled, measure_background, smooth_mesh
 from starcal_ros.stars.pixel_noise import CONVERTER_ENDS, quantisation_step_dn, rounding_noise_dn
 
 _ROWS = 64
@@ -40,6 +40,9 @@ _SLOPE_LEFT = 7.0 / 24.0
 _MAX_SATURATED_FRACTION = 0.2
 # In pixel noise per pixel; this slope pulls the centroid of a star of 1 px by 0.25 sigma.
 _MAX_SLOPE = 0.05
+_UNIT_DN = 30000  # level of a response of 1 in the 16-bit image that is searched for stars
+_STAR_SIGMA = 8.0  # detection limit in a flat field: the noise of five megapixels stays below
+_LEAST_RESPONSE = 0.1  # of a row or column that is divided by its own
 
 
 @dataclass(frozen=True)
@@ -299,3 +302,23 @@ def _middle_mean(ascending: Singles) -> Singles:
     """Means (down, across) of the middle half of each cell, free of stars and dead columns."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])
+
+
+def excess_of_stars(response: Floats) -> int:
+    """
+    Number of star-like bright spots of a response (height, width) beyond that of dark ones.
+
+    Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
+    """
+    level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
+    # Columns and rows with another gain have edges, whose maxima are not stars either.
+    level = level / np.maximum(np.median(level, axis=0), _LEAST_RESPONSE)
+    level = level / np.maximum(np.median(level, axis=1), _LEAST_RESPONSE)[:, None] * _UNIT_DN
+    bright, dark = (
+        detect(pixels, measure_background(pixels), _STAR_SIGMA)
+        for pixels in (
+            np.clip(np.rint(values), 0, 2 * _UNIT_DN).astype(np.uint16)
+            for values in (level, 2 * _UNIT_DN - level)
+        )
+    )
+    return len(bright.snr) - len(dark.snr)

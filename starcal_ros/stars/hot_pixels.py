@@ -7,7 +7,7 @@ A single pixel that is lit again after the sky has moved on is a defect of the d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -64,6 +64,11 @@ def hot_in_dark(dark: Pixels | None) -> HotPixels:
     spread = MAD_TO_SIGMA * median(np.abs(dark[::4, ::4] - level))
     limit = level + _HOT_SIGMA * max(spread, rounding_noise_dn(quantisation_step_dn(dark)))
     return HotPixels(np.flatnonzero(dark > limit)[:_MOST])
+
+
+def with_bad_pixels(hot: HotPixels, bad: Indices) -> HotPixels:
+    """Hot pixels and bad ones, flat indices (k,), together."""
+    return replace(hot, index=np.union1d(hot.index, bad)) if len(bad) else hot
 
 
 def learn_hot_pixels(

@@ -59,7 +59,7 @@ def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
     assert made.gate.max_change_px == 0.3
     assert made.frames.camera_frame == 'left_eye'
     assert made.catalog.magnitude.max() <= 6.0
-    assert made.dark is None
+    assert made.detector.dark is None
     np.testing.assert_array_equal(made.prior.camera.parameters, SCENARIO.prior.camera.parameters)
 
 

@@ -15,6 +15,7 @@ from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[imp
 from starcal_ground.products import write_camera_info
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image, StarObservations
 
@@ -45,7 +46,8 @@ def test_a_flat_field_restores_the_flux_of_the_stars(camera_yaml: Path, tmp_path
     dimmed = np.rint((image().pixels - offset) * flat + offset).clip(0, 4095).astype(np.uint16)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.fits')))
     # The pedestal of a dark frame: the offset is no signal.
-    setup = dataclasses.replace(setup, dark_pedestal_dn=round(offset))
+    detector = dataclasses.replace(setup.detector, pedestal_dn=round(offset))
+    setup = dataclasses.replace(setup, detector=detector)
     plain = load_setup(values(camera_yaml))
     ideal, without, with_flat = (
         observed(image().pixels, plain), observed(dimmed, plain), observed(dimmed, setup)
@@ -75,7 +77,7 @@ def test_a_bad_pixel_is_left_out_of_the_stars(camera_yaml: Path, tmp_path: Path)
     bad[v, u] = 1
     cv2.imwrite(str(tmp_path / 'bad.png'), bad)
     setup = load_setup(values(camera_yaml, bad_pixel_map=str(tmp_path / 'bad.png')))
-    assert setup.hot.index.tolist() == [v * WIDTH + u]
+    assert setup.detector.hot.index.tolist() == [v * WIDTH + u]
     after = observed(image().pixels, setup)
     assert before.catalog_id[star] not in after.catalog_id
     assert after.refused_stars['hot_pixel'] == before.refused_stars.get('hot_pixel', 0) + 1
@@ -86,8 +88,8 @@ def test_pixels_without_response_are_bad(camera_yaml: Path, tmp_path: Path) -> N
     flat[7, 9] = 50
     cv2.imwrite(str(tmp_path / 'flat.png'), flat)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
-    assert setup.hot.index.tolist() == [7 * WIDTH + 9]
-    same = observe.flattened(image(), setup.flat, 0)
+    assert setup.detector.hot.index.tolist() == [7 * WIDTH + 9]
+    same = flattened(image(), setup.detector.flat, 0)
     assert (same.pixels == image().pixels).all()
 
 
@@ -103,13 +105,13 @@ def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
     counts = np.random.default_rng(9).poisson(20000.0 * flat).astype(np.uint16)
     cv2.imwrite(str(tmp_path / 'flat.png'), counts)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
-    assert setup.flat is not None
+    assert setup.detector.flat is not None
 
 
 def test_saturated_pixels_stay_at_the_peak() -> None:
     pixels = np.array([[4095, 2000], [1000, 4095]], np.uint16)
     flat = np.array([[1.5, 0.25], [0.5, 0.5]])
-    found = observe.flattened(Image(1, pixels), flat, 0).pixels
+    found = flattened(Image(1, pixels), flat, 0).pixels
     assert found.tolist() == [[4095, 4095], [2000, 4095]]
 
 
