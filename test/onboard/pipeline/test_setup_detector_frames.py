@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[import-not-found]
 
-from starcal_ground.products import write_camera_info
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.detector_frames import flattened
@@ -20,12 +19,6 @@ from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image, StarObservations
 
 HEIGHT, WIDTH = 512, 640
-
-
-@pytest.fixture
-def camera_yaml(tmp_path: Path) -> Path:
-    write_camera_info(SCENARIO.prior.camera, tmp_path / 'camera.yaml')
-    return tmp_path / 'camera.yaml'
 
 
 def response() -> np.ndarray:
@@ -118,11 +111,11 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
 @pytest.mark.parametrize(
     ('name', 'content', 'words'),
     [
-        (
-            'flat_field',
-            np.ones((HEIGHT, WIDTH - 1), np.uint8),
-            'one channel of 640 x 512',
-        ),
+        ('dark_frame', np.zeros((HEIGHT, WIDTH - 1), np.uint16), 'one channel of 640 x 512'),
+        ('dark_frame', np.zeros((HEIGHT, WIDTH, 3), np.uint8), 'one channel of 640 x 512'),
+        ('dark_frame', np.zeros((HEIGHT, WIDTH), np.float32), 'one channel of 640 x 512'),
+        ('dark_frame', None, r'dark_frame: .*map.png: cannot be read: No such file'),
+        ('flat_field', np.ones((HEIGHT, WIDTH - 1), np.uint8), 'one channel of 640 x 512'),
         ('flat_field', np.zeros((HEIGHT, WIDTH), np.uint8), 'median is .*not positive'),
         ('flat_field', image().pixels, 'shows [0-9]+ stars: it is a frame of the sky'),
         ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'one channel of 640 x 512'),
@@ -133,7 +126,8 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
 def test_a_file_that_does_not_fit_is_named(
     camera_yaml: Path, tmp_path: Path, name: str, content: np.ndarray | None, words: str
 ) -> None:
-    path = tmp_path / 'map.png'
+    is_float = content is not None and content.dtype == np.float32
+    path = tmp_path / ('map.tiff' if is_float else 'map.png')
     if content is not None:
         cv2.imwrite(str(path), content)
     with pytest.raises(OptionError, match=words):

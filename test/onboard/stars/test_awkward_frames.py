@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_sky import QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader
 from starcal_ground.simulation.rendering import expose, star_electrons
-from starcal_ground.simulation.scenario import Detector
 from starcal_ros.records import Image, StarRefusal
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import (
@@ -26,16 +26,8 @@ from starcal_ros.stars.image_model import CentroidOptions, model_image
 from starcal_ros.stars.pixel_noise import NoiseSums
 
 SHAPE = (512, 640)
-QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 OPTIONS = CentroidOptions()
 WISPR = Path(__file__).parents[4] / 'shared' / 'realsky' / 'wispr_i_2022'
-
-
-def star_grid(seed: int, spacing: int = 32) -> np.ndarray:
-    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
-    v, u = np.mgrid[spacing : SHAPE[0] - spacing : spacing, spacing : SHAPE[1] - spacing : spacing]
-    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
-    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
 
 
 def measured(pixels: np.ndarray, xy: np.ndarray) -> Centroids:
@@ -69,7 +61,7 @@ def test_values_that_step_are_measured_as_those_of_fewer_bits(
     step_dn: int, read_noise: float
 ) -> None:
     """8 bits in the high ones of 12 (16) or scaled to 16 (257): the sigma is that of 8 bits."""
-    xy = star_grid(3)
+    xy = star_grid(3, 32)
     detector = dataclasses.replace(
         QUIET, bits=8, read_noise_electrons=read_noise, electrons_per_dn=3.0, offset_dn=10.0
     )
@@ -116,7 +108,7 @@ def test_undersampled_stars_are_found_and_their_covariance_holds() -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=0.47)
     squared, found_share = [], []
     for seed in range(4):
-        xy = star_grid(seed)
+        xy = star_grid(seed, 32)
         mean = star_electrons(xy, np.full(len(xy), 6000.0), detector.psf_sigma_px, SHAPE)
         rng = np.random.default_rng([seed, 1])
         pixels = expose(mean + detector.background_electrons, detector, rng)
@@ -139,7 +131,7 @@ def test_a_steady_slope_is_subtracted(slope: float) -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=1.0, bits=16)
     normalised, signed = [], []
     for seed in range(3):
-        xy = star_grid(seed)
+        xy = star_grid(seed, 32)
         mean = star_electrons(xy, np.full(len(xy), 2500.0), detector.psf_sigma_px, SHAPE)
         noise_e = measure_background(
             expose(np.full(SHAPE, detector.background_electrons), detector,

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from sample_sky import QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import centroid_bound
 from starcal_ground.simulation.rendering import expose, star_electrons
@@ -27,15 +28,7 @@ from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise, quantisation_s
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums
 
 SHAPE = (512, 640)
-QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 PSF, MOMENT = CentroidOptions(), CentroidOptions(centroid='moment')
-
-
-def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = SHAPE) -> np.ndarray:
-    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
-    v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
-    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
-    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
 
 
 def unlike_fluxes(seed: int, n: int) -> np.ndarray:
