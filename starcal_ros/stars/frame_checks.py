@@ -42,7 +42,7 @@ _MAX_SATURATED_FRACTION = 0.2
 _MAX_SLOPE = 0.05
 _UNIT_DN = 30000  # level of a response of 1 in the 16-bit image that is searched for stars
 _STAR_SIGMA = 8.0  # detection limit in a flat field: the noise of five megapixels stays below
-_LEAST_RESPONSE = 0.1  # of a row or column that is divided by its own
+_LEAST_RESPONSE = 0.1  # a darker row or column is not brought to the level of the others
 
 
 @dataclass(frozen=True)
