@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, rows_of, Singles
 from starcal_ros.robust_statistics import median, medians
 from starcal_ros.stars.pixel_noise import quantisation_step_dn, rounding_noise_dn
 
@@ -92,7 +92,7 @@ class Sources:
 
     def select(self, rows: Mask | slice) -> Sources:
         """Return some of the sources, of the same area."""
-        return Sources(self.xy_px[rows], self.snr[rows], self.searched_px2)
+        return rows_of(self, rows)
 
 
 def measure_background(pixels: Pixels) -> Background:
