@@ -24,6 +24,7 @@ from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.annotation import annotate
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.stars.hot_pixels import with_bad_pixels
 
 SCENARIO = scenario.scenario('tiny')
 PLAIN = setup_of(SCENARIO)
@@ -125,9 +126,9 @@ def spoilt_stars() -> tuple[Image, StarObservations]:
     bright = expose(mean)
     bright[hot[1], hot[0] + 1] += 60
     number = hot[1] * SHAPE[1] + hot[0] + 1
-    known = dataclasses.replace(
-        SETUP, hot=dataclasses.replace(SETUP.hot, index=np.array([number], np.int64))
-    )
+    hot_pixels = with_bad_pixels(SETUP.detector.hot, np.array([number], np.int64))
+    detector = dataclasses.replace(SETUP.detector, hot=hot_pixels)
+    known = dataclasses.replace(SETUP, detector=detector)
     image = Image(SCENARIO.time_ns(FIELD), bright)
     return image, observe.observe_next(image, attitudes(), known)[0]
 

@@ -157,7 +157,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         )
     difference: Floats = np.empty(0)
     covariance: Floats = np.empty((0, 0))
-    if camera_a.model == camera_b.model:
+    if camera_a.has_lens(camera_b.model):
         difference = parameter_difference(b.geometry, a.geometry)
         covariance = a.covariance + b.covariance
     sigma = np.sqrt(np.diag(covariance))

@@ -1,17 +1,29 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Planets in a field, and a detector without defects."""
+"""Images of a simulated campaign, where their stars are, planets; a detector without defects."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 import dataclasses
 
 import numpy as np
 
-from starcal_ground.simulation.scenario import Detector, Scenario, Scene
+from starcal_ground.simulation.rendering import render
+from starcal_ground.simulation.scenario import Detector, Scenario, Scene, scene
+from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
+from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
+from starcal_ros.records import CameraGeometry, StarObservations
 
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 # Venus, Jupiter, Mars, Saturn, Mercury, and Uranus, which resembles a star.
 PLANET_MAGNITUDES = np.array([-4.2, -2.3, -1.0, 0.4, 1.5, 5.8])
+
+
+def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = (512, 640)) -> np.ndarray:
+    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
+    v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
+    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
+    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
 
 
 def with_planets(scenario: Scenario, shown: Scene, seed: int) -> Scene:
@@ -34,3 +46,47 @@ def with_planets(scenario: Scenario, shown: Scene, seed: int) -> Scene:
         pixel_px=np.concatenate([shown.pixel_px, beside, anywhere]),
         flux_electrons=np.concatenate([shown.flux_electrons, light]),
     )
+
+
+def exposure_of(scenario: Scenario, index: int) -> tuple[Scene, Exposure]:
+    """Scene and image of a campaign, with the attitude of its star tracker."""
+    shown = scene(scenario, index)
+    image = render(scenario, shown, index)
+    return shown, Exposure(image, shown.icrf_from_star_tracker_xyzw, 0.5)
+
+
+def true_px(shown: Scene, catalog_id: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of stars of a scene by catalog number; NaN for those that it does not show."""
+    place = dict(zip(shown.catalog_id.tolist(), shown.pixel_px, strict=True))
+    pixels = [place.get(number, np.full(2, np.nan)) for number in catalog_id.tolist()]
+    return np.array(pixels).reshape(-1, 2)
+
+
+def errors_sigma(shown: Scene, found: StarObservations) -> np.ndarray:
+    """Errors (n, 2) of the centroids over their sigmas; NaN for a star that is not shown."""
+    sigma_px = np.sqrt(found.covariance_px2[:, [0, 2]])
+    return np.asarray((found.measured_px - true_px(shown, found.catalog_id)) / sigma_px)
+
+
+def started(
+    exposure: Exposure, geometry: CameraGeometry, search: StarSearch
+) -> tuple[StarObservations, TrackedCamera]:
+    """Observations of a searched image, and the track that it starts."""
+    found, instrument = observe_stars(exposure, geometry, search)
+    track = start_tracking(geometry, found, instrument)
+    assert track is not None
+    return found, track
+
+
+def tracked(
+    scenario: Scenario, indices: Iterable[int], search: StarSearch
+) -> Iterator[tuple[Scene, StarObservations, TrackedCamera]]:
+    """Images of a campaign: the first is searched from the prior, the others are tracked."""
+    track: TrackedCamera | None = None
+    for index in indices:
+        shown, exposure = exposure_of(scenario, index)
+        if track is None:
+            found, track = started(exposure, scenario.prior, search)
+        else:
+            found, track = track_stars(exposure, track, search)
+        yield shown, found, track

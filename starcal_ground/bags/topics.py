@@ -14,7 +14,7 @@ from starcal_ground.bags.reader import Topics as Topics
 from starcal_ros.constants import CLOCKS_SET_NS, utc_text
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages import message_codec as codec
-from starcal_ros.pipeline.observe import observe_next, Track
+from starcal_ros.pipeline.observe import observe_next, rewound, Track
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, OF_THE_STARS, StarObservations
 from starcal_ros.text import counted
@@ -205,7 +205,7 @@ def read(
             track = track if is_sequence else Track(setup.prior)
             # The stamps of a bag are all known: these are not images of a wrong stamp.
             if track.latest_ns is not None and time_ns < track.latest_ns:
-                track = dataclasses.replace(track, latest_ns=None, tracked_camera=None)
+                track = rewound(track)
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
             if on_image is not None:

@@ -265,8 +265,8 @@ def ideal_camera(size: tuple[int, int], focal_px: float, model: str = _PINHOLE) 
 
 def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -> CameraModel:
     """A camera of a model without distortion, of this half diagonal."""
-    half_ideal = math.tan(half_rad) if model == _PINHOLE else half_rad
-    return ideal_camera(size, half_px / half_ideal, model)
+    towards = np.array([math.sin(half_rad), 0.0, math.cos(half_rad)])
+    return ideal_camera(size, half_px / float(ideal_points(model, towards)[0]), model)
 
 
 def _first_match(
@@ -298,7 +298,7 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
     corner = (
         0.5 * math.hypot(sky.camera.width, sky.camera.height) / float(sky.camera.parameters[0])
     )
-    if sky.camera.model == _EQUIDISTANT or corner < _ONE_LENS:
+    if sky.camera.lens.is_angular or corner < _ONE_LENS:
         return sky
     # Without distortion: coefficients fitted to a perspective lens bend corners without stars.
     size, focal_px = (sky.camera.width, sky.camera.height), _focal_px(sky.camera, _EQUIDISTANT)

@@ -189,7 +189,7 @@ def parameter_rows(
 ) -> list[Row]:
     """Value, sigma and change of each camera parameter."""
     camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
-    if prior and prior.camera.model != camera.model:
+    if prior and not prior.camera.has_lens(camera.model):
         prior = None  # parameters of another lens model are no start of these
     changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
     rows = []

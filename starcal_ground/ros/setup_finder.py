@@ -33,12 +33,12 @@ from starcal_ground.diagnosis.diagnose import (
 )
 from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.pipeline import setup
+from starcal_ros.pipeline.detector_frames import NO_FRAMES
 from starcal_ros.processes import ChildProcess
 from starcal_ros.records import Image
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
-from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 
 NAME = 'setup_finder'
 _IMAGES = QoSProfile(depth=20)  # as in the star observer, so that both see the same
@@ -252,7 +252,7 @@ class Unmatched:
             question = (
                 tuple(self._images),
                 wire_attitudes(self._attitudes, self._setup.attitude.attitude_direction),
-                replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
+                replace(self._setup, detector=NO_FRAMES),
             )
             self._thread = threading.Thread(
                 target=self._ask, args=question, name='diagnose', daemon=True

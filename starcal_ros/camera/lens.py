@@ -60,6 +60,10 @@ class LensModel:
         Newton's method may start beyond the fold or a pole, from where it does not return.
     ros, ros_order : str, tuple of int
         ``distortion_model`` of a ``CameraInfo``, and the place of each number of its D.
+    ros_aliases : tuple of str
+        Other names of it in camera files.
+    fewest : int
+        Least number of coefficients in a camera file, without the last ones, which are zero.
     opencv : str
         Its namespace in OpenCV: ``pinhole`` (none) or ``fisheye``.
     mrcal, giant : str
@@ -83,6 +87,8 @@ class LensModel:
     opencv: str = 'pinhole'
     mrcal: str = ''
     giant: str = ''
+    ros_aliases: tuple[str, ...] = ()
+    fewest: int | None = None
 
 
 def lens_named(name: str) -> LensModel:
@@ -398,6 +404,8 @@ def _of_opencv(
         is_guarded=is_rational,
         mrcal=mrcal,
         giant=giant,
+        ros_aliases=('thin_prism', 'thin_prism_fraunhofer') if is_rational else (),
+        fewest=None if is_rational else 4,  # ROS 1 wrote no k3
     )
 
 
@@ -431,6 +439,7 @@ _EQUIDISTANT = LensModel(
     ),
     is_angular=True,
     opencv='fisheye',
+    ros_aliases=('fisheye',),
 )
 
 LENSES: dict[str, LensModel] = {
@@ -482,19 +491,17 @@ def from_ros_distortion(distortion_model: str, D: Sequence[float]) -> tuple[str,
     No coefficients at all are zeros.  Raises ValueError for an unknown model or a wrong number of
     coefficients.
     """
-    asked = 'equidistant' if distortion_model == 'fisheye' else distortion_model
-    if asked.startswith('thin_prism'):
-        asked = 'rational_polynomial'
-    named = [lens for lens in LENSES.values() if lens.ros == asked]
+    named = [lens for lens in LENSES.values() if distortion_model in (lens.ros, *lens.ros_aliases)]
     if not named:
         known = ', '.join(dict.fromkeys(lens.ros for lens in LENSES.values()))
         raise ValueError(f'{distortion_model!r} is not {known}, thin_prism or fisheye')
-    if not len(D) or (asked == 'plumb_bob' and len(D) == 4):  # ROS 1 wrote no k3
-        D = [*D, *[0.0] * (len(named[0].coefficients) - len(D))]
+    if not len(D):
+        return named[0].name, np.zeros(len(named[0].coefficients))
     for lens in named:
-        if len(lens.coefficients) == len(D):
-            values = np.empty(len(D))
-            values[list(lens.ros_order)] = D
+        count = len(lens.coefficients)
+        if len(D) in (count, lens.fewest):
+            values = np.zeros(count)
+            values[list(lens.ros_order[: len(D)])] = D
             return lens.name, values
     counts = ' or '.join(str(len(lens.coefficients)) for lens in named)
     raise ValueError(f'{len(D)} coefficients of {distortion_model}, which has {counts}')

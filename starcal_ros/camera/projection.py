@@ -107,6 +107,15 @@ class CameraModel(Record):
         return parameter_names(self.model)
 
     @property
+    def lens(self) -> lens.LensModel:
+        """Row of the lens model in `lens.LENSES`."""
+        return lens.LENSES[self.model]
+
+    def has_lens(self, model: str) -> bool:
+        """Return True if a lens model is that of this camera: its parameters mean the same."""
+        return self.model == model
+
+    @property
     def intrinsics(self) -> Floats:
         """(5,): fx, skew, fy, cx, cy."""
         return self.parameters[:5]
@@ -168,7 +177,7 @@ def check_plausible(camera: CameraModel) -> None:
     width, height = camera.width, camera.height
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     side_px = max(width, height)
-    if lens.LENSES[camera.model].is_angular:
+    if camera.lens.is_angular:
         least_px = float(np.hypot(width, height)) / (2 * np.pi)
     else:
         least_px = _MIN_FOCAL_OF_SIDE * side_px
@@ -350,7 +359,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         pixels = pixels - field.displacement_px(pixels)
     target = _plane_points(camera, pixels)
     # Newton's method does not return from beyond a fold or a pole: start and steps stay inside.
-    guarded = lens.LENSES[model].is_guarded
+    guarded = camera.lens.is_guarded
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
     error = np.full(target.shape, np.inf)
     for _ in range(_INVERSE_STEPS):
@@ -452,12 +461,12 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
         Largest pixel error over the grid; infinite where the model cannot see all of it, or no
         camera of the model is found.
     """
-    if model == camera.model and not camera.has_field:
+    if camera.has_lens(model) and not camera.has_field:
         return dataclasses.replace(camera, field=None), 0.0
     is_angular = lens.lens_named(model).is_angular
     names = parameter_names(model)
     known = dict(zip(camera.parameter_names, camera.parameters, strict=True))
-    same_plane = not (is_angular or lens.LENSES[camera.model].is_angular)
+    same_plane = not (is_angular or camera.lens.is_angular)
     start = np.array([known.get(name, 0.0) for name in names])
     if not same_plane:
         start[5:] = 0.0
@@ -475,9 +484,9 @@ def nearest_camera(
 
     Raises ValueError for an unknown model, or a name that is not one of its parameters.
     """
-    start = camera if model == camera.model else convert(camera, model)[0]
+    start = camera if camera.has_lens(model) else convert(camera, model)[0]
     start = dataclasses.replace(start.replace(**dict.fromkeys(zero, 0.0)), field=None)
-    unchanged = not camera.has_field and model == camera.model
+    unchanged = not camera.has_field and camera.has_lens(model)
     if unchanged and np.array_equal(start.parameters, camera.parameters):
         return start, 0.0
     free = [k for k, name in enumerate(start.parameter_names) if name not in zero]
@@ -500,7 +509,7 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     # Numerator and denominator of a rational polynomial can grow together: without a penalty
     # the coefficients reach 10^4 for a gain of 1e-3 px.
     held_px = np.diag(np.where(np.arange(len(start.parameters)) < 5, 0.0, _HELD_PX))[free][:, free]
-    if not lens.LENSES[start.model].is_redundant:
+    if not start.lens.is_redundant:
         held_px = held_px[:0]
 
     def residual(x: Floats) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.arrays import Floats, Indices, Mask, rows_of
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
@@ -44,14 +44,7 @@ class Prediction:
 
     def select(self, stars: Mask) -> Prediction:
         """Return the stars of a mask (n,)."""
-        rows = np.flatnonzero(stars)  # `take` needs a tenth of the time of a mask
-        return Prediction(
-            self.catalog_index.take(rows),
-            self.direction_icrf.take(rows, axis=0),
-            self.direction_camera.take(rows, axis=0),
-            self.xy_px.take(rows, axis=0),
-            self.camera,
-        )
+        return rows_of(self, stars)
 
 
 def predict(

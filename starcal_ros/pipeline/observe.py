@@ -8,16 +8,15 @@ import contextlib
 import dataclasses
 import math
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
 from starcal_ros.estimation.options import assumed_tracker_sigma_rad
-from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
+from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned, StarSearch
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.processes import one_blas_thread
@@ -26,7 +25,6 @@ from starcal_ros.sky.astrometry import velocity_of
 from starcal_ros.sky.attitude import Attitude, AttitudeHistory, attitudes_at
 from starcal_ros.stars.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.stars.hot_pixels import HotPixels, learn_hot_pixels
-from starcal_ros.stars.image_model import saturation_level
 
 _SAME_ATTITUDE = 1e-12  # difference of a component; interpolation of equal samples rounds at 1e-16
 _TURN_SIGMAS = 2.0  # a coarse star tracker may repeat its output within its noise
@@ -36,11 +34,24 @@ _IMAGES_OF_AN_UNFIT = 10  # cost of an unfit attitude: its search takes as long 
 
 
 @dataclasses.dataclass(frozen=True)
-class Unfit:
-    """Number of images for which a star tracker's attitude was unfit, and the last reason."""
+class TrackerState:
+    """
+    State of a star tracker in an image sequence.
 
-    images: int = 0
-    why: str = ''  # empty: its attitude was used since
+    ``geometry`` predicts the stars of a searched image, because mountings are not exact; None:
+    that of the track.  ``camera`` measures the next image without a search; None before the first
+    image.  ``first_with_same_attitude`` is the first image of the current run of bit-identical
+    attitudes of images used.  ``taken`` counts the images used, ``unfit`` those for which this
+    attitude was refused while another one was accepted, and ``why_unfit`` is the last reason;
+    empty: its attitude was used since.
+    """
+
+    geometry: CameraGeometry | None = None
+    camera: TrackedCamera | None = None
+    first_with_same_attitude: StarObservations | None = None
+    taken: int = 0
+    unfit: int = 0
+    why_unfit: str = ''
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,27 +60,31 @@ class Track:
     State of an image sequence.
 
     ``geometry`` predicts the stars of a searched image; ``latest_ns`` is the stamp of the last
-    image used.  ``tracked_camera`` measures the next image without a search; None before the first
-    image.  ``behind`` counts images in a row with stamps before the last one used, ``behind_ns``
-    is the stamp of the latest of them.  ``seen`` is the previous frame, used or not, which a stuck
-    camera repeats; ``hot`` are the hot pixels detected so far.
-    ``first_with_same_attitude`` is the first image of the current run of bit-identical attitudes
-    of images used.  ``taken`` counts the images of each star tracker;
-    ``others`` holds a state for each additional one, because mountings are not exact.  ``unfit``
-    lists star trackers whose attitude was refused while another one was accepted.
+    image used.  ``behind`` counts images in a row with stamps before the last one used,
+    ``behind_ns`` is the stamp of the latest of them.  ``seen`` is the previous frame, used or not,
+    which a stuck camera repeats; ``hot`` are the hot pixels detected so far.  ``trackers`` are the
+    states of the star trackers by their frames; the first one has the empty name.
     """
 
     geometry: CameraGeometry
     latest_ns: int | None = None
-    tracked_camera: TrackedCamera | None = None
     behind: int = 0
     behind_ns: int = 0
     seen: Fingerprint | None = None
     hot: HotPixels | None = None
-    first_with_same_attitude: StarObservations | None = None
-    taken: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    unfit: Mapping[str, Unfit] = dataclasses.field(default_factory=dict)
-    others: Mapping[str, Track] = dataclasses.field(default_factory=dict)
+    trackers: Mapping[str, TrackerState] = dataclasses.field(default_factory=dict)
+
+    def tracker(self, name: str) -> TrackerState:
+        """State of a star tracker; a new one before its first image."""
+        return self.trackers.get(name, TrackerState())
+
+
+def rewound(track: Track) -> Track:
+    """State that takes an image of any stamp next, and searches it."""
+    trackers = {
+        name: dataclasses.replace(tracker, camera=None) for name, tracker in track.trackers.items()
+    }
+    return dataclasses.replace(track, latest_ns=None, trackers=trackers)
 
 
 @one_blas_thread()
@@ -118,23 +133,26 @@ def observe_next(
             more_attitudes,
             setup.mountings[: len(more_attitudes)],
             setup.attitude.max_attitude_gap_s,
-            track.taken,
+            {name: tracker.taken for name, tracker in track.trackers.items()},
             assumed_tracker_sigma_rad(setup.calibration),
         )
         known |= vars(found[0]) | {'catalog_digest': setup.catalog.digest}
-        saturation_dn = setup.centroid.saturation_dn
-        screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
-        hot = (track.hot or setup.hot).index
-        exposure = Exposure(
-            flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
-            found[0].icrf_from_star_tracker_xyzw,
-            found[0].attitude_gap_s,
-            velocity,
-            setup.site,
-            hot,
-            temperature_degc,
-        )
-        observations, after = _with_any(found, exposure, setup, remembered)
+        detector, saturation_dn = setup.detector, setup.centroid.saturation_dn
+        screen(sample, seen, track.seen, saturation_dn, detector.dark, setup.screening)
+        corrected = detector.corrected(image, setup.centroid)
+        exposures = [
+            Exposure(
+                corrected,
+                attitude.icrf_from_star_tracker_xyzw,
+                attitude.attitude_gap_s,
+                velocity,
+                setup.site,
+                (track.hot or detector.hot).index,
+                temperature_degc,
+            )
+            for attitude in found
+        ]
+        observations, after = _with_any(found, exposures, setup, remembered)
         return dataclasses.replace(observations, pixel_digest=seen.digest), after
     except ImageRefused as refused:
         height, width = image.pixels.shape
@@ -145,13 +163,13 @@ def observe_next(
 
 
 def _with_any(
-    attitudes: Sequence[Attitude], exposure: Exposure, setup: Setup, track: Track
+    attitudes: Sequence[Attitude], exposures: Sequence[Exposure], setup: Setup, track: Track
 ) -> tuple[StarObservations, Track]:
     """Observations with the first attitude that leads to no refusal, else the first refusal."""
     refused_by_stars: list[tuple[StarObservations, Track]] = []
     errors: list[ImageRefused] = []
     unfit: dict[str, str] = {}
-    for attitude in attitudes:
+    for attitude, exposure in zip(attitudes, exposures, strict=True):
         try:
             observations, after = _with_one(attitude, exposure, setup, track)
         except ImageRefused as refused:
@@ -160,8 +178,7 @@ def _with_any(
         else:
             if not observations.refusal:
                 detail = '; '.join(unfit.values())
-                observations = dataclasses.replace(observations, detail=detail)
-                return observations, _with_fitness(after, attitude.star_tracker, unfit)
+                return dataclasses.replace(observations, detail=detail), _with_unfit(after, unfit)
             refused_by_stars.append((observations, after))
             why = f'{observations.refusal}: {observations.detail}'
         label = attitude.star_tracker or setup.frames.star_tracker_frame
@@ -171,15 +188,15 @@ def _with_any(
     return refused_by_stars[0]
 
 
-def _with_fitness(track: Track, used: str, unfit: Mapping[str, str]) -> Track:
-    """State after an image for which one star tracker was used and others were unfit."""
-    taken, known = dict(track.taken), dict(track.unfit)
-    if used in known:
-        known[used] = dataclasses.replace(known[used], why='')
+def _with_unfit(track: Track, unfit: Mapping[str, str]) -> Track:
+    """State after an image for which some star trackers were unfit, with the reason of each."""
+    trackers = dict(track.trackers)
     for name, why in unfit.items():
-        taken[name] = taken.get(name, 0) + _IMAGES_OF_AN_UNFIT
-        known[name] = Unfit(known.get(name, Unfit()).images + 1, why)
-    return dataclasses.replace(track, taken=taken, unfit=known)
+        own = track.tracker(name)
+        trackers[name] = dataclasses.replace(
+            own, taken=own.taken + _IMAGES_OF_AN_UNFIT, unfit=own.unfit + 1, why_unfit=why
+        )
+    return dataclasses.replace(track, trackers=trackers)
 
 
 def _with_one(
@@ -187,70 +204,50 @@ def _with_one(
 ) -> tuple[StarObservations, Track]:
     """Observations with an attitude; the new state updates that star tracker only."""
     name = attitude.star_tracker
-    # The error of the mounting exceeds the uncertainty of a tracked camera.
-    own = track.others.get(name, Track(track.geometry)) if name else track
-    before = dataclasses.replace(
-        track,
-        geometry=own.geometry,
-        tracked_camera=own.tracked_camera,
-        first_with_same_attitude=own.first_with_same_attitude,
-    )
-    exposure = dataclasses.replace(
-        exposure,
-        icrf_from_star_tracker_xyzw=attitude.icrf_from_star_tracker_xyzw,
-        attitude_gap_s=attitude.attitude_gap_s,
-    )
-    observations, after = _stars(exposure, setup, before)
+    before = track.tracker(name)
+    geometry = before.geometry or track.geometry
+    observations, geometry, camera = _stars(exposure, setup.star_search, geometry, before.camera)
     observations = dataclasses.replace(observations, **vars(attitude))
     if observations.refusal:
         return observations, track
-    first = _first_with_same_attitude(observations, before.first_with_same_attitude, setup)
-    after = dataclasses.replace(after, first_with_same_attitude=first)
-    taken = {**track.taken, name: track.taken.get(name, 0) + 1}
-    if not name:
-        return observations, dataclasses.replace(after, taken=taken)
+    own = TrackerState(
+        geometry if name else None,
+        camera,
+        _first_with_same_attitude(observations, before.first_with_same_attitude, setup),
+        before.taken + 1,
+        before.unfit,
+    )
+    hot = learn_hot_pixels(
+        track.hot or setup.detector.hot,
+        exposure.image.pixels,
+        observations.background_dn,
+        observations.noise_dn,
+        geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw),
+        float(geometry.camera.parameters[0]),
+    )
     return observations, dataclasses.replace(
         track,
-        latest_ns=after.latest_ns,
-        hot=after.hot,
-        taken=taken,
-        others={**track.others, name: dataclasses.replace(after, others={})},
+        geometry=track.geometry if name else geometry,
+        latest_ns=exposure.image.time_ns,
+        hot=hot,
+        trackers={**track.trackers, name: own},
     )
 
 
-def _without_dark(image: Image, setup: Setup) -> Image:
-    """Image minus dark frame, kept positive by adding the median of the dark frame."""
-    pixels, dark = image.pixels, setup.dark
-    if dark is None:
-        return image
-    if dark.dtype != pixels.dtype:
-        raise ImageRefused('bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}')
-    # Clipping noise below the dark level at zero would bias the background.
-    below = np.minimum(dark, dark.dtype.type(setup.dark_pedestal_dn))
-    raised = cv2.add(pixels, dark.dtype.type(setup.dark_pedestal_dn) - below)
-    # OpenCV's type stubs lack integer images.
-    level: Pixels = cv2.subtract(raised, dark - below)  # type: ignore[assignment]
-    # Saturated pixels stay at the end of the range, so that they are still found.
-    peak = int(pixels.max())
-    level[(level > peak) | (pixels >= (saturation_level(pixels, setup.centroid) or np.inf))] = peak
-    return Image(image.time_ns, level)
-
-
-def flattened(image: Image, flat: Floats | None, pedestal_dn: int) -> Image:
-    """
-    Image divided by the flat field above a pedestal; of blind pixels as it is.
-
-    The brightest pixels stay at the peak of the image, so that saturated ones are still found.
-    """
-    if flat is None:
-        return image
-    pixels = image.pixels
-    peak = int(pixels.max())
-    signal = (pixels.astype(np.float32) - pedestal_dn) / np.nan_to_num(flat, nan=1.0)
-    level = np.clip(np.rint(signal + pedestal_dn), 0, peak)
-    level[pixels == peak] = peak
-    cast = level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
-    return Image(image.time_ns, cast)
+def _stars(
+    exposure: Exposure,
+    search: StarSearch,
+    geometry: CameraGeometry,
+    tracked: TrackedCamera | None,
+) -> tuple[StarObservations, CameraGeometry, TrackedCamera | None]:
+    """Stars of an image by the camera of the images before it, or else by a search."""
+    if tracked is not None:
+        with contextlib.suppress(ImageRefused):  # the full search finds the reason of refusal
+            observations, camera = track_stars(exposure, tracked, search)
+            return observations, geometry, camera
+    observations, instrument = observe_stars(exposure, geometry, search)
+    geometry = realigned(geometry, observations)
+    return observations, geometry, start_tracking(geometry, observations, instrument)
 
 
 def _after_order(track: Track, time_ns: int) -> Track:
@@ -260,25 +257,11 @@ def _after_order(track: Track, time_ns: int) -> Track:
     behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1
     if behind < _IMAGES_OF_A_RESTART:
         return dataclasses.replace(track, behind=behind, behind_ns=time_ns)
-    return Track(track.geometry, hot=track.hot, unfit=track.unfit)
-
-
-def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
-    """Stars of an image by the track of the images before it, or else by a search."""
-    if track.tracked_camera is not None:
-        with contextlib.suppress(ImageRefused):  # the full search finds the reason of refusal
-            observations, tracked_camera = track_stars(
-                exposure, track.tracked_camera, setup.star_search
-            )
-            after = dataclasses.replace(track, tracked_camera=tracked_camera)
-            return observations, _after_image(after, exposure, observations, setup)
-    observations, instrument = observe_stars(exposure, track.geometry, setup.star_search)
-    if observations.refusal:
-        return observations, track
-    geometry = realigned(track.geometry, observations)
-    started = start_tracking(geometry, observations, instrument)
-    after = dataclasses.replace(track, geometry=geometry, tracked_camera=started)
-    return observations, _after_image(after, exposure, observations, setup)
+    trackers = {
+        name: TrackerState(unfit=tracker.unfit, why_unfit=tracker.why_unfit)
+        for name, tracker in track.trackers.items()
+    }
+    return Track(track.geometry, hot=track.hot, trackers=trackers)
 
 
 def _first_with_same_attitude(
@@ -318,21 +301,6 @@ def _first_with_same_attitude(
             f'one attitude, but the stars have turned {turned_arcsec:.0f} arcsec',
         )
     return first
-
-
-def _after_image(
-    track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
-) -> Track:
-    """Track with the stamp and the hot pixels of an image, by the alignment of the track."""
-    hot = learn_hot_pixels(
-        track.hot or setup.hot,
-        exposure.image.pixels,
-        observations.background_dn,
-        observations.noise_dn,
-        track.geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw),
-        float(track.geometry.camera.parameters[0]),
-    )
-    return dataclasses.replace(track, latest_ns=exposure.image.time_ns, hot=hot)
 
 
 def _check_size(image: Image, camera: CameraModel) -> None:

@@ -25,31 +25,29 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros import options
-from starcal_ros.arrays import AnyArray, Floats, Indices, Pixels
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.requirements import requirements_of
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import IngestError, OptionError
+from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     check_options,
 )
-from starcal_ros.formats.image_files import read_image
 from starcal_ros.formats.messages.sensor_messages import CHANNELS
 from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.options import option
+from starcal_ros.pipeline.detector_frames import DetectorFrames, NO_FRAMES, read_detector_frames
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions, Mounting
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog, StarCatalog
-from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.frame_checks import ScreeningOptions
-from starcal_ros.stars.hot_pixels import hot_in_dark, HotPixels, NO_HOT_PIXELS
 from starcal_ros.stars.image_model import CentroidOptions
 from starcal_ros.text import counted
 from starcal_ros.untrusted import shown
@@ -59,11 +57,6 @@ _LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 _RADIANS_BELOW, _DEGREES_BELOW = 1e-3, 1e-2
 _FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as many
 _FAINTEST = 100  # stars of the catalog about which its stars are counted
-_UNIT_DN = 30000  # level of a response of 1 in the 16-bit image that is searched for stars
-_STAR_SIGMA = 8.0  # detection limit in a flat field: the noise of five megapixels stays below
-_MOST_STARS = 5  # a flat field of the twilight may show as many
-_MOST_BAD = 0.5  # part of the pixels from which a map is taken to be inverted
-_LEAST = 0.1  # response over the median below which a pixel is bad: its noise is ten times larger
 
 
 def check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
@@ -217,12 +210,9 @@ class Setup:
     gate: GateOptions
     prior: CameraGeometry
     catalog: StarCatalog
-    dark: Pixels | None
-    dark_pedestal_dn: int = 0
-    hot: HotPixels = NO_HOT_PIXELS
+    detector: DetectorFrames = NO_FRAMES
     is_aligned: bool = True
     camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
-    flat: Floats | None = None
     mountings: tuple[Mounting, ...] = ()
     times_of: str = ''
     pixels_of: str = ''
@@ -408,19 +398,15 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
     if frames.catalog or magnitude_limit < BUNDLED_MAGNITUDE:
         check_field_of_stars(catalog, magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
-    dark = read_dark(frames.dark_frame, *size)
-    flat = read_flat(frames.flat_field, *size)
-    bad = read_bad_pixels(frames.bad_pixel_map, *size)
     return Setup(
         **groups,
         prior=prior,
         catalog=catalog,
-        dark=dark,
-        dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=with_bad_pixels(hot_in_dark(dark), bad, flat),
+        detector=read_detector_frames(
+            frames.dark_frame, frames.flat_field, frames.bad_pixel_map, *size
+        ),
         is_aligned=is_aligned,
         camera_name=camera_yaml.read_camera_name(frames.camera_info_url),
-        flat=flat,
         mountings=_mountings(groups['attitude'], frames, prior, is_aligned),
     )
 
@@ -507,92 +493,3 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
-
-
-def read_dark(path: str, width: int, height: int) -> Pixels | None:
-    """Pixels (height, width) of a dark frame; None without a path; raises as `read_flat`."""
-    if not path:
-        return None
-    values = _read('dark_frame', path, width, height)
-    if values.dtype not in (np.uint8, np.uint16):
-        raise OptionError(
-            f'dark_frame: {path} is {values.dtype}, expected unsigned 8 or 16 bit, one channel of'
-            f' {width} x {height}'
-        )
-    return values
-
-
-def read_flat(path: str, width: int, height: int) -> Floats | None:
-    """
-    Response (height, width) of the pixels, median 1; NaN where it is under a tenth of that.
-
-    None without a path. Raises OptionError when the file is missing, damaged or of another size,
-    or holds no positive number or stars.
-    """
-    if not path:
-        return None
-    values = _read('flat_field', path, width, height).astype(np.float64)
-    with np.errstate(all='ignore'):
-        middle = float(np.nanmedian(values))
-        response = values / middle
-    if not middle > 0:
-        raise OptionError(f'flat_field: {path}: the median is {middle:g}, not positive')
-    stars = _excess_of_stars(response)
-    if stars > _MOST_STARS:
-        raise OptionError(
-            f'flat_field: {path} shows {stars} stars: it is a frame of the sky; give a frame of an'
-            ' evenly lit field, without its bias'
-        )
-    response[~(response >= _LEAST)] = np.nan
-    return np.asarray(response)
-
-
-def read_bad_pixels(path: str, width: int, height: int) -> Indices:
-    """Flat indices (k,) of the pixels of a map that are not 0; raises as `read_flat`."""
-    if not path:
-        return np.empty(0, np.int64)
-    bad = np.flatnonzero(_read('bad_pixel_map', path, width, height))
-    if len(bad) > _MOST_BAD * width * height:
-        raise OptionError(
-            f'bad_pixel_map: {path} marks {len(bad) / (width * height):.0%} of the pixels as bad:'
-            ' write 0 for good pixels, any other value for bad ones'
-        )
-    return bad
-
-
-def _excess_of_stars(response: Floats) -> int:
-    """
-    Number of star-like bright spots of a response beyond that of dark ones.
-
-    Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
-    """
-    level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
-    # Columns and rows with another gain have edges, whose maxima are not stars either.
-    level = level / np.maximum(np.median(level, axis=0), _LEAST)
-    level = level / np.maximum(np.median(level, axis=1), _LEAST)[:, None] * _UNIT_DN
-    bright, dark = (
-        detect(pixels, measure_background(pixels), _STAR_SIGMA)
-        for pixels in (
-            np.clip(np.rint(values), 0, 2 * _UNIT_DN).astype(np.uint16)
-            for values in (level, 2 * _UNIT_DN - level)
-        )
-    )
-    return len(bright.snr) - len(dark.snr)
-
-
-def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPixels:
-    """Hot pixels, bad pixels and those without response in the flat field, together."""
-    blind = np.empty(0, np.int64) if flat is None else np.flatnonzero(np.isnan(flat))
-    index = np.union1d(np.union1d(hot.index, bad), blind)
-    return replace(hot, index=index) if len(index) else hot
-
-
-def _read(name: str, path: str, width: int, height: int) -> AnyArray:
-    expected = f'expected one channel of {width} x {height}'
-    try:
-        values = read_image(Path(path.removeprefix('file://'))).values
-    except IngestError as error:
-        raise OptionError(f'{name}: {error}; {expected}') from error
-    if values.shape != (height, width):
-        raise OptionError(f'{name}: {path} is of shape {values.shape}, {expected}')
-    return values

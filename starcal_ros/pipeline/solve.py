@@ -297,7 +297,7 @@ def estimate_with_smallest_lens(
         try:
             estimate = estimate_calibration(ensemble, started, options, colours_of)
         except TooFewObservations as error:
-            shortage = error if model == prior.camera.model else shortage
+            shortage = error if prior.camera.has_lens(model) else shortage
             continue  # the stars do not determine this model
         if estimate.termination != 'converged' and best is not None:
             continue  # lost on the way: its lack of a field means nothing

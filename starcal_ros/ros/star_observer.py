@@ -151,8 +151,12 @@ class StarObserver(StarcalNode):
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
         counts = dict(self._counts)  # the worker thread continues counting
-        unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
-        not_used = [f'{name or first}: {tracker.images}' for name, tracker in unfit.items()]
+        trackers, first = self._track.trackers, self._setup.frames.star_tracker_frame
+        not_used = [
+            f'{name or first}: {tracker.unfit}'
+            for name, tracker in trackers.items()
+            if tracker.unfit
+        ]
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
@@ -177,7 +181,7 @@ class StarObserver(StarcalNode):
             return WARN, self._withdrawn, numbers
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
-        if why_not := [tracker.why for tracker in unfit.values() if tracker.why]:
+        if why_not := [tracker.why_unfit for tracker in trackers.values() if tracker.why_unfit]:
             return WARN, '; '.join(why_not), numbers
         if bad_velocity := self._bad_velocity or self._doubt_of_velocity():
             return WARN, bad_velocity, numbers

@@ -9,7 +9,7 @@ The bundled file covers the whole sky to V = 9, merged from Gaia DR3, Hipparcos-
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property, lru_cache, partial
 import hashlib
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import AnyArray, Codes, Floats, Indices, Mask, Rows, Singles
+from starcal_ros.arrays import AnyArray, Codes, Floats, Indices, Mask, Rows, rows_of, Singles
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, errors_as
 from starcal_ros.untrusted import read_archive
@@ -174,12 +174,7 @@ class StarCatalog:
 
     def select(self, rows: Mask | Indices | Rows | slice) -> StarCatalog:
         """Return the stars selected by a mask (n,), row numbers or a slice, in that order."""
-        columns = {
-            field.name: getattr(self, field.name)[rows]
-            for field in fields(self)
-            if field.name not in ('epoch_jyear', 'digest', 'deeper')
-        }
-        return replace(self, **columns)
+        return rows_of(self, rows)
 
     def place_sigma_rad(self, rows: Indices | Rows, jyear: float) -> Floats:
         """

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Mask, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, rows_of
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import centre_and_scatter, MAD_TO_SIGMA, medians
 from starcal_ros.stars import detection, psf_fit
@@ -501,7 +501,7 @@ def learn(
     # Fainter stars show no PSF error, so that it can be separated from photon noise.
     shown = stars[:_MOST]
     noise = psf_fit.noise_sums(
-        psf_fit.select(measured.fit, shown),
+        rows_of(measured.fit, shown),
         measured.noise_dn[measured.fitted[shown]],
         model.pixel_noise,
     )
@@ -512,7 +512,7 @@ def learn(
         )
     if len(bright) < FEWEST_BRIGHT:
         return None if before is None else dataclasses.replace(before, noise=noise)
-    fit, row = psf_fit.select(measured.fit, bright), measured.fitted[bright]
+    fit, row = rows_of(measured.fit, bright), measured.fitted[bright]
     variance = measured.psf_sigma_px[row] ** 2
     median, scatter = centre_and_scatter(fit.shape_change)
     change = fit.shape_change[:, :2].mean(axis=1)

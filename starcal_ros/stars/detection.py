@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, rows_of, Singles
 from starcal_ros.robust_statistics import median, medians
+from starcal_ros.stars.pixel_noise import quantisation_step_dn, rounding_noise_dn
 
 DETECTION_SIGMA = 5.0  # noise alone exceeds it at 0.6 places of a megapixel
 _MESH_PX = 64  # glare and vignetting vary slowly over it
 _MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise to 5 %
 GAP_SIGMA = 8.0  # a pixel of 0 DN this far below the rest of its cell is invalid
 _CUT_OFF = 0.3  # with more of a cell at 0 DN, its lower half no longer shows the noise
-_LEAST_CUT_OFF_DN = 0.5
+_LEAST_CUT_OFF = 0.5  # quantisation steps
 _STEEP_PART = 0.2  # a slope that adds more to the variance of a cell is corrected
 _MOSTLY_INVALID = 0.75  # a cell with more invalid pixels takes the level of its neighbour
 _SPARSE_PX = 256
@@ -52,7 +53,8 @@ class Background:
     Background level and 1-sigma noise, DN, on a coarse mesh and for the whole image.
 
     ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image of
-    ``shape`` (height, width); ``level_dn`` and ``noise_dn`` are their medians.
+    ``shape`` (height, width); ``level_dn`` and ``noise_dn`` are their medians.  ``step_dn`` is the
+    quantisation step of the image.
     """
 
     level_mesh: Singles
@@ -60,6 +62,7 @@ class Background:
     level_dn: float
     noise_dn: float
     shape: tuple[int, ...]
+    step_dn: int = 1
 
     def level_at(self, xy_px: Floats | Indices) -> Floats:
         """Level (n,) at pixels (n, 2)."""
@@ -89,7 +92,7 @@ class Sources:
 
     def select(self, rows: Mask | slice) -> Sources:
         """Return some of the sources, of the same area."""
-        return Sources(self.xy_px[rows], self.snr[rows], self.searched_px2)
+        return rows_of(self, rows)
 
 
 def measure_background(pixels: Pixels) -> Background:
@@ -97,25 +100,27 @@ def measure_background(pixels: Pixels) -> Background:
     Background level and noise of an image from the median and the clipped spread of each cell.
 
     Reads one pixel in sixteen.  Ignores invalid pixels (0 DN far below all others, as in a masked
-    border).  The noise is at least the quantisation noise of whole DN.
+    border).  The noise is at least that of the quantisation.
     """
     samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
+    step_dn = quantisation_step_dn(pixels)
     samples.sort(axis=1)
     zeros = np.count_nonzero(samples == 0.0, axis=1)
-    invalid = np.where(_gap_above_zero(samples, zeros), zeros, 0)
+    invalid = np.where(_gap_above_zero(samples, zeros, step_dn), zeros, 0)
     level = _quantile(samples, 0.5, invalid)
     # Stars lie above the median only: the lower quantile gives the spread.
     spread = level - _quantile(samples, 0.1587, invalid)
-    tail = _noise_above(samples, level, np.where(invalid > 0, 0, zeros))
+    tail = _noise_above(samples, level, np.where(invalid > 0, 0, zeros), step_dn)
     samples -= level[:, None]
-    mean, noise = _clipped(samples, spread, np.arange(samples.shape[1]) >= invalid[:, None])
+    valid = np.arange(samples.shape[1]) >= invalid[:, None]
+    mean, noise = _clipped(samples, spread, step_dn, valid)
     noise = np.maximum(noise, tail)
     has_pixels = (invalid < _MOSTLY_INVALID * samples.shape[1]).reshape(mesh_shape)
     level, noise = (
         filled(values.reshape(mesh_shape), has_pixels).ravel() for values in (mean + level, noise)
     )
-    noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels), tail)
-    return _background(level, noise, mesh_shape, pixels.shape)
+    noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels, step_dn), tail)
+    return _background(level, noise, mesh_shape, pixels.shape, step_dn)
 
 
 def sample_background(pixels: Pixels) -> Background:
@@ -126,32 +131,35 @@ def sample_background(pixels: Pixels) -> Background:
     sky is too steep for large cells, `measure_background` replaces the result.
     """
     samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
-    noise = _difference_noise(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
+    step_dn = quantisation_step_dn(pixels)
+    noise = _difference_noise(pixels, _SPARSE_PX, _SPARSE_STEP_PX, step_dn)
     level = medians(samples[:, ::4].T).astype(np.float32)
     zeros = np.count_nonzero(samples == 0.0, axis=1)
     cut_off = np.flatnonzero(zeros > _CUT_OFF * samples.shape[1])
     if len(cut_off):
-        tail = _noise_above(np.sort(samples[cut_off], axis=1), level[cut_off], zeros[cut_off])
+        ascending = np.sort(samples[cut_off], axis=1)
+        tail = _noise_above(ascending, level[cut_off], zeros[cut_off], step_dn)
         noise[cut_off] = np.maximum(noise[cut_off], tail)
-    background = _background(level, noise, mesh_shape, pixels.shape)
+    background = _background(level, noise, mesh_shape, pixels.shape, step_dn)
     steepest = (np.hypot(*background.slope_meshes) / background.noise_mesh).max()
     return background if steepest <= _MOST_SLOPE else measure_background(pixels)
 
 
-def _noise_above(ascending: Singles, level: Singles, zeros: Indices) -> Singles:
+def _noise_above(ascending: Singles, level: Singles, zeros: Indices, step_dn: int) -> Singles:
     """
     Noise (k,) of the sorted rows (k, n) that the converter clips at 0 DN; 0 for other rows.
 
     Clipping removes the lower half of the noise: the upper half's 2-sigma quantile is used.
-    Noise below 1 DN changes too few pixels to be measured: the result is at least 0.5 DN.
+    Noise below a quantisation step changes too few pixels to be measured: the result is at least
+    half of one.
     """
     count = ascending.shape[1]
     above = ascending[:, int(0.9772 * count)] - level
-    noise = np.maximum(0.5 * above, np.float32(_LEAST_CUT_OFF_DN))
+    noise = np.maximum(0.5 * above, np.float32(_LEAST_CUT_OFF * step_dn))
     return np.where(zeros > _CUT_OFF * count, noise, np.float32(0.0))
 
 
-def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels) -> Singles:
+def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels, step_dn: int) -> Singles:
     """Noise (k,) of the cells, from differences of pixels where the background is steep."""
     down, across = mesh_slope(smooth_mesh(level_mesh), pixels.shape)
     cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
@@ -159,11 +167,13 @@ def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels) -> Singl
     steep = ramp > _STEEP_PART * noise**2
     if not steep.any():
         return noise
-    from_differences = _difference_noise(pixels, _MESH_PX, _MESH_STEP_PX)
+    from_differences = _difference_noise(pixels, _MESH_PX, _MESH_STEP_PX, step_dn)
     return np.where(steep, np.minimum(from_differences, noise), noise)
 
 
-def _difference_noise(pixels: Pixels, cell_px: int, step_px: tuple[int, int]) -> Singles:
+def _difference_noise(
+    pixels: Pixels, cell_px: int, step_px: tuple[int, int], step_dn: int
+) -> Singles:
     """Noise (k,) of the cells from differences of pixels two columns apart, almost slope-free."""
     samples, mesh_shape = _cells(pixels, cell_px, step_px)
     beside, _ = _cells(pixels[:, 2:], cell_px, step_px, mesh_shape)
@@ -171,7 +181,7 @@ def _difference_noise(pixels: Pixels, cell_px: int, step_px: tuple[int, int]) ->
     apart = samples[:, :width] - beside[:, :width]
     apart -= np.partition(apart, apart.shape[1] // 2, axis=1)[:, apart.shape[1] // 2, None]
     rank = int(apart.shape[1] * 0.6827)
-    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank], step_dn)
     return np.asarray(noise / math.sqrt(2.0), np.float32)
 
 
@@ -192,11 +202,11 @@ def _quantile(ascending: Singles, part: float, first: Indices) -> Singles:
     return np.asarray(ascending[row, np.minimum(rank, count - 1)])
 
 
-def _gap_above_zero(ascending: Singles, zeros: Indices) -> Mask:
+def _gap_above_zero(ascending: Singles, zeros: Indices, step_dn: int) -> Mask:
     """Mask (k,) of the sorted rows that hold 0 DN far below the noise of their other samples."""
     level = _quantile(ascending, 0.5, zeros)
     spread = level - _quantile(ascending, 0.1587, zeros)
-    return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
+    return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, step_dn)))
 
 
 def filled(values: NDArray[Any], valid: Mask) -> NDArray[Any]:
@@ -224,10 +234,10 @@ def _cells(
 
 
 def _clipped(
-    samples: Singles, spread: Singles, valid: Mask | None = None
+    samples: Singles, spread: Singles, step_dn: int, valid: Mask | None = None
 ) -> tuple[Singles, Singles]:
     """Mean and 1-sigma of each row of samples about zero, without values beyond three spreads."""
-    inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
+    inside = np.abs(samples) <= 3.0 * np.maximum(spread, step_dn)[:, None]
     if valid is not None:
         inside &= valid
     kept = np.maximum(np.count_nonzero(inside, axis=1), 1)
@@ -239,12 +249,17 @@ def _clipped(
 
 
 def _background(
-    level: Singles, noise: Singles, mesh_shape: tuple[int, int], shape: tuple[int, ...]
+    level: Singles,
+    noise: Singles,
+    mesh_shape: tuple[int, int],
+    shape: tuple[int, ...],
+    step_dn: int,
 ) -> Background:
-    """Smoothed level and noise of the cells; the noise is at least that of rounding to DN."""
+    """Smoothed level and noise of the cells; the noise is at least that of rounding."""
     level_mesh = smooth_mesh(level.reshape(mesh_shape))
-    noise_mesh = smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
-    return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh), shape)
+    noise_mesh = smooth_mesh(np.maximum(noise, rounding_noise_dn(step_dn)).reshape(mesh_shape))
+    medians_dn = median(level_mesh), median(noise_mesh)
+    return Background(level_mesh, noise_mesh, *medians_dn, shape, step_dn)
 
 
 def smooth_mesh(mesh: Singles) -> Singles:

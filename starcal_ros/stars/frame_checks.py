@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Checks of a frame as a whole, before any star is searched.
+Checks of a frame as a whole, before any star is searched, and of a flat field.
 
 A sample of rows, each with the row below it, is enough for all checks: 5 % of the pixels of a
 five-megapixel frame.  Noise makes a row of an intact frame differ from every other row of any
@@ -19,13 +19,14 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Indices, Mask, Pixels, Singles
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import Image
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
-from starcal_ros.stars.detection import filled, smooth_mesh
+from starcal_ros.stars.detection import detect, filled, measure_background, smooth_mesh
+from starcal_ros.stars.pixel_noise import CONVERTER_ENDS, quantisation_step_dn, rounding_noise_dn
 
 _ROWS = 64
 _GOLDEN = 0.618034
@@ -39,8 +40,9 @@ _SLOPE_LEFT = 7.0 / 24.0
 _MAX_SATURATED_FRACTION = 0.2
 # In pixel noise per pixel; this slope pulls the centroid of a star of 1 px by 0.25 sigma.
 _MAX_SLOPE = 0.05
-# Largest values of converters of 8 to 16 bits, in the low or in the high bits of 16.
-_ENDS_DN = (255, 1023, 4095, 16383, 65472, 65520, 65532, 65535)
+_UNIT_DN = 30000  # level of a response of 1 in the 16-bit image that is searched for stars
+_STAR_SIGMA = 8.0  # detection limit in a flat field: the noise of five megapixels stays below
+_LEAST_RESPONSE = 0.1  # a darker row or column is not brought to the level of the others
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ class RowSample:
 
     ``row`` (k,) numbers of the rows, ``step`` their mean distance, px; ``pixels`` (k, width) the
     rows; ``below`` every eighth pixel of the rows below them; ``noisy`` (k, m) mask of the
-    segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value.
+    segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value;
+    ``step_dn`` the quantisation step of the frame.
     """
 
     row: Indices
@@ -86,6 +89,7 @@ class RowSample:
     below: Pixels
     noisy: Mask
     constant: Mask
+    step_dn: int
 
     @functools.cached_property
     def distinctive(self) -> Mask:
@@ -114,6 +118,7 @@ def sample_rows(pixels: Pixels) -> RowSample:
         # this many pixels differ; one or two stars do not.
         noisy=unlike > 0.249,
         constant=unlike == 0.0,
+        step_dn=quantisation_step_dn(pixels),
     )
 
 
@@ -182,7 +187,8 @@ def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
     """Least value of a saturated pixel."""
     peak = int(sample.pixels.max())
     if not saturation_dn:
-        saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
+        is_end = peak / sample.step_dn in CONVERTER_ENDS
+        saturation_dn = 0.98 * peak if is_end else peak + 1.0
     # An integer, since a comparison with a float converts every pixel.
     return math.ceil(saturation_dn)
 
@@ -251,8 +257,7 @@ def _noise_dn(sample: RowSample, alive: Mask) -> float:
     here = _segments(sample.pixels)[:, :, 0].astype(np.int32)
     below = sample.below[:, :: _SEGMENT_PX // _BELOW_STEP_PX][:, : here.shape[1]]
     spread = median(np.abs(here - below)[alive])
-    # The second value is the noise of rounding to whole DN.
-    return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), math.sqrt(1.0 / 12.0))
+    return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), rounding_noise_dn(sample.step_dn))
 
 
 def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> float:
@@ -297,3 +302,23 @@ def _middle_mean(ascending: Singles) -> Singles:
     """Means (down, across) of the middle half of each cell, free of stars and dead columns."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])
+
+
+def excess_of_stars(response: Floats) -> int:
+    """
+    Number of star-like bright spots of a response (height, width) beyond that of dark ones.
+
+    Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
+    """
+    level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
+    # Columns and rows with another gain have edges, whose maxima are not stars either.
+    level = level / np.maximum(np.median(level, axis=0), _LEAST_RESPONSE)
+    level = level / np.maximum(np.median(level, axis=1), _LEAST_RESPONSE)[:, None] * _UNIT_DN
+    bright, dark = (
+        detect(pixels, measure_background(pixels), _STAR_SIGMA)
+        for pixels in (
+            np.clip(np.rint(values), 0, 2 * _UNIT_DN).astype(np.uint16)
+            for values in (level, 2 * _UNIT_DN - level)
+        )
+    )
+    return len(bright.snr) - len(dark.snr)

@@ -7,7 +7,7 @@ A single pixel that is lit again after the sky has moved on is a defect of the d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+from starcal_ros.stars.pixel_noise import quantisation_step_dn, rounding_noise_dn
 
 _SCANNED_PX = 1 << 19  # pixels scanned per image, in 0.1 ms; larger images are scanned by strips
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
@@ -61,8 +62,13 @@ def hot_in_dark(dark: Pixels | None) -> HotPixels:
         return NO_HOT_PIXELS
     level = median(dark)
     spread = MAD_TO_SIGMA * median(np.abs(dark[::4, ::4] - level))
-    limit = level + _HOT_SIGMA * max(spread, math.sqrt(1.0 / 12.0))
+    limit = level + _HOT_SIGMA * max(spread, rounding_noise_dn(quantisation_step_dn(dark)))
     return HotPixels(np.flatnonzero(dark > limit)[:_MOST])
+
+
+def with_bad_pixels(hot: HotPixels, bad: Indices) -> HotPixels:
+    """Hot pixels and bad ones, flat indices (k,), together."""
+    return replace(hot, index=np.union1d(hot.index, bad)) if len(bad) else hot
 
 
 def learn_hot_pixels(

@@ -20,7 +20,7 @@ from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.options import option
 from starcal_ros.robust_statistics import centre_and_scatter, median
 from starcal_ros.stars import detection
-from starcal_ros.stars.pixel_noise import blurred_px, NoiseSums, PixelNoise
+from starcal_ros.stars.pixel_noise import blurred_px, CONVERTER_ENDS, NoiseSums, PixelNoise
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums, stamp_radius_px
 from starcal_ros.stars.streak import refined, Streak
 
@@ -33,7 +33,7 @@ _ISOLATED_PX = 12.0  # least distance to another source of the stars that give t
 _MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a smaller width cannot be measured
 _MAX_PSF_SIGMA_PX = 4.0
 _MAP_CHI2 = 30.0  # chance gives five terms a larger chi^2 once in 80,000 times
-_CUT_OFF_BELOW_DN = 1.0  # many pixels of a lower background are clipped to 0 DN
+_CUT_OFF_BELOW = 1.0  # quantisation steps: many pixels of a lower background are clipped to 0 DN
 
 
 @dataclass(frozen=True)
@@ -178,19 +178,18 @@ class ImageModel:
         return self.streak.at(xy_px) if self.streak else None
 
 
-def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
+def saturation_level(pixels: Pixels, options: CentroidOptions, step_dn: int) -> float:
     """
     Smallest value of a saturated pixel, DN; 0 if no pixel is saturated.
 
     Without the option ``saturation_dn``, the largest value of the image counts as saturated if at
-    least four pixels share it, or if it is the end of an 8, 10, 12, 14 or 16 bit range.
+    least four pixels share it, or if it is the end of an 8, 10, 12, 14 or 16 bit range of steps.
     """
     if options.saturation_dn > 0:
         return options.saturation_dn
     peak = int(pixels.max(initial=0))
-    ends = (255,) if pixels.dtype == np.uint8 else (1023, 4095, 16383, 65535)
     # Far above the background, photon noise does not give four pixels the same greatest value.
-    plateau = peak in ends or np.count_nonzero(pixels == peak) >= 4
+    plateau = peak / step_dn in CONVERTER_ENDS or np.count_nonzero(pixels == peak) >= 4
     return _BELOW_PLATEAU * peak if plateau else 0.0
 
 
@@ -210,10 +209,11 @@ def model_image(
     Streaks are fitted with the width, from the ``streak`` that the second moments gave.
     ``neighbours``: all sources, where those to be fitted are some of them.
     """
-    saturation_dn = saturation_level(pixels, options) or np.inf
+    saturation_dn = saturation_level(pixels, options, background.step_dn) or np.inf
     gain = options.gain_e_per_dn
+    first_gain = gain or 1.0 / background.step_dn
     unknown = ImageModel(
-        background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
+        background, None, PixelNoise(first_gain, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
     given = pixels, sources, neighbours or sources, saturation_dn, streak
     xy = _isolated(*given, BRIGHT_SNR)
@@ -223,7 +223,7 @@ def model_image(
     sigma = 1.2
     if len(xy) < FEWEST_BRIGHT:
         return unknown
-    noise_model = PixelNoise(gain or 1.0, 0.02)
+    noise_model = PixelNoise(first_gain, 0.02)
     for _ in range(6):
         radius = stamp_radius_px(sigma, streak.longest_px if streak else 0.0)
         centre = np.rint(xy).astype(np.int64)
@@ -300,7 +300,7 @@ def known_model(
     centre = np.rint(predicted_px).astype(np.int64)
     centre = centre[detection.windows_inside(pixels.shape, centre, 2)][:_BRIGHTEST]
     cores = detection.windows_about(pixels, centre, 2)
-    saturation_dn = saturation_level(cores, options)
+    saturation_dn = saturation_level(cores, options, background.step_dn)
     if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:
         saturation_dn = known.saturation_dn
     return ImageModel(
@@ -315,7 +315,7 @@ def known_model(
 
 def _at_least_sky(noise: PixelNoise, background: detection.Background) -> PixelNoise:
     """Pixel noise, raised to the noise of the sky if the converter clips it at 0 DN."""
-    if background.level_dn >= _CUT_OFF_BELOW_DN:
+    if background.level_dn >= _CUT_OFF_BELOW * background.step_dn:
         return noise
     # Clipped pixels do not scatter: their noise would make the sigmas of faint stars too small.
     return dataclasses.replace(noise, background=max(noise.background, 1.0))

@@ -9,14 +9,14 @@ mean of such Gaussians along a line, by Gauss-Legendre quadrature.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import Floats, Mask, rows_of
 from starcal_ros.stars.hot_pixels import CORE_PX, SPILT
 from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
 
@@ -58,11 +58,6 @@ class PsfFit:
     sigma_dn: Floats
     derivatives: Floats
     noise_covariance: Floats
-
-
-def select(fit: PsfFit, stars: NDArray[np.intp] | Mask) -> PsfFit:
-    """Return the fits of some stars, by row number or mask."""
-    return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
 
 def stamp_radius_px(psf_sigma_px: float, streak_px: float = 0.0) -> int:
@@ -118,13 +113,7 @@ class Stamps:
         """Return the windows of some stars, by ascending row number without repetition."""
         if len(stars) == len(self):
             return self
-        return Stamps(
-            self.data_dn.take(stars, axis=0),
-            self.sigma_px.take(stars),
-            self.noise2_dn2.take(stars, axis=0),
-            None if self.out is None else self.out.take(stars, axis=0),
-            None if self.streak_px is None else self.streak_px.take(stars, axis=0),
-        )
+        return rows_of(self, stars)
 
 
 def fit_psf(

@@ -37,7 +37,13 @@ TABLE_FILE = 'starcal_camera.bin'
 _MAGIC = b'STARCALT'
 _VERSION = 1  # STARCAL_TABLE_VERSION
 # The enumeration of starcal_camera.c.
-_MODELS = ('plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidistant')
+_MODELS = {
+    'plumb_bob': 0,
+    'rational_polynomial': 1,
+    'thin_prism': 2,
+    'tilted': 3,
+    'equidistant': 4,
+}
 _MOST_WAVES = 128  # STARCAL_MAX_WAVES
 _NAME_SIZE = 32  # STARCAL_NAME_SIZE
 _VECTORS_A_SIDE = 5
@@ -79,7 +85,8 @@ def c_table(calibration: Calibration) -> bytes:
     waves than it has room for.
     """
     camera = calibration.geometry.camera
-    if camera.model not in _MODELS:
+    number = _MODELS.get(camera.model)
+    if number is None:
         raise OptionError(f'--to c: the C code has no lens model {camera.model}')
     field = _factored(calibration)
     terms = np.empty((0, 2), np.int64) if camera.field is None else camera.field.orders
@@ -117,7 +124,7 @@ def c_table(calibration: Calibration) -> bytes:
     body += triangle.T[np.triu_indices(len(triangle))].astype('<i2').tobytes()
     head = struct.pack(
         '<8I12xq32s16x',
-        _MODELS.index(camera.model),
+        number,
         camera.width,
         camera.height,
         len(terms),

@@ -67,7 +67,7 @@ def fitted(
     lens = replace(camera, field=None)
     if camera.has_field:
         losses.append(Loss('field beside the lens model', _alone(camera, camera.model, ())))
-    if model != camera.model:
+    if not camera.has_lens(model):
         cost_px = _alone(lens, model, ())
         if cost_px > 0:
             losses.append(Loss(f'lens model {camera.model} (here {model})', cost_px))

@@ -1,15 +1,18 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pull of neighbours on centroids, against fits to mean images."""
+"""Pull of neighbours on centroids: against fits, and of stars below the magnitude limit."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
 import numpy as np
 import pytest
+from sample_sky import errors_sigma, tracked  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.rendering import star_electrons
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.identification.blending import (
     MAX_BLEND_SIGMA,
@@ -17,6 +20,8 @@ from starcal_ros.identification.blending import (
     Pulls,
     unlisted_pull_px,
 )
+from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
+from starcal_ros.sky.catalog import DEEPER_MAG, load_catalog
 from starcal_ros.stars.detection import Background
 from starcal_ros.stars.image_model import ImageModel, uniform_width
 from starcal_ros.stars.pixel_noise import PixelNoise
@@ -136,3 +141,35 @@ def test_no_neighbours_no_pulls() -> None:
     assert pull_px.shape == (0, 2) and swamped.shape == (0,)
     alone = np.array([[5.0, 5.0]])
     assert not pulls_on(alone, np.array([3.0]), np.array([90.0]), model).pull_px.any()
+
+
+def excess_sigma2(deeper: bool) -> float:
+    """Mean square of the errors over their sigmas, of six images of which five are tracked."""
+    # The sky of the bundled catalog to V = 7, in pixels of 1.7 arcmin.
+    catalog = load_catalog(None, 7.0)
+    if not deeper:
+        catalog = dataclasses.replace(catalog, deeper=None)
+    search = StarSearch(catalog, identification=IdentificationOptions(magnitude_limit=7.0))
+    squares = []
+    for shown, found, _ in tracked(scenario('tiny', seed=8), range(6), search):
+        assert np.isin(found.refused_catalog_id, catalog.id).all()
+        squares.append(errors_sigma(shown, found) ** 2)
+    return float(np.mean(np.concatenate(squares)))
+
+
+def test_the_pull_of_deeper_stars_is_taken_off() -> None:
+    assert excess_sigma2(deeper=False) > 1.2
+    assert excess_sigma2(deeper=True) < 1.1
+
+
+@pytest.mark.parametrize('limit', [5.0, 7.0, 9.0])
+def test_deeper_stars_follow_the_limit(limit: float) -> None:
+    catalog, deeper = load_catalog(None, limit), load_catalog(None, limit).deeper
+    assert catalog.magnitude[-1] <= limit
+    if limit == 9.0:
+        assert deeper is None
+        return
+    assert deeper is not None
+    assert limit < deeper.magnitude[0] and deeper.magnitude[-1] <= limit + DEEPER_MAG
+    whole = load_catalog(None, limit + DEEPER_MAG)
+    assert np.array_equal(np.concatenate([catalog.id, deeper.id]), whole.id)

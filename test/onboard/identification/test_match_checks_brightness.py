@@ -7,17 +7,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from sample_sky import exposure_of, true_px  # type: ignore[import-not-found]
 
-from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.match_checks import refuse_by_brightness
-from starcal_ros.identification.star_finder import (
-    Exposure,
-    IdentificationOptions,
-    observe_stars,
-    StarSearch,
-)
+from starcal_ros.identification.star_finder import IdentificationOptions, observe_stars, StarSearch
 from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.centroiding import Centroids
@@ -142,14 +137,11 @@ def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[f
     base = synthetic.scenario('tiny', seed=367)
     field = synthetic.Inertial((MILKY_WAY_DEG,) * 12)
     scenario = dataclasses.replace(base, pointing=field, image_count=12)
-    drawn = synthetic.scene(scenario, 11)
-    image = rendering.render(scenario, drawn, 11)
-    shot = Exposure(image, np.array(attitude_xyzw), 0.0)
+    drawn, shot = exposure_of(scenario, 11)
+    shot = dataclasses.replace(shot, icrf_from_star_tracker_xyzw=np.array(attitude_xyzw))
     catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
     try:
         found, _ = observe_stars(shot, scenario.prior, StarSearch(catalog))
     except ImageRefused:
         return
-    place = dict(zip(drawn.catalog_id.tolist(), drawn.pixel_px, strict=True))
-    true_px = np.array([place[number] for number in found.catalog_id.tolist()])
-    assert np.abs(found.measured_px - true_px).max() < 2.0
+    assert np.abs(found.measured_px - true_px(drawn, found.catalog_id)).max() < 2.0

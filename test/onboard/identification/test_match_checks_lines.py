@@ -9,36 +9,26 @@ import re
 
 import numpy as np
 import pytest
+from sample_sky import exposure_of, started  # type: ignore[import-not-found]
 
-from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import scenario, scene
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.match_checks import find_line_loss
-from starcal_ros.identification.star_finder import (
-    Exposure,
-    IdentificationOptions,
-    observe_stars,
-    StarSearch,
-)
-from starcal_ros.identification.tracking import start_tracking, track_stars
+from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
+from starcal_ros.identification.tracking import track_stars
 from starcal_ros.records import CameraGeometry, Image
-from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.sky.catalog import load_catalog
 
 SCENARIO = scenario('tiny', seed=31)
 PRIOR = SCENARIO.prior
-OPTIONS = IdentificationOptions()
+SEARCH = StarSearch(load_catalog(None, 9.0))
 SHAPE = (PRIOR.camera.height, PRIOR.camera.width)
 
 
 @functools.cache
-def catalog() -> StarCatalog:
-    return load_catalog(None, OPTIONS.magnitude_limit)
-
-
-@functools.cache
 def exposure(index: int) -> Exposure:
-    one = scene(SCENARIO, index)
-    return Exposure(render(SCENARIO, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
+    _, exposed = exposure_of(SCENARIO, index)
+    return exposed  # type: ignore[no-any-return]
 
 
 def with_lost_rows(index: int, row: int, lost: int) -> Exposure:
@@ -64,14 +54,14 @@ priors = pytest.mark.parametrize('prior', [PRIOR, WRONG], ids=['prior', 'wrong p
 @priors
 @pytest.mark.parametrize('index', range(10))
 def test_an_intact_frame_is_accepted(prior: CameraGeometry, index: int) -> None:
-    assert not observe_stars(exposure(index), prior, StarSearch(catalog()))[0].refusal
+    assert not observe_stars(exposure(index), prior, SEARCH)[0].refusal
 
 
 @priors
 @pytest.mark.parametrize(('row', 'lost'), [(100, 2), (100, 3), (256, 1), (256, 3), (380, 2)])
 def test_lost_rows_are_found(prior: CameraGeometry, row: int, lost: int) -> None:
     with pytest.raises(ImageRefused, match='incomplete: stars below row') as refused:
-        observe_stars(with_lost_rows(0, row, lost), prior, StarSearch(catalog()))
+        observe_stars(with_lost_rows(0, row, lost), prior, SEARCH)
     row_found, down_px = re.findall(r'row (\d+) .*, ([-+.\d]+)\)', refused.value.detail)[0]
     assert abs(int(row_found) - row) < 40  # a tenth of the rows holds a dozen stars
     assert float(down_px) == pytest.approx(-lost, abs=0.3)  # the smooth part takes some
@@ -79,12 +69,10 @@ def test_lost_rows_are_found(prior: CameraGeometry, row: int, lost: int) -> None
 
 @pytest.mark.parametrize('lost', [1, 2, 3])
 def test_lost_rows_are_found_while_tracking(lost: int) -> None:
-    observations, instrument = observe_stars(exposure(0), PRIOR, StarSearch(catalog()))
-    known = start_tracking(PRIOR, observations, instrument)
-    assert known is not None
-    assert not track_stars(exposure(1), known, StarSearch(catalog()))[0].refusal
+    _, known = started(exposure(0), PRIOR, SEARCH)
+    assert not track_stars(exposure(1), known, SEARCH)[0].refusal
     with pytest.raises(ImageRefused, match='incomplete'):
-        track_stars(with_lost_rows(1, 256, lost), known, StarSearch(catalog()))
+        track_stars(with_lost_rows(1, 256, lost), known, SEARCH)
 
 
 def places(n: int, seed: int = 1) -> np.ndarray:

@@ -9,11 +9,11 @@ import functools
 
 import numpy as np
 import pytest
-from sample_sky import with_planets  # type: ignore[import-not-found]
+from sample_sky import errors_sigma, exposure_of, true_px, with_planets  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import Detector, scenario, Scene, scene
+from starcal_ground.simulation.scenario import Detector, scenario, Scene
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
     Exposure,
@@ -44,8 +44,8 @@ def catalog() -> StarCatalog:
 
 @functools.cache
 def shown(index: int) -> tuple[Scene, Image]:
-    one = scene(SCENARIO, index)
-    return one, render(SCENARIO, one, index)
+    one, exposure = exposure_of(SCENARIO, index)
+    return one, exposure.image
 
 
 def observed(
@@ -67,10 +67,7 @@ def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
 def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
     """Assert that every star is at the pixel of its catalog number."""
     assert found.refusal == '' and len(found) >= least
-    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
-    true_px = np.array([place.get(number, [np.nan, np.nan]) for number in found.catalog_id])
-    uu, _, vv = found.covariance_px2.T
-    in_sigma = np.abs(found.measured_px - true_px) / np.sqrt(np.stack([uu, vv], axis=-1))
+    in_sigma = np.abs(errors_sigma(one, found))
     assert np.isfinite(in_sigma).all()
     # Several hundred normal deviates, some of them pulled by a faint neighbour: a wrong star is
     # some hundred sigma off.
@@ -118,6 +115,30 @@ def test_a_focal_length_two_percent_off_is_acquired(scale: float) -> None:
         assert_right(observed(image, one.icrf_from_star_tracker_xyzw, prior), one)
 
 
+def test_the_judgement_of_a_star_does_not_depend_on_the_prior() -> None:
+    """Cameras and alignments 0.5 to 3 px off: PSF and noise are of the stars of the match."""
+    camera, fx = PRIOR.camera, float(PRIOR.camera.parameters[0])
+    priors = [
+        turned(PRIOR, Rotation.from_rotvec(np.array(off_px) / fx))
+        for off_px in ([0.3, 0.4, 0.0], [0.0, 3.0, 0.0], [-3.0, 0.0, 0.0])
+    ]
+    longer = camera.replace(fx=1.003 * fx, fy=1.003 * fx)
+    priors += [CameraGeometry(longer, PRIOR.star_tracker_from_camera_xyzw), TRUTH]
+    for index in range(4):
+        one, image = shown(index)
+        expected = observed(image, one.icrf_from_star_tracker_xyzw)
+        bright = set(expected.catalog_id[expected.snr > 20.0].tolist())
+        for prior in priors:
+            found = observed(image, one.icrf_from_star_tracker_xyzw, prior)
+            # The same sources: to rounding. By the sources about the prior it was 0.4 %.
+            assert found.psf_sigma_px == pytest.approx(expected.psf_sigma_px, rel=1e-12)
+            assert bright <= set(found.catalog_id.tolist())
+            _, i, j = np.intersect1d(expected.catalog_id, found.catalog_id, return_indices=True)
+            noise = found.covariance_px2[j, 0] / expected.covariance_px2[i, 0]
+            # By the sources about the prior it was 4 %.
+            assert np.median(noise) == pytest.approx(1.0, abs=1e-6)
+
+
 @pytest.mark.slow
 def test_a_wrong_attitude_never_matches() -> None:
     # Anywhere in the sky: that one of 100 comes within 1.5 degrees is a chance of 0.02.
@@ -163,9 +184,7 @@ def test_hot_pixels_and_missing_and_strange_stars() -> None:
     # Hardly any star that was not drawn is found: one of the strange ones stands in its place.
     missing = set(one.catalog_id[~seen].tolist())
     assert sum(number in missing for number in found.catalog_id.tolist()) <= 1
-    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
-    true_px = np.array([place[number] for number in found.catalog_id])
-    off_px = np.linalg.norm(found.measured_px - true_px, axis=1)
+    off_px = np.linalg.norm(found.measured_px - true_px(one, found.catalog_id), axis=1)
     # A strange star beside a true one pulls it; the catalog knows nothing of it.
     assert len(found) > 80 and (off_px < 1.0).mean() > 0.98
 
@@ -280,10 +299,8 @@ def test_refused_stars_are_told_with_their_places() -> None:
     assert not set(found.refused_catalog_id) & set(found.catalog_id)
     counted = {reason: len(places) for reason, places in found.refused_places().items()}
     assert counted == found.refused_stars and {'blend', 'faint'} <= set(counted)
-    where = {star: k for k, star in enumerate(one.catalog_id)}
-    true_px = one.pixel_px[[where[star] for star in found.refused_catalog_id]]
     # The match refines the predictions to a fraction of the pixel in which a star is looked for.
-    assert np.abs(found.refused_px - true_px).max() < 0.5
+    assert np.abs(found.refused_px - true_px(one, found.refused_catalog_id)).max() < 0.5
 
 
 def test_the_geometry_is_tracked_from_image_to_image() -> None:

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from sample_sky import exposure_of, started, true_px  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import find_sky
@@ -16,8 +17,7 @@ from bench.narrow import scenario_of
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.pattern_index import pattern_index
 from starcal_ground.blind.search import SkyMatch
-from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import Scenario, scenario, Scene, scene
+from starcal_ground.simulation.scenario import Scenario, scenario, Scene
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
@@ -26,7 +26,7 @@ from starcal_ros.identification.star_finder import (
     observe_stars,
     StarSearch,
 )
-from starcal_ros.identification.tracking import start_tracking, track_stars
+from starcal_ros.identification.tracking import track_stars
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
@@ -40,8 +40,8 @@ def given(field_deg: float) -> Scenario:
 def shown(field_deg: float, index: int, stars: int | None = None) -> tuple[Scene, Image]:
     """An image of a narrow camera, of its brightest stars."""
     scenario = dataclasses.replace(given(field_deg), stars_per_image=stars)
-    one = scene(scenario, index)
-    return one, render(scenario, one, index)
+    one, exposure = exposure_of(scenario, index)
+    return one, exposure.image
 
 
 def sky_of(field_deg: float) -> StarCatalog:
@@ -69,9 +69,8 @@ def observed(
 
 def wrong(found: StarObservations, one: Scene) -> int:
     """Number of stars that are not at the pixel of their catalog number."""
-    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
-    true_px = np.array([place.get(star, [np.nan] * 2) for star in found.catalog_id.tolist()])
-    return int((~(np.hypot(*(found.measured_px - true_px).T) < 1.0)).sum())
+    off_px = np.hypot(*(found.measured_px - true_px(one, found.catalog_id)).T)
+    return int((~(off_px < 1.0)).sum())
 
 
 @pytest.mark.parametrize(
@@ -164,10 +163,8 @@ def faint(psf_sigma_px: float, zero_point_electrons: float, index: int) -> tuple
         psf_sigma_px=psf_sigma_px,
         zero_point_electrons=zero_point_electrons,
     )
-    campaign = dataclasses.replace(of_small, detector=detector)
-    one = scene(campaign, index)
-    image = render(campaign, one, index)
-    return Exposure(image, one.icrf_from_star_tracker_xyzw, 0.0), one
+    one, exposure = exposure_of(dataclasses.replace(of_small, detector=detector), index)
+    return exposure, one
 
 
 def test_few_faint_stars_show_the_psf() -> None:
@@ -184,8 +181,7 @@ def test_few_faint_stars_show_the_psf() -> None:
 def test_the_noise_is_learned_from_stars_too_faint_for_the_psf() -> None:
     truth, search = scenario('small', 1).truth, StarSearch(load_catalog())
     exposure, _ = faint(0.4, 1e4, 0)
-    before = start_tracking(truth, *observe_stars(exposure, truth, search))
-    assert before is not None
+    _, before = started(exposure, truth, search)
     after = track_stars(faint(0.4, 1e4, 2)[0], before, search)[1].instrument
     assert (after.width_normal == before.instrument.width_normal).all()
     assert after.noise.normal[0, 0] > 1.5 * before.instrument.noise.normal[0, 0]
@@ -212,9 +208,7 @@ def test_stars_are_found_without_attitude_in_the_region_of_the_catalog(field_deg
         sources = bright_sources(image.pixels)
         sky = find_sky(sources.xy_px, camera.replace(fx=fx, fy=fx), catalog, try_mirrored=True)
         assert isinstance(sky, SkyMatch) and not sky.mirrored
-        place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
-        numbers = catalog.id[sky.catalog_index].tolist()
-        off_px = sky.xy_px - np.array([place.get(star, [np.nan] * 2) for star in numbers])
+        off_px = sky.xy_px - true_px(one, catalog.id[sky.catalog_index])
         assert (np.hypot(*off_px.T) < 3.0).all()
 
 

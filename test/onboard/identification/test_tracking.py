@@ -3,47 +3,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import dataclasses
 import functools
-from typing import Any
 
 import numpy as np
 import pytest
-from sample_sky import with_planets  # type: ignore[import-not-found]
+from sample_sky import errors_sigma, exposure_of, started, with_planets  # type: ignore[import-not-found]
+from sample_sky import tracked as tracked_campaign
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import scenario, Scene, scene
+from starcal_ground.simulation.scenario import scenario, Scene
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import (
-    Exposure,
-    IdentificationOptions,
-    observe_stars,
-    StarSearch,
-)
+from starcal_ros.identification.star_finder import Exposure, StarSearch
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.image_model import CentroidOptions
 
 SCENARIO = scenario('tiny', seed=8)
 PRIOR = SCENARIO.prior
-OPTIONS = IdentificationOptions()
-CENTROIDS = CentroidOptions(max_saturated_pixels=0)
-
-
-@functools.cache
-def catalog() -> StarCatalog:
-    return load_catalog(None, OPTIONS.magnitude_limit)
+CATALOG = load_catalog(None, 9.0)
+SEARCH = StarSearch(CATALOG, CentroidOptions(max_saturated_pixels=0))
 
 
 @functools.cache
 def shown(index: int) -> tuple[Scene, Image]:
-    one = scene(SCENARIO, index)
-    return one, render(SCENARIO, one, index)
+    one, exposed = exposure_of(SCENARIO, index)
+    return one, exposed.image
 
 
 def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
@@ -58,34 +47,12 @@ def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
 def searched(
     index: int, geometry: CameraGeometry = PRIOR
 ) -> tuple[StarObservations, TrackedCamera]:
-    observations, instrument = observe_stars(
-        exposure(index), geometry, StarSearch(catalog(), CENTROIDS, OPTIONS)
-    )
-    known = start_tracking(geometry, observations, instrument)
-    assert known is not None
+    observations, known = started(exposure(index), geometry, SEARCH)
     return observations, known
 
 
 def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, TrackedCamera]:
-    return track_stars(image, before, StarSearch(catalog(), CENTROIDS, OPTIONS))
-
-
-def of_detector(seed: int, count: int, **changes: Any) -> Iterator[tuple[Scene, StarObservations]]:
-    """Scenes and observations with another detector, from the image that starts a track on."""
-    given = scenario('tiny', seed=seed)
-    other = dataclasses.replace(given, detector=dataclasses.replace(given.detector, **changes))
-    prior, known = other.prior, None
-    for index in range(count):
-        one = scene(other, index)
-        image = render(other, one, index)
-        exposed = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
-        if known is not None:
-            observations, known = track_stars(exposed, known, StarSearch(catalog()))
-        else:
-            observations, instrument = observe_stars(exposed, prior, StarSearch(catalog()))
-            known = start_tracking(prior, observations, instrument)
-        if known is not None:
-            yield one, observations
+    return track_stars(image, before, SEARCH)
 
 
 @pytest.mark.parametrize('index', [1, 2, 5])
@@ -126,8 +93,12 @@ def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
 def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
     errors = []
     for seed in (8, 9, 10, 11):
-        cut = of_detector(seed, 10, zero_point_electrons=2.5e4, psf_sigma_px=0.55, offset_dn=0.0)
-        for one, observations in cut:
+        given = scenario('tiny', seed=seed)
+        detector = dataclasses.replace(
+            given.detector, zero_point_electrons=2.5e4, psf_sigma_px=0.55, offset_dn=0.0
+        )
+        dark = dataclasses.replace(given, detector=detector)
+        for one, observations, _ in tracked_campaign(dark, range(10), StarSearch(CATALOG)):
             apart_px, nearest = cKDTree(one.pixel_px).query(observations.measured_px)
             assert apart_px.max() < 3.0
             sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
@@ -142,8 +113,8 @@ def test_stars_left_out_as_too_faint_are_listed_as_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     whole, _ = searched(1)
-    used = np.flatnonzero(np.isin(catalog().id, whole.catalog_id))
-    refused = np.flatnonzero(np.isin(catalog().id, whole.refused_catalog_id))
+    used = np.flatnonzero(np.isin(CATALOG.id, whole.catalog_id))
+    refused = np.flatnonzero(np.isin(CATALOG.id, whole.refused_catalog_id))
     # All that were used, and half of those that are fainter: the catalog is sorted by magnitude.
     fainter = int((refused > used.max()).sum())
     count = len(used) + len(refused) - fainter // 2
@@ -160,19 +131,7 @@ def test_stars_left_out_as_too_faint_are_listed_as_refused(
 def test_a_width_that_changes_over_the_field_is_learnt() -> None:
     detector = dataclasses.replace(SCENARIO.detector, psf_growth=0.3)
     soft = dataclasses.replace(SCENARIO, detector=detector)
-    known: TrackedCamera | None = None
-    for index in range(5):
-        one = scene(soft, index)
-        image = Exposure(render(soft, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
-        if known is None:
-            observations, instrument = observe_stars(
-                image, PRIOR, StarSearch(catalog(), CENTROIDS, OPTIONS)
-            )
-            known = start_tracking(PRIOR, observations, instrument)
-            assert known is not None
-        else:
-            observations, known = followed(image, known)
-    assert known is not None
+    *_, (one, observations, known) = tracked_campaign(soft, range(5), SEARCH)
     camera = PRIOR.camera
     grid = pixel_grid(camera, 7, 5)
     true_px = detector.psf_sigma_at(grid, (camera.height, camera.width))
@@ -180,12 +139,8 @@ def test_a_width_that_changes_over_the_field_is_learnt() -> None:
     # 30 % wider in the corners; some 250 bright stars tell it to a few percent there.
     assert np.abs(found_px / true_px - 1.0).max() < 0.06
     # And no star's error is larger than it says.
-    order = np.argsort(one.catalog_id)
-    row = order[np.searchsorted(one.catalog_id[order], observations.catalog_id)]
-    error = observations.measured_px - one.pixel_px[row]
-    sigma = np.sqrt(observations.covariance_px2[:, [0, 2]])
     # 300 stars, two axes: known to 3 %, and some have companions fainter than the catalog.
-    assert 0.85 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.15
+    assert 0.85 < np.sqrt(np.mean(errors_sigma(one, observations) ** 2)) < 1.15
     assert observations.refused_stars.get('elongated', 0) < 0.3 * len(observations)
 
 
@@ -272,9 +227,7 @@ def test_planets_are_no_stars(index: int) -> None:
     found, _ = followed(dataclasses.replace(exposure(index), image=image), known)
     # The brightest of them raise the noise over some percent of this small field.
     assert found.refusal == '' and len(found) > 0.8 * len(followed(exposure(index), known)[0])
-    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
-    true_px = np.array([place[number] for number in found.catalog_id.tolist()])
-    off = (found.measured_px - true_px) / np.sqrt(found.covariance_px2[:, [0, 2]])
+    off = errors_sigma(one, found)
     # Several hundred normal deviates; a wrong star is some hundred sigma off.
     assert np.abs(off).max() < 6.0 and np.sqrt((off**2).mean()) < 1.2
 

@@ -8,17 +8,16 @@ import functools
 
 import numpy as np
 import pytest
+from sample_sky import errors_sigma, exposure_of, started  # type: ignore[import-not-found]
 
 from bench import narrow
 from bench.frames import load_set_up, observed, render_frame
-from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import Detector, scenario, Scene, scene
+from starcal_ground.simulation.scenario import Detector, scenario, Scene
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
-from starcal_ros.identification.tracking import start_tracking, track_stars
+from starcal_ros.identification.tracking import track_stars, TrackedCamera
 from starcal_ros.records import StarObservations
 from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.stars.image_model import Instrument
 
 SCENARIO = scenario('tiny', seed=8)
 FOCAL_PX = float(SCENARIO.truth.camera.parameters[0])
@@ -39,22 +38,14 @@ def exposed(
     turn_rad: Turn, index: int = 1, detector: Detector = SCENARIO.detector
 ) -> tuple[Scene, Exposure]:
     moving = dataclasses.replace(SCENARIO, turn_rad=turn_rad, detector=detector)
-    shown = scene(moving, index)
-    image = render(moving, shown, index)
-    return shown, Exposure(image, shown.icrf_from_star_tracker_xyzw, 0.5)
+    shown, exposure = exposure_of(moving, index)
+    return shown, exposure
 
 
 @functools.cache
-def sharp() -> tuple[StarObservations, Instrument | None]:
-    return observe_stars(exposed(SHARP)[1], SCENARIO.prior, SEARCH)
-
-
-def errors_sigma(shown: Scene, observations: StarObservations) -> np.ndarray:
-    """Errors (n, 2) of the centroids by the places in the middle of the exposure."""
-    row = {star: k for k, star in enumerate(shown.catalog_id.tolist())}
-    true_px = shown.pixel_px[[row[star] for star in observations.catalog_id.tolist()]]
-    sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
-    return np.asarray((observations.measured_px - true_px) / sigma_px)
+def sharp() -> tuple[StarObservations, TrackedCamera]:
+    observations, track = started(exposed(SHARP)[1], SCENARIO.prior, SEARCH)
+    return observations, track
 
 
 @pytest.mark.parametrize(
@@ -71,11 +62,9 @@ def errors_sigma(shown: Scene, observations: StarObservations) -> np.ndarray:
 )
 @pytest.mark.parametrize('tracked', [False, True])
 def test_streaks_are_measured_at_their_middle(turn_rad: Turn, tracked: bool) -> None:
-    before, instrument = sharp()
+    before, track = sharp()
     shown, image = exposed(turn_rad)
     if tracked:
-        track = start_tracking(SCENARIO.prior, before, instrument)
-        assert track is not None
         observations, after = track_stars(image, track, SEARCH)
         # The next image may be sharp again.
         assert after.instrument is track.instrument
@@ -108,8 +97,7 @@ def test_a_longer_streak_is_refused_with_its_length(length_px: float) -> None:
 
 @pytest.mark.parametrize('psf_sigma_px', [0.8, 1.0, 1.4])
 def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> None:
-    track = start_tracking(SCENARIO.prior, *sharp())
-    assert track is not None
+    _, track = sharp()
     detector = dataclasses.replace(SCENARIO.detector, psf_sigma_px=psf_sigma_px)
     for index in (2, 3, 4):
         _, track = track_stars(exposed(SHARP, index, detector)[1], track, SEARCH)
@@ -118,8 +106,7 @@ def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> 
 def test_streaks_of_which_too_few_are_alone_are_searched_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    track = start_tracking(SCENARIO.prior, *sharp())
-    assert track is not None
+    _, track = sharp()
     monkeypatch.setattr('starcal_ros.stars.image_model._ISOLATED_PX', 1000.0)
     with pytest.raises(ImageRefused, match='too few of them are alone') as refused:
         track_stars(exposed(turned(6.0, 0.0, 0.0))[1], track, SEARCH)

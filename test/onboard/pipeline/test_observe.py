@@ -271,9 +271,7 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float)
         lengths.append(len(found))
         seen.append(found.refusal)
         if found.refusal:
-            assert (
-                track.geometry is before.geometry and track.tracked_camera is before.tracked_camera
-            )
+            assert track.geometry is before.geometry and track.trackers is before.trackers
             assert track.latest_ns == before.latest_ns
     # Beyond the search the jump is refused, within it the stars are still the right ones.
     assert seen == ['', '', '' if jump_deg < 1.5 else 'no_match', '', '']
@@ -322,7 +320,7 @@ def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) ->
     without = load_setup(values(camera_yaml))
     url = write_png(tmp_path / 'dark.png', dark)
     with_dark = load_setup(values(camera_yaml, dark_frame='file://' + url))
-    np.testing.assert_array_equal(with_dark.dark, dark)
+    np.testing.assert_array_equal(with_dark.detector.dark, dark)
     spoilt = observe.observe_next(one_image, attitudes(), without)[0]
     found = observe.observe_next(one_image, attitudes(), with_dark)[0]
     assert found.refusal == '' and len(found) > max(150, 2 * len(spoilt))
@@ -338,7 +336,7 @@ def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) ->
 def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
     url = write_png(tmp_path / 'dark.png', np.full((512, 640), 7, np.uint8))
     made = load_setup(values(camera_yaml, dark_frame=url))
-    assert made.dark is not None and made.dark.dtype == np.uint8
+    assert made.detector.dark is not None and made.detector.dark.dtype == np.uint8
     found = observe.observe_next(image(), attitudes(), made)[0]
     assert found.refusal == 'bad_encoding'
     assert found.detail == 'uint16 image, the dark frame is uint8'

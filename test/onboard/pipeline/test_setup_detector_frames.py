@@ -12,19 +12,13 @@ import numpy as np
 import pytest
 from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[import-not-found]
 
-from starcal_ground.products import write_camera_info
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image, StarObservations
 
 HEIGHT, WIDTH = 512, 640
-
-
-@pytest.fixture
-def camera_yaml(tmp_path: Path) -> Path:
-    write_camera_info(SCENARIO.prior.camera, tmp_path / 'camera.yaml')
-    return tmp_path / 'camera.yaml'
 
 
 def response() -> np.ndarray:
@@ -45,7 +39,8 @@ def test_a_flat_field_restores_the_flux_of_the_stars(camera_yaml: Path, tmp_path
     dimmed = np.rint((image().pixels - offset) * flat + offset).clip(0, 4095).astype(np.uint16)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.fits')))
     # The pedestal of a dark frame: the offset is no signal.
-    setup = dataclasses.replace(setup, dark_pedestal_dn=round(offset))
+    detector = dataclasses.replace(setup.detector, pedestal_dn=round(offset))
+    setup = dataclasses.replace(setup, detector=detector)
     plain = load_setup(values(camera_yaml))
     ideal, without, with_flat = (
         observed(image().pixels, plain), observed(dimmed, plain), observed(dimmed, setup)
@@ -75,7 +70,7 @@ def test_a_bad_pixel_is_left_out_of_the_stars(camera_yaml: Path, tmp_path: Path)
     bad[v, u] = 1
     cv2.imwrite(str(tmp_path / 'bad.png'), bad)
     setup = load_setup(values(camera_yaml, bad_pixel_map=str(tmp_path / 'bad.png')))
-    assert setup.hot.index.tolist() == [v * WIDTH + u]
+    assert setup.detector.hot.index.tolist() == [v * WIDTH + u]
     after = observed(image().pixels, setup)
     assert before.catalog_id[star] not in after.catalog_id
     assert after.refused_stars['hot_pixel'] == before.refused_stars.get('hot_pixel', 0) + 1
@@ -86,8 +81,8 @@ def test_pixels_without_response_are_bad(camera_yaml: Path, tmp_path: Path) -> N
     flat[7, 9] = 50
     cv2.imwrite(str(tmp_path / 'flat.png'), flat)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
-    assert setup.hot.index.tolist() == [7 * WIDTH + 9]
-    same = observe.flattened(image(), setup.flat, 0)
+    assert setup.detector.hot.index.tolist() == [7 * WIDTH + 9]
+    same = flattened(image(), setup.detector.flat, 0)
     assert (same.pixels == image().pixels).all()
 
 
@@ -103,24 +98,24 @@ def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
     counts = np.random.default_rng(9).poisson(20000.0 * flat).astype(np.uint16)
     cv2.imwrite(str(tmp_path / 'flat.png'), counts)
     setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
-    assert setup.flat is not None
+    assert setup.detector.flat is not None
 
 
 def test_saturated_pixels_stay_at_the_peak() -> None:
     pixels = np.array([[4095, 2000], [1000, 4095]], np.uint16)
     flat = np.array([[1.5, 0.25], [0.5, 0.5]])
-    found = observe.flattened(Image(1, pixels), flat, 0).pixels
+    found = flattened(Image(1, pixels), flat, 0).pixels
     assert found.tolist() == [[4095, 4095], [2000, 4095]]
 
 
 @pytest.mark.parametrize(
     ('name', 'content', 'words'),
     [
-        (
-            'flat_field',
-            np.ones((HEIGHT, WIDTH - 1), np.uint8),
-            'one channel of 640 x 512',
-        ),
+        ('dark_frame', np.zeros((HEIGHT, WIDTH - 1), np.uint16), 'one channel of 640 x 512'),
+        ('dark_frame', np.zeros((HEIGHT, WIDTH, 3), np.uint8), 'one channel of 640 x 512'),
+        ('dark_frame', np.zeros((HEIGHT, WIDTH), np.float32), 'one channel of 640 x 512'),
+        ('dark_frame', None, r'dark_frame: .*map.png: cannot be read: No such file'),
+        ('flat_field', np.ones((HEIGHT, WIDTH - 1), np.uint8), 'one channel of 640 x 512'),
         ('flat_field', np.zeros((HEIGHT, WIDTH), np.uint8), 'median is .*not positive'),
         ('flat_field', image().pixels, 'shows [0-9]+ stars: it is a frame of the sky'),
         ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'one channel of 640 x 512'),
@@ -131,7 +126,8 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
 def test_a_file_that_does_not_fit_is_named(
     camera_yaml: Path, tmp_path: Path, name: str, content: np.ndarray | None, words: str
 ) -> None:
-    path = tmp_path / 'map.png'
+    is_float = content is not None and content.dtype == np.float32
+    path = tmp_path / ('map.tiff' if is_float else 'map.png')
     if content is not None:
         cv2.imwrite(str(path), content)
     with pytest.raises(OptionError, match=words):

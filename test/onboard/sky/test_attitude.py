@@ -165,35 +165,38 @@ def test_the_same_rotation_with_the_other_sign_is_no_turn() -> None:
     assert angle_between(found, q0) < 1e-15
 
 
-def test_outside_the_samples_there_is_no_attitude() -> None:
-    q0, q1 = random_quaternions(9, 2)
-    held = history([(START_NS, q0), (START_NS + S, q1)])
-    assert refusal(held, START_NS - 1) == 'no_attitude'
-    assert refusal(held, START_NS + S + 1) == 'no_attitude'
-    assert refusal(AttitudeHistory(), START_NS) == 'no_attitude'
-
-
-def test_samples_too_far_apart_are_a_gap() -> None:
-    q0, q1 = random_quaternions(10, 2)
-    held = history([(START_NS, q0), (START_NS + 2 * S, q1)])
-    _, gap_s = held.at(START_NS + S, 2.0)
-    assert gap_s == 2.0
-    assert refusal(held, START_NS + S, 2.0 - 1e-9) == 'attitude_gap'
-
-
-def test_invalid_samples_are_told_from_missing_ones() -> None:
-    q0, q1 = random_quaternions(11, 2)
-    held = history([(START_NS, q0), (START_NS + 2 * S, q1)])
-    held.add(START_NS + S, None)
-    # The neighbours on both sides are near enough: the invalid one is passed over.
-    _, gap_s = held.at(START_NS + S + 1, 2.0)
-    assert gap_s == 2.0
-    assert refusal(held, START_NS + S) == 'bad_attitude'
-    assert refusal(held, START_NS + S + 1, 1.5) == 'bad_attitude'
-    held.add(START_NS + 3 * S, None)
-    assert refusal(held, START_NS + 3 * S - 1) == 'bad_attitude'
-    held.add(START_NS - S, None)
-    assert refusal(held, START_NS - 1) == 'bad_attitude'
+@pytest.mark.parametrize(
+    ('valid_s', 'invalid_s', 'at_s', 'max_gap_s', 'reason'),
+    [
+        ((), (), 0.0, 2.0, 'no_attitude'),
+        ((0, 1), (), -1e-9, 2.0, 'no_attitude'),
+        ((0, 1), (), 1.0 + 1e-9, 2.0, 'no_attitude'),
+        ((0, 2), (), 1.0, 2.0, ''),
+        ((0, 2), (), 1.0, 2.0 - 1e-9, 'attitude_gap'),
+        # The neighbours on both sides are near enough: the invalid one is passed over.
+        ((0, 2), (1,), 1.0 + 1e-9, 2.0, ''),
+        ((0, 2), (1,), 1.0, 2.0, 'bad_attitude'),
+        ((0, 2), (1,), 1.0 + 1e-9, 1.5, 'bad_attitude'),
+        ((0, 2), (1, 3), 3.0 - 1e-9, 2.0, 'bad_attitude'),
+        ((0, 2), (-1, 1), -1e-9, 2.0, 'bad_attitude'),
+    ],
+)
+def test_samples_that_give_no_attitude_are_named(
+    valid_s: tuple[int, ...],
+    invalid_s: tuple[int, ...],
+    at_s: float,
+    max_gap_s: float,
+    reason: str,
+) -> None:
+    quaternions = random_quaternions(11, len(valid_s))
+    held = history([(START_NS + t * S, q) for t, q in zip(valid_s, quaternions, strict=True)])
+    for t in invalid_s:
+        held.add(START_NS + t * S, None)
+    time_ns = START_NS + round(at_s * S)
+    if reason:
+        assert refusal(held, time_ns, max_gap_s) == reason
+    else:
+        assert held.at(time_ns, max_gap_s)[1] == 2.0
 
 
 def test_only_the_last_seconds_are_kept() -> None:

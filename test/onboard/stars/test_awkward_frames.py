@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_sky import QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader
 from starcal_ground.simulation.rendering import expose, star_electrons
-from starcal_ground.simulation.scenario import Detector
 from starcal_ros.records import Image, StarRefusal
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import (
@@ -26,16 +26,8 @@ from starcal_ros.stars.image_model import CentroidOptions, model_image
 from starcal_ros.stars.pixel_noise import NoiseSums
 
 SHAPE = (512, 640)
-QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 OPTIONS = CentroidOptions()
 WISPR = Path(__file__).parents[4] / 'shared' / 'realsky' / 'wispr_i_2022'
-
-
-def star_grid(seed: int, spacing: int = 32) -> np.ndarray:
-    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
-    v, u = np.mgrid[spacing : SHAPE[0] - spacing : spacing, spacing : SHAPE[1] - spacing : spacing]
-    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
-    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
 
 
 def measured(pixels: np.ndarray, xy: np.ndarray) -> Centroids:
@@ -63,6 +55,37 @@ def test_a_black_sky_has_few_false_sources() -> None:
     assert len(sources.snr) <= 10
 
 
+@pytest.mark.parametrize('read_noise', [1.0, 3.0], ids=['under half a step', 'over a step'])
+@pytest.mark.parametrize('step_dn', [1, 16, 17, 257], ids='step of {}'.format)
+def test_values_that_step_are_measured_as_those_of_fewer_bits(
+    step_dn: int, read_noise: float
+) -> None:
+    """8 bits in the high ones of 12 (16) or scaled to 16 (257): the sigma is that of 8 bits."""
+    xy = star_grid(3, 32)
+    detector = dataclasses.replace(
+        QUIET, bits=8, read_noise_electrons=read_noise, electrons_per_dn=3.0, offset_dn=10.0
+    )
+    flux = np.random.default_rng(4).uniform(50.0, 6000.0, len(xy))
+    shown = expose(star_electrons(xy, flux, 0.95, SHAPE), detector, np.random.default_rng(5))
+    assert shown.max() == 255
+    stepped = shown.astype(np.uint16) * step_dn
+    sample = sample_rows(stepped)
+    mark = fingerprint(Image(1, stepped), sample)
+    screen(sample, mark, None, 0.0, None, ScreeningOptions())
+    for measure in (measure_background, sample_background):
+        scaled = measure(stepped).noise_dn / step_dn
+        assert scaled == pytest.approx(measure(shown).noise_dn, rel=1e-5)
+    expected, found = measured(shown, xy), measured(stepped, xy)
+    np.testing.assert_array_equal(found.refusal, expected.refusal)
+    # Single precision of the background, whose level is 10 steps: 1e-6 of a step.
+    good = expected.refusal == StarRefusal.NONE
+    assert np.count_nonzero(good) > 150
+    np.testing.assert_allclose(found.xy_px[good], expected.xy_px[good], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        found.covariance_px2[good], expected.covariance_px2[good], rtol=1e-3, atol=1e-9
+    )
+
+
 def test_a_masked_border_does_not_raise_the_noise() -> None:
     pixels = np.random.default_rng(3).normal(1000.0, 20.0, SHAPE).round().astype(np.uint16)
     whole = measure_background(pixels)
@@ -85,7 +108,7 @@ def test_undersampled_stars_are_found_and_their_covariance_holds() -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=0.47)
     squared, found_share = [], []
     for seed in range(4):
-        xy = star_grid(seed)
+        xy = star_grid(seed, 32)
         mean = star_electrons(xy, np.full(len(xy), 6000.0), detector.psf_sigma_px, SHAPE)
         rng = np.random.default_rng([seed, 1])
         pixels = expose(mean + detector.background_electrons, detector, rng)
@@ -108,7 +131,7 @@ def test_a_steady_slope_is_subtracted(slope: float) -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=1.0, bits=16)
     normalised, signed = [], []
     for seed in range(3):
-        xy = star_grid(seed)
+        xy = star_grid(seed, 32)
         mean = star_electrons(xy, np.full(len(xy), 2500.0), detector.psf_sigma_px, SHAPE)
         noise_e = measure_background(
             expose(np.full(SHAPE, detector.background_electrons), detector,

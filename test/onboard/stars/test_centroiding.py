@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from sample_sky import QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import centroid_bound
 from starcal_ground.simulation.rendering import expose, star_electrons
@@ -23,19 +24,11 @@ from starcal_ros.stars.image_model import (
     model_image,
     saturation_level,
 )
-from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise
+from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise, quantisation_step_dn
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums
 
 SHAPE = (512, 640)
-QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 PSF, MOMENT = CentroidOptions(), CentroidOptions(centroid='moment')
-
-
-def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = SHAPE) -> np.ndarray:
-    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
-    v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
-    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
-    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
 
 
 def unlike_fluxes(seed: int, n: int) -> np.ndarray:
@@ -391,24 +384,31 @@ def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, f
 
 
 @pytest.mark.parametrize(
-    ('dtype', 'peak', 'count', 'expected'),
+    ('dtype', 'step_dn', 'peak', 'count', 'expected'),
     [
-        (np.uint8, 255, 1, 0.98 * 255),
-        (np.uint8, 254, 1, 0.0),
-        (np.uint8, 200, 4, 0.98 * 200),
-        (np.uint16, 4095, 1, 0.98 * 4095),
-        (np.uint16, 16383, 1, 0.98 * 16383),
-        (np.uint16, 65535, 1, 0.98 * 65535),
-        (np.uint16, 3000, 1, 0.0),
-        (np.uint16, 3000, 3, 0.0),
-        (np.uint16, 3000, 4, 0.98 * 3000),
+        (np.uint8, 1, 255, 1, 0.98 * 255),
+        (np.uint8, 1, 254, 1, 0.0),
+        (np.uint8, 1, 200, 4, 0.98 * 200),
+        (np.uint16, 1, 4095, 1, 0.98 * 4095),
+        (np.uint16, 1, 16383, 1, 0.98 * 16383),
+        (np.uint16, 1, 65535, 1, 0.98 * 65535),
+        (np.uint16, 257, 65535, 1, 0.98 * 65535),  # 8 bits
+        (np.uint16, 16, 65520, 1, 0.98 * 65520),  # 12 bits in the high ones
+        (np.uint16, 1, 65520, 1, 0.0),
+        (np.uint16, 16, 4080, 1, 0.98 * 4080),  # 8 bits in the high ones of 12
+        (np.uint16, 1, 3000, 1, 0.0),
+        (np.uint16, 1, 3000, 3, 0.0),
+        (np.uint16, 1, 3000, 4, 0.98 * 3000),
     ],
 )
-def test_the_saturation_level(dtype: type, peak: int, count: int, expected: float) -> None:
-    pixels: np.ndarray = np.random.default_rng(8).integers(20, 60, SHAPE).astype(dtype)
+def test_the_saturation_level(
+    dtype: type, step_dn: int, peak: int, count: int, expected: float
+) -> None:
+    pixels: np.ndarray = np.random.default_rng(8).integers(20, 60, SHAPE).astype(dtype) * step_dn
     pixels.flat[:count] = peak
-    assert saturation_level(pixels, PSF) == pytest.approx(expected)
-    assert saturation_level(pixels, CentroidOptions(saturation_dn=123.0)) == 123.0
+    assert quantisation_step_dn(pixels) == step_dn
+    assert saturation_level(pixels, PSF, step_dn) == pytest.approx(expected)
+    assert saturation_level(pixels, CentroidOptions(saturation_dn=123.0), step_dn) == 123.0
 
 
 @pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 2.0])

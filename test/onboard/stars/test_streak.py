@@ -83,6 +83,7 @@ def test_a_source_at_the_limit_of_a_body_ends_the_search() -> None:
         pixels += 3000.0 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2.0 * 1.5**2))
     snr = np.array([15.0, 14.0, 13.0, 12.0, 10.0, 5.0])
     sources = Sources(np.array(xy_px, np.float64), snr, 600.0**2)
+    image = np.rint(pixels).astype(np.uint16)
     camera = CameraModel(600, 600, np.array([1000.0, 0.0, 1000.0, 299.5, 299.5, *np.zeros(5)]))
-    found, streak = without_streaks(pixels, measure_background(pixels), sources, camera)
+    found, streak = without_streaks(image, measure_background(image), sources, camera)
     assert streak is None and len(found.snr) == len(sources.snr)
