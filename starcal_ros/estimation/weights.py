@@ -334,9 +334,7 @@ def tracker_attitudes(
             trackers.append(dataclasses.replace(exact, sigma_rad=stated[0], images=images))
         return Attitudes(error, covariance, seen, np.zeros(m, bool), tuple(trackers))
     is_stated = tracker_sigma_is_given(data.options)
-    misfit = misfit_images(
-        error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
-    )
+    misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, is_stated)
     known_trackers = before.trackers if before else ()
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
