@@ -293,6 +293,7 @@ _UNKNOWN_RATE_RAD_S = 6.4e-4  # per axis: a low orbit, 1.1e-3, about an unknown 
 # comes round nor often turns away and back.
 _NEAR_S = 600.0
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
+_TRACY_WIDOM_99 = 2.0234  # 99 % quantile of the Tracy-Widom law of order 1
 _FEWEST_RATES = 3  # their scatter replaces a sigma that a sender does not state
 
 
@@ -348,10 +349,12 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     if np.count_nonzero(known) >= _FEWEST_RATES:
         unstated = np.sqrt(np.diag(scatter))
     own = np.where(sigma > 0, sigma, unstated)[:, :, None] ** 2 * np.eye(3)
-    # The errors explain the scatter up to their 2 sigma; only the rest is a difference of rates.
-    likely = 1.0 + 2.0 * math.sqrt(2.0 / max(np.count_nonzero(known) - 1, 1))
-    values, vectors = np.linalg.eigh(scatter - likely * own[known].mean(axis=0))
-    without_errors = (vectors * values.clip(0.0)) @ vectors.T
+    # Errors alone scatter so along their best direction; only the rest is a difference of rates.
+    errors = own[known].mean(axis=0) + _LEAST_RAD2_S2 * np.eye(3)
+    values, vectors = eigh(scatter, errors)
+    columns = errors @ vectors
+    differing = (values - largest_scatter(np.count_nonzero(known) - 1)).clip(0.0)
+    without_errors = (columns * differing) @ columns.T
     own[~known] = without_errors + _UNKNOWN_RATE_RAD_S**2 * np.eye(3)
     weight = known / (np.trace(without_errors) + np.einsum('mii->m', own) + _LEAST_RAD2_S2)
     mean = (weight @ np.where(known[:, None], rate, 0.0)) / weight.sum()
@@ -360,6 +363,20 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     shrunk = np.linalg.solve(total, off[:, :, None])[:, :, 0] @ without_errors
     root = np.asarray(np.linalg.cholesky(own + _LEAST_RAD2_S2 * np.eye(3)))
     return Rates(mean + shrunk, root)
+
+
+def largest_scatter(freedom: int) -> float:
+    """
+    Return the variance of errors of unit variance in three axes, along the axis of the largest.
+
+    The 99 % quantile for a covariance of so many degrees of freedom: the Tracy-Widom law of the
+    largest eigenvalue of a Wishart matrix with the centring of Ma (Bernoulli 18, 2012), which is
+    right to a tenth of the chance.
+    """
+    samples, axes = math.sqrt(max(freedom, 1) - 0.5), math.sqrt(3.0 - 0.5)
+    edge = samples + axes
+    width = edge * (1.0 / samples + 1.0 / axes) ** (1.0 / 3.0)
+    return float((edge**2 + _TRACY_WIDOM_99 * width) / max(freedom, 1))
 
 
 def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:

@@ -17,7 +17,12 @@ from starcal_ros.estimation import tracker_errors as module
 from starcal_ros.estimation.amplitudes import interval_factor
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.tracker_errors import correlations_of, tracker_errors, TrackerErrors
+from starcal_ros.estimation.tracker_errors import (
+    correlations_of,
+    largest_scatter,
+    tracker_errors,
+    TrackerErrors,
+)
 from studies.worlds import simulate, World
 
 CADENCE_NS = 60 * 10**9
@@ -304,3 +309,15 @@ def test_a_slow_error_is_as_large_about_an_axis_of_more_noise(stated_arcsec: flo
     assert 0.4 < about / across < 2.5
     if stated_arcsec:
         assert across == pytest.approx(stated_arcsec, rel=0.3)
+
+
+@pytest.mark.parametrize('freedom', [1, 3, 17, 100])
+def test_errors_alone_scatter_beyond_the_largest_of_three_axes_once_in_a_hundred(
+    freedom: int,
+) -> None:
+    rng = np.random.default_rng(freedom)
+    errors = rng.normal(size=(10_000, freedom, 3))
+    largest = np.linalg.eigvalsh(errors.transpose(0, 2, 1) @ errors / freedom)[:, -1]
+    # 100 campaigns of 10,000 leave 10 % of their number; the law is right to as much.
+    chance = np.mean(largest > largest_scatter(freedom))
+    assert chance == pytest.approx(0.01, rel=0.4)
