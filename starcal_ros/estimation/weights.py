@@ -124,23 +124,26 @@ def estimate_variance(
 
     Notes
     -----
-    Scale and floor are found by scoring: weighted least squares of the squared residuals on the
-    measured variance and one, with the variance of a square as weight, less of it near 4.5 sigma
-    (`_part`).
+    Scale and floor maximise the restricted likelihood of the residuals, whose gradient is the sum
+    of ``freedom / 2 (square / freedom - variance) / variance^2`` times the derivatives of the
+    variance: weighted least squares of squares over freedom on the measured variance and one, the
+    weights renewed, with less of a square near 4.5 sigma (`_part`).
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
-    squared = (residual_px[used] ** 2).sum(axis=1) / np.maximum(freedom[used], _LEAST_FREEDOM)
+    left = np.maximum(freedom[used], _LEAST_FREEDOM)
+    squared = (residual_px[used] ** 2).sum(axis=1) / left
     # The median of a squared length of two normal axes is ln 2 of its mean.
     scale, floor_px2 = max(float(np.median(squared / own)) / math.log(2.0), 1e-12), 0.0
     for _ in range(_ROUNDS):
         before = scale, floor_px2
         expected = scale * own + floor_px2
-        weight = _part(squared / expected) / expected**2
+        weight = 0.5 * left * _part(squared / expected) / expected**2
         scale, floor_px2, sigma_px2 = _line(own, squared, weight)
         if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
             break
     ratio = squared / (scale * own + floor_px2)
-    nodes, factors = _brightness(ratio, np.asarray(magnitude, np.float64)[used])
+    counted = 0.5 * left * _part(ratio)
+    nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
     return CentroidVariance(scale, floor_px2, nodes, factors, sigma_px2)
 
 
@@ -173,12 +176,15 @@ def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, f
     return scale, floor_px2, sigma_px2
 
 
-def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _brightness(
+    ratio: Floats, counted: Floats, magnitude: Floats
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """
     Return magnitudes and factors of a smooth function of brightness.
 
-    Scoring of the exponential likelihood of ``ratio`` (n,), squared residuals over variance, with
-    a normal prior of the logarithms: few stars, or none that differ, give factors near 1.
+    Scoring of the exponential likelihood of ``ratio`` (n,), squared residuals over variance, of
+    which each counts as ``counted`` (n,) stars, with a normal prior of the logarithms: few stars,
+    or none that differ, give factors near 1.
     """
     count = min(_NODES, len(ratio) // _STARS_PER_NODE)
     if count < 2:
@@ -187,7 +193,7 @@ def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tu
     if len(nodes) < 2:
         return (), ()
     place = np.rint((magnitude - nodes[0]) / np.ptp(nodes) * _BINS).astype(np.int64)
-    stars, summed = (np.bincount(place, _part(ratio) * one) for one in (1.0, ratio))
+    stars, summed = (np.bincount(place, counted * one) for one in (1.0, ratio))
     bins = nodes[0] + np.ptp(nodes) / _BINS * np.arange(len(stars))
     basis = np.stack([np.interp(bins, nodes, row) for row in np.eye(len(nodes))], axis=1)
     log_factor = np.zeros(len(nodes))
