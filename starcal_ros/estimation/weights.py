@@ -472,33 +472,6 @@ def judge(
     return Weighting(variance, errors, kept, attitudes)
 
 
-def damped(one: Weighting, other: Weighting, share: float) -> Weighting:
-    """
-    Return the other conclusions, with weights a share of the way from one to the other.
-
-    Weights and residuals may oscillate from round to round, as a step may overshoot.
-    """
-    a, b, to = one.variance, other.variance, other.attitudes
-    if share == 1.0 or one.attitudes is None or to is None:
-        return other
-    before = one.attitudes.trackers
-    if len(a.class_factor) != len(b.class_factor) or len(before) != len(to.trackers):
-        return other
-
-    def part(this: float, that: float) -> float:
-        return this + share * (that - this)
-
-    trackers = tuple(
-        dataclasses.replace(that, working=part(this.working, that.working))
-        for this, that in zip(before, to.trackers, strict=True)
-    )
-    scale, floor_px2 = part(a.scale, b.scale), part(a.floor_px2, b.floor_px2)
-    factor = tuple(map(part, a.class_factor, b.class_factor))
-    variance = dataclasses.replace(b, scale=scale, floor_px2=floor_px2, class_factor=factor)
-    attitudes = dataclasses.replace(to, trackers=trackers)
-    return dataclasses.replace(other, variance=variance, attitudes=attitudes)
-
-
 def has_converged(one: Weighting, other: Weighting, table: StarTable) -> bool:
     """Return True if both lead to the same estimate."""
     if one.attitudes is None or other.attitudes is None:
