@@ -250,11 +250,12 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     span_s = max(float(np.ptp(time_s)), 1e-9)
     apart_s = np.abs(np.subtract.outer(time_s[some], time_s[some]))
     boresight = camera_from_icrf.as_matrix()[some, 2]
-    angle_deg = np.degrees(np.arccos(np.clip(boresight @ boresight.T, -1.0, 1.0)))
+    # Squared chords: a Gaussian of the angle itself is no covariance on a sphere.
+    chord2 = 2.0 - 2.0 * boresight @ boresight.T
     names = [f'over {share * span_s:.3g} s' for share in _SPANS]
     kernels = [of_groups(np.exp(-apart_s / (share * span_s))) for share in _SPANS]
     names += [f'over {one:g} deg' for one in _ANGLES_DEG]
-    kernels += [of_groups(np.exp(-0.5 * (angle_deg / one) ** 2)) for one in _ANGLES_DEG]
+    kernels += [of_groups(np.exp(-0.5 * chord2 / math.radians(one) ** 2)) for one in _ANGLES_DEG]
     axes = tuple(eigh(K, check_finite=False) for K in kernels)
     return Correlations(group, tuple(names), np.array(kernels), axes)
 

@@ -76,7 +76,7 @@ def test_the_restricted_likelihood_is_that_of_dense_contrasts() -> None:
     assert values - values[0, 0] == pytest.approx(expected - expected[0, 0], abs=1e-9)
 
 
-def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
+def test_correlations_are_in_time_and_in_the_distance_of_the_boresights() -> None:
     attitudes = Rotation.from_euler('xz', [[0, 0], [10, 40], [30, 80], [180, 0]], degrees=True)
     time_ns = np.array([0, 10, 40, 100], np.int64) * 10**9
     found = correlations_of(time_ns, attitudes)
@@ -95,9 +95,12 @@ def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
         assert pytest.approx(np.exp(-apart / (100.0 * share))) == K
     for width, K in zip((10.0, 30.0, 60.0), kernels[4:], strict=True):
         assert np.diag(K) == pytest.approx(1.0)
-        assert K[0, 1] == pytest.approx(math.exp(-0.5 * (10.0 / width) ** 2))
-        assert K[0, 2] == pytest.approx(math.exp(-0.5 * (30.0 / width) ** 2))
-        assert K[0, 3] == pytest.approx(math.exp(-0.5 * (180.0 / width) ** 2))
+        chords = 2.0 * np.sin(0.5 * np.radians([10.0, 30.0, 180.0])) / math.radians(width)
+        assert K[0, 1:] == pytest.approx(np.exp(-0.5 * chords**2))
+    # All over the sky too it is a covariance; with angles for chords one eigenvalue was -0.008.
+    sky = Rotation.random(60, random_state=np.random.default_rng(1))
+    for K in correlations_of(time_ns[0] + np.arange(60), sky).kernels[4:]:
+        assert np.linalg.eigvalsh(K).min() > -1e-12
 
 
 def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -> TrackerErrors:
