@@ -35,12 +35,11 @@ from starcal_ros.records import StarObservations, StarTrackerAlignment
 _SPANS = (0.3, 1.0, 3.0, 10.0)  # correlation times, in spans of the campaign
 _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a large part of the sky
 _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
-_LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma
+_LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma; more where errors are larger
+_BEYOND = 1.0  # the grid ends a factor of e above the RMS of the errors at least
 _NOISE_SIGMA = 0.5  # prior 1-sigma of ln n: data sheets are right to a factor of 1.6
 _UNSTATED_SIGMA = 3.0  # the same where no sigma is stated: within a factor of 20
-_WRONG_SHEETS = 0.02  # prior probability that a data sheet is four times too small or worse
-_LEAST_WRONG = 4  # steps in the grid from the stated noise to four times it
-_BEYOND = 1.0  # the grid of wrong data sheets ends a factor of e above the RMS of the errors
+_WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
 _STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
 # Images are joined in at most 100 groups of neighbours in time, a hundredth of a campaign against
@@ -135,7 +134,7 @@ def tracker_errors(
 
     Notes
     -----
-    The stated sigma is a prior of the noise: log-normal, with a tail of wrong data sheets.
+    The stated sigma is a prior of the noise: log-normal, with the tails of wrong data sheets.
     """
     (m, count), group = error.shape, correlations.group
     size = np.bincount(group)
@@ -190,21 +189,19 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     """
     Return a grid (n,) of ln n for errors (m, 3), the centres of ln s there, and its log prior.
 
-    Right data sheets come first, then wrong ones, up to the size of the errors: with a wrong one
-    the slow error is as large as the noise, not as the stated noise.
+    A stated sigma has a normal prior with the tails of wrong data sheets, which are as no sigma at
+    all: there the slow error is as large as the noise, not as the stated noise.
     """
-    sigma = _NOISE_SIGMA if is_stated else _UNSTATED_SIGMA
     step = _LOG_NOISE[1] - _LOG_NOISE[0]
     log_rms = 0.5 * math.log(max(float((error**2).mean()), 1e-300))
-    top = max(float(_LOG_NOISE[-1]), log_rms + _BEYOND)
-    wrong = step * np.arange(_LEAST_WRONG, math.ceil(top / step) + 1)
-    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * sigma / _UNSTATED_SIGMA)
-    log_prior = [-0.5 * (_LOG_NOISE / sigma) ** 2, odds - 0.5 * (wrong / _UNSTATED_SIGMA) ** 2]
-    return (
-        np.concatenate([_LOG_NOISE, wrong]),
-        np.concatenate([np.zeros(len(_LOG_NOISE)) if is_stated else _LOG_NOISE, wrong]),
-        np.concatenate(log_prior),
-    )
+    more = max(math.ceil((log_rms + _BEYOND - _LOG_NOISE[-1]) / step), 0)
+    log_noise: Floats = np.append(_LOG_NOISE, _LOG_NOISE[-1] + step * np.arange(1, more + 1))
+    unstated = -0.5 * (log_noise / _UNSTATED_SIGMA) ** 2
+    if not is_stated:
+        return log_noise, log_noise, unstated
+    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * _NOISE_SIGMA / _UNSTATED_SIGMA)
+    right, wrong = -0.5 * (log_noise / _NOISE_SIGMA) ** 2, odds + unstated
+    return log_noise, np.where(wrong > right, log_noise, 0.0), np.logaddexp(right, wrong)
 
 
 def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise: float) -> float:

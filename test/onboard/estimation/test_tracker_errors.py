@@ -10,7 +10,7 @@ from numpy.random import Generator
 import pytest
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation import tracker_errors as module
@@ -112,14 +112,15 @@ def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -
     contrasts = null_space(np.ones((1, m)))
     logs, slows, noises, covariances, of_mean = [], [], [], [], []
     log_likelihoods, plain = [], []
-    sigma = 0.5 if is_stated else 3.0
-    # Of fifty data sheets one states no more than none: its noise is four times larger and more.
+    # One of fifty data sheets states no more than none.
+    right, wrong = (norm(0.0, size).logpdf for size in (0.5, 3.0))
+    sheets = []
     rms = math.sqrt((error**2).mean())
-    right = np.linspace(-2.1, 2.8, 15)
-    # Where none is stated, the slow error is as large as the noise.
-    sheets = [(b, 0.0 if is_stated else b, -0.5 * (b / sigma) ** 2) for b in right]
-    for b in 0.35 * np.arange(4, math.ceil(max(2.8, math.log(rms) + 1.0) / 0.35) + 1):
-        sheets.append((b, b, -0.5 * (b / 3.0) ** 2 + math.log(0.02 / 0.98 * sigma / 3.0)))
+    for b in -2.1 + 0.35 * np.arange(15 + max(math.ceil((math.log(rms) - 1.8) / 0.35), 0)):
+        by_sheet, by_none = right(b) + math.log(0.98), wrong(b) + math.log(0.02)
+        prior = np.logaddexp(by_sheet, by_none) if is_stated else by_none
+        # Where none is stated, the slow error is as large as the noise.
+        sheets.append((b, 0.0 if is_stated and by_sheet > by_none else b, prior))
     for K in kernels:
         for a in np.linspace(-4.5, 4.0, 18):
             for b, centre, log_prior in sheets:
