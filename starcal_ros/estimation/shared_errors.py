@@ -30,7 +30,6 @@ import math
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.special import softmax
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
@@ -52,10 +51,6 @@ _NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _ROUNDING = 1e-9  # relative rounding of a sum over pairs where there are no pairs
 _ROUNDS = 8  # iterations of expectation and maximisation for the factors of stars
-# Prior odds that the centroids have a floor, as noise or as structure, against none: at 0.2 the
-# sigma of a tenth of sound missions grows by 9 %, at 0.02 by 1 % (docs/experiments.md).
-_FLOOR_ODDS = 0.02
-_SHARES = 20  # grid of the share of a floor that is structure
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
@@ -155,7 +150,6 @@ def shared_errors(
     groups: Sequence[Groups],
     from_sky: Floats,
     last_octave: tuple[Floats, Floats],
-    floor_px2: tuple[float, float],
 ) -> tuple[SharedError, ...]:
     """
     Return the errors that observations share.
@@ -172,8 +166,6 @@ def shared_errors(
         Rotation of a displacement fixed to the star into pixel axes.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
-    floor_px2 : (estimate, 1-sigma)
-        Variance per axis that all centroids have beyond their own.
     """
     star = groups[0].group
     sightings = np.maximum(np.bincount(star, used)[star], 1.0)
@@ -197,13 +189,6 @@ def shared_errors(
     share = together / max(_pairs(working, star), together, 1e-300)
     first = last_octave[1] @ _next_octave(last_octave[0]) * _beside_stars(of_places, share)
     variances = chain_means(first, _increments(moments))
-    # The floor contains the errors of stars too, which their number determines.
-    stars = np.unique(star[used])
-    places_px2 = float(usual_px2[used].mean())
-    sigma_px2 = math.hypot(floor_px2[1], places_px2 / math.sqrt(max(len(stars), 1)))
-    beyond_px2 = max(floor_px2[0] - places_px2, 0.0)
-    of_floor_px2 = _of_floor(beyond_px2, sigma_px2, np.array(moments))
-    variances = max(variances, of_floor_px2, key=sum)
     for kind, moment, variance in zip(groups[1:], moments, variances, strict=True):
         ratio = max(moment[0] / moment[1], 0.0) ** 2
         found.append(_error(kind, weight, np.full(len(weight), variance), ratio, 0.0))
@@ -390,25 +375,6 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
         after = transition @ (likelihood * after)
         after /= after.max()
     return means[::-1]
-
-
-def _of_floor(floor_px2: float, sigma_px2: float, moments: Floats) -> list[float]:
-    """
-    Return the variances (k,) of the fine octaves that may cause a floor of the centroids.
-
-    A variance that all centroids have alike is noise of each, or structure of the detector at its
-    place; where no two stars are near each other, the data cannot separate the two.
-    Posterior means: there is no floor, or it is noise, or a share of it, uniform, is structure of
-    one octave, which the pairs of its cells and of the finer ones show (`pair_moment`).
-    """
-    estimate, sigma = moments.T
-    share = (np.arange(_SHARES) + 0.5) / _SHARES
-    shown = share[:, None, None] * floor_px2 * np.triu(np.ones((len(moments), len(moments))))
-    off = ((estimate / sigma) ** 2 - ((estimate - shown) / sigma) ** 2).sum(axis=2)
-    is_floor = math.log(_FLOOR_ODDS) + 0.5 * (floor_px2 / sigma_px2) ** 2
-    of_structure = is_floor + 0.5 * off - math.log(off.size)
-    likely = softmax(np.concatenate([[0.0, is_floor], of_structure.ravel()]))[2:]
-    return list(floor_px2 * share @ likely.reshape(off.shape))
 
 
 def pixel_variance_px2(errors: Sequence[SharedError]) -> float:

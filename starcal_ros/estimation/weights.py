@@ -80,18 +80,16 @@ class CentroidVariance:
     """
     Correction of the centroid covariances C: ``f(magnitude) (scale C + floor_px2 I)``.
 
-    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air;
-    ``floor_sigma_px2`` is its 1-sigma, infinite where all C are alike.  The scale corrects a wrong
-    detector gain.  The factor f covers errors that come with brightness, as of saturated cores:
-    linear between ``class_magnitude`` (k,), ascending, with the values ``class_factor`` (k,), and
-    constant outside; 1 where both are empty.
+    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air.
+    The scale corrects a wrong detector gain.  The factor f covers errors that come with
+    brightness, as of saturated cores: linear between ``class_magnitude`` (k,), ascending, with the
+    values ``class_factor`` (k,), and constant outside; 1 where both are empty.
     """
 
     scale: float
     floor_px2: float
     class_magnitude: tuple[float, ...] = ()
     class_factor: tuple[float, ...] = ()
-    floor_sigma_px2: float = math.inf
 
     def of(self, covariance_px2: Floats, magnitude: NDArray[np.floating]) -> Floats:
         """Corrected covariances (n, 3) uu, uv, vv of stars of magnitudes (n,)."""
@@ -138,13 +136,13 @@ def estimate_variance(
         before = scale, floor_px2
         expected = scale * own + floor_px2
         weight = 0.5 * left * _part(squared / expected) / expected**2
-        scale, floor_px2, sigma_px2 = _line(own, squared, weight)
+        scale, floor_px2 = _line(own, squared, weight)
         if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
             break
     ratio = squared / (scale * own + floor_px2)
     counted = 0.5 * left * _part(ratio)
     nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
-    return CentroidVariance(scale, floor_px2, nodes, factors, sigma_px2)
+    return CentroidVariance(scale, floor_px2, nodes, factors)
 
 
 def _part(ratio: Floats) -> Floats:
@@ -157,15 +155,14 @@ def _part(ratio: Floats) -> Floats:
     return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
 
 
-def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, float]:
-    """Return scale and floor of ``squared = scale own + floor``, not negative, and its sigma."""
+def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
+    """Return scale and floor of ``squared = scale own + floor``, not negative."""
     weighted = weight * own
     by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
     determinant = by_own * by_one - both**2
-    scale, floor_px2, sigma_px2 = right_own / by_own, 0.0, math.inf
+    scale, floor_px2 = right_own / by_own, 0.0
     if determinant > _ALIKE * by_own * by_one:
-        sigma_px2 = math.sqrt(by_own / determinant)
         scale = (by_one * right_own - both * right_one) / determinant
         floor_px2 = (by_own * right_one - both * right_own) / determinant
     if floor_px2 < 0:
@@ -173,7 +170,7 @@ def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, f
     if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
         scale = float(np.clip(scale, *_SCALE_LIMITS))
         floor_px2 = max((right_one - scale * both) / by_one, 0.0)
-    return scale, floor_px2, sigma_px2
+    return scale, floor_px2
 
 
 def _brightness(
@@ -463,11 +460,8 @@ def judge(
         raise NotObservable('no image has three stars that fit')
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
-        # As the residuals have it: they are smaller than the errors by the degrees of freedom.
-        left = 0.5 * float(freedom[kept].mean())
-        floor = (left * variance.floor_px2, left * variance.floor_sigma_px2)
         errors = shared_errors(
-            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave, floor
+            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave
         )
     return Weighting(variance, errors, kept, attitudes)
 

@@ -26,7 +26,6 @@ from starcal_ros.estimation.shared_errors import (
 
 DRAWS = 400
 WIDTH = 1200
-NO_FLOOR = 0.0, math.inf
 
 
 def groups(rng: Generator, n: int = 60, count: int = 20) -> tuple[Indices, Floats]:
@@ -170,7 +169,7 @@ def campaign(
     last = np.log([1e-5, 1e-4, 1e-3, 1e-2]), np.full(4, 0.25)
     variance, used = np.full(m * n, noise_px**2), np.ones(m * n, bool)
     kinds = observation_groups(pixels, star, WIDTH)
-    return shared_errors(residual, variance, used, kinds, from_sky, last, NO_FLOOR)
+    return shared_errors(residual, variance, used, kinds, from_sky, last)
 
 
 def test_the_errors_have_their_names_and_groups() -> None:
@@ -201,7 +200,7 @@ def test_each_error_has_its_likelihood_ratio_and_its_effect() -> None:
     last = np.log([1e-4, 1e-2]), np.array([0.5, 0.5])
     kinds = observation_groups(pixels, star, WIDTH)
     used = np.ones(n, bool)
-    found = shared_errors(residual, variance, used, kinds, from_sky, last, NO_FLOOR)
+    found = shared_errors(residual, variance, used, kinds, from_sky, last)
     ratios = []
     of_star = found[0]
     # Cells are compared by the weights of stars of several sightings.
@@ -234,7 +233,6 @@ def test_cells_are_a_sixth_of_a_wave() -> None:
         observation_groups(pixels, np.arange(n), WIDTH),
         np.tile(np.eye(2), (n, 1, 1)),
         (np.zeros(1), np.ones(1)),
-        NO_FLOOR,
     )
     for error, wave in zip(found[1:], (1 / 4, 1 / 8, 1 / 16), strict=True):
         keys = pixels.T // (WIDTH * wave / 6)
@@ -267,46 +265,6 @@ def test_a_planted_error_is_found_with_its_size(planted: dict[str, float], name:
     assert np.mean(variances) == pytest.approx(size_px**2, rel=tolerance)
 
 
-@pytest.mark.parametrize(
-    ('stars', 'structure_px', 'least', 'most'),
-    [(80, 0.0, 0.1, 0.3), (80, 0.1, 0.2, 0.5), (4000, 0.0, 0.0, 0.02), (4000, 0.1, 0.9, 1.1)],
-)
-def test_a_floor_is_structure_of_the_detector_unless_neighbours_deny_it(
-    stars: int, structure_px: float, least: float, most: float
-) -> None:
-    """
-    Of 80 stars few have a neighbour: noise of 0.1 px and structure of as much look the same.
-
-    The odds of structure are one half, and its share one half of the floor in the mean.
-    """
-    by_floor = []
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        pixels = rng.uniform(0.0, WIDTH - 1.0, (stars, 2))
-        cell = ((pixels + 0.5) / (WIDTH / 8 / 6)).astype(int)
-        residual = math.sqrt(0.02 - structure_px**2) * rng.normal(size=(stars, 2))
-        residual += (structure_px * rng.normal(size=(60, 60, 2)))[cell[:, 0], cell[:, 1]]
-        shares = (
-            pixel_variance_px2(
-                shared_errors(
-                    residual,
-                    np.full(stars, 0.02),
-                    np.ones(stars, bool),
-                    observation_groups(pixels, np.arange(stars), WIDTH),
-                    np.tile(np.eye(2), (stars, 1, 1)),
-                    (np.log([1e-5, 1e-4]), np.full(2, 0.5)),
-                    floor,
-                )
-            )
-            for floor in ((0.01, 0.002), NO_FLOOR)
-        )
-        by_floor.append(np.array(list(shares)) / 0.01)
-    share, without = np.mean(by_floor, axis=0)
-    assert least < share < most
-    # Thousands of pairs need no floor to show structure; a few do not show it.
-    assert without == pytest.approx(share, rel=0.1, abs=0.01) if stars > 80 else without < 0.05
-
-
 def stare(
     seed: int, place_px: float = 0.0, rho: float = 0.0, blend: float = 0.0
 ) -> tuple[tuple[SharedError, ...], Floats, Floats]:
@@ -333,7 +291,6 @@ def stare(
         observation_groups(pixels, star, WIDTH),
         np.tile(np.eye(2), (m * n, 1, 1)),
         (np.log([1e-5, 1e-3]), np.full(2, 0.5)),
-        NO_FLOOR,
     )
     return found, sigma[star], moved
 
@@ -379,7 +336,6 @@ def test_what_stars_of_one_field_share_may_be_structure_of_the_detector(of_star:
             observation_groups(pixels, star, WIDTH),
             np.tile(np.eye(2), (m * n, 1, 1)),
             (np.log([1e-6, 1e-5, 1e-4]), np.full(3, 1.0 / 3.0)),
-            NO_FLOOR,
         )
         assert found[0].variance_px2 == pytest.approx(size_px**2, rel=0.4)
         variances.append(pixel_variance_px2(found))
