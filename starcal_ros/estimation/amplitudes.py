@@ -24,7 +24,7 @@ import math
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
-from scipy.special import erf
+from scipy.special import erf, expit
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
@@ -261,14 +261,9 @@ class ShapeSums:
     time_s: Floats = field(default_factory=lambda: np.empty(0))
 
 
-# Correlations of the shapes of images k steps apart, with their weights before the data: none; one
-# that decays, as heat does, in ten images or a quarter of an orbit about the Earth if that is
-# shorter; and one that lasts, as the air flattens every image, which no scatter shows.
-_CORRELATIONS: tuple[tuple[float, Callable[[Floats], Floats]], ...] = (
-    (0.50, lambda k: np.equal(k, 0).astype(np.float64)),
-    (0.45, lambda k: 0.9**k),
-    (0.05, lambda k: 0.5 + 0.5 * np.equal(k, 0)),
-)
+# Correlation of the shapes of images a step apart: heat decays so in ten images, or in a quarter
+# of an orbit about the Earth if that is shorter.
+_PER_STEP = 0.9
 _STEP_S = 100.0  # time in which heat loses a tenth
 _MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
 _AT_ONCE = 8192  # images times amplitudes
@@ -449,8 +444,9 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
     Return the variance (s,) that all images share: that of the camera, which shows in no image.
 
     With a correlation, images of a campaign share the part c of the variance, the mean
-    correlation, and differ by 1 - c.  Correlations are averaged over by their evidence, the
-    amplitude integrated over and the mean of the images eliminated.
+    correlation, and differ by 1 - c.  That correlation and none are equally likely before the
+    data: they are averaged over by their evidence, the amplitude integrated over and the mean of
+    the images eliminated.
     """
     information = np.einsum('mii->mi', sums.information)
     used = np.flatnonzero((information > 0).all(axis=1))[:_MOST_CORRELATED]
@@ -462,23 +458,28 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
     if len(sums.time_s):
         late_s = sums.time_s[used]
         steps = np.maximum(steps, np.abs(np.subtract.outer(late_s, late_s)) / _STEP_S)
-    variance = np.exp(2.0 * _LOG_SHAPE)
-    prior = -0.5 * ((_LOG_SHAPE - LOG_CENTRE) / LOG_SIGMA) ** 2
-    evidence = np.empty((len(sigma_px), len(_CORRELATIONS)))
-    ratio = np.empty(len(_CORRELATIONS))
-    for j, (odds, kernel) in enumerate(_CORRELATIONS):
-        K = kernel(steps)
-        ratio[j] = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
-        for k in range(len(sigma_px)):  # the shapes in units of their noise
-            values, vectors = information[used, k], np.eye(len(used))
-            if j:  # all but the first, without a correlation
-                values, vectors = np.linalg.eigh(K * np.outer(root[:, k], root[:, k]))
-            ones, along = root[:, k] @ vectors, (left[:, k] / root[:, k]) @ vectors
-            inverse = 1.0 / (1.0 + variance[:, None] * np.maximum(values, 0.0))
-            of_ones, mean = inverse @ ones**2, inverse @ (ones * along)
-            squared = inverse @ along**2 - mean**2 / of_ones
-            log_det = np.log(of_ones) - np.log(inverse).sum(axis=1)
-            likelihood = prior - 0.5 * (log_det + squared)
-            evidence[k, j] = math.log(odds) + float(np.logaddexp.reduce(likelihood))
-    weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
-    return np.asarray(weight @ ratio / weight.sum(axis=1) * sigma_px**2)
+    K = _PER_STEP**steps
+    ratio = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
+    common_px2 = np.empty(len(sigma_px))
+    for k in range(len(sigma_px)):  # the shapes in units of their noise
+        values, vectors = np.linalg.eigh(K * np.outer(root[:, k], root[:, k]))
+        along = left[:, k] / root[:, k]
+        correlated = _evidence(values, root[:, k] @ vectors, along @ vectors)
+        alone = _evidence(information[used, k], root[:, k], along)
+        common_px2[k] = ratio * expit(correlated - alone) * sigma_px[k] ** 2
+    return common_px2
+
+
+def _evidence(values: Floats, ones: Floats, along: Floats) -> float:
+    """
+    Return the log evidence of shapes along the axes of their covariance, mean eliminated.
+
+    Along each axis (m,): variance at an amplitude of 1 px, component of a common shape, and of
+    the shapes.
+    """
+    inverse = 1.0 / (1.0 + np.exp(2.0 * _LOG_SHAPE)[:, None] * np.maximum(values, 0.0))
+    of_ones, mean = inverse @ ones**2, inverse @ (ones * along)
+    squared = inverse @ along**2 - mean**2 / of_ones
+    log_det = np.log(of_ones) - np.log(inverse).sum(axis=1)
+    prior = ((_LOG_SHAPE - LOG_CENTRE) / LOG_SIGMA) ** 2
+    return float(np.logaddexp.reduce(-0.5 * (log_det + squared + prior)))

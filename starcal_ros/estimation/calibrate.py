@@ -75,7 +75,6 @@ from starcal_ros.estimation.unknowns import (
 )
 from starcal_ros.estimation.weights import (
     CentroidVariance,
-    damped,
     Data,
     degrees_of_freedom,
     FREE_FACTOR,
@@ -269,9 +268,9 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
-            state, judged = last.after, damped(judged, after, share)
-        # Steps of unknowns that stars hardly show oscillate, and so do weights: the ratio of
-        # successive steps damps them.
+            state, judged = last.after, after
+        # Steps of unknowns that stars hardly show oscillate: the ratio of successive steps damps
+        # them.
         if k:
             of_before = max(float(before_sigma @ before_sigma), 1e-300)
             rest = float(step_sigma @ before_sigma) / of_before

@@ -20,7 +20,6 @@ _FEWEST_SIGHTINGS = 3  # sightings that separate the error of a star from those 
 _STAR_CHANCE = 1e-7  # probability that the sum of its residuals drops a good star
 _FEWEST_ATTITUDES = 3  # two show that one of them is wrong, but not which
 _MISFIT_SIGMA = 6.0  # noise exceeds it once in 10^8 attitudes, and a jump is far larger
-_MOST_OF_A_LINE = 200  # attitudes: their 20,000 pairs give a slope to a hundredth of a sigma
 _EFFICIENCY = 0.37  # efficiency of a variance from the median of squares, normal errors
 _CHANCE = 1e-5  # probability that a good attitude lies beyond the limit
 _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
@@ -99,7 +98,6 @@ def misfit_images(
     variance: Floats,
     seen: Mask,
     star_tracker: Indices,
-    time_ns: Indices,
     is_stated: bool,
 ) -> Mask:
     """
@@ -117,17 +115,17 @@ def misfit_images(
 
     Notes
     -----
-    Beyond 6 sigma about an axis, both of the stated sigma and of the scatter of the images about a
-    line in time (Theil 1950): a star tracker that drifts has no misfits.  Where the sigma is a
-    guess, the scatter of few images alone is uncertain: the limit is that of Student's t if it is
-    larger.  If more than a third would be misfits, the majority is unclear, and none is reported.
+    Beyond 6 sigma about an axis off the median, both of the stated sigma and of the scatter of the
+    images: a star tracker that drifts has no misfits.  Where the sigma is a guess, the scatter of
+    few images alone is uncertain: the limit is that of Student's t if it is larger.  If more than
+    a third would be misfits, the majority is unclear, and none is reported.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     for k in np.unique(star_tracker[seen]):
         here = seen & (star_tracker == k)
         if np.count_nonzero(here) < _FEWEST_ATTITUDES:
             continue
-        left = error[here] - _line_in_time(time_ns[here], error[here])
+        left = error[here] - np.median(error[here], axis=0)
         spread2 = np.median(left**2, axis=0) / _MEDIAN_OF_SQUARE
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
@@ -137,18 +135,3 @@ def misfit_images(
         if 3 * np.count_nonzero(found) <= np.count_nonzero(here):
             misfit[here] = found
     return misfit
-
-
-def _line_in_time(time_ns: Indices, error: Floats) -> Floats:
-    """Return robust lines (k, 3) through errors (k, 3): median of slopes, median of the rest."""
-    time = (time_ns - time_ns.mean()) / max(float(np.ptp(time_ns)), 1.0)
-    some = np.arange(0, len(time), -(-len(time) // _MOST_OF_A_LINE))
-    one, other = (some[k] for k in np.triu_indices(len(some), 1))
-    apart = time[other] - time[one]
-    # Neighbours in time have slopes of noise alone.
-    far = np.abs(apart) > 0.25
-    slope = np.zeros(3)
-    if len(time) > 2 * _FEWEST_ATTITUDES and far.any():
-        slope = np.median((error[other] - error[one])[far] / apart[far, None], axis=0)
-    line = time[:, None] * slope
-    return np.asarray(line + np.median(error - line, axis=0))

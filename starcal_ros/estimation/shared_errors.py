@@ -3,8 +3,8 @@
 Errors that stars of different images share: places of stars, and patterns of the detector.
 
 The observations of a group share one random displacement: those of a catalog star its error of
-place, those of a cell, a row or a column of the detector the structure of the lens and the sensor
-that is finer than the field.  Such errors need no coefficients.  Their variance is the mean
+place, those of a cell of the detector the structure of the lens and the sensor that is finer than
+the field.  Such errors need no coefficients.  Their variance is the mean
 product of residuals of different members of a group::
 
     s^2 = [sum_g |sum w r|^2 - sum_i |w r|^2] / [2 (sum_g (sum w)^2 - sum_i w^2)],
@@ -30,7 +30,6 @@ import math
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.special import softmax
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
@@ -46,17 +45,12 @@ from starcal_ros.estimation.amplitudes import (
 _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
-_STRIPS = (1 / 48, 1 / 192)  # heights of groups of rows, widths of groups of columns, in widths
 # Groups that add under 1 % (stars 2 %) to the variance of their mean are skipped: in thousands of
 # images, places of stars that are seen a hundred times add 1 % and take a third of the time.
 _NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _ROUNDING = 1e-9  # relative rounding of a sum over pairs where there are no pairs
 _ROUNDS = 8  # iterations of expectation and maximisation for the factors of stars
-# Prior odds that the centroids have a floor, as noise or as structure, against none: at 0.2 the
-# sigma of a tenth of sound missions grows by 9 %, at 0.02 by 1 % (docs/experiments.md).
-_FLOOR_ODDS = 0.02
-_SHARES = 20  # grid of the share of a floor that is structure
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
@@ -124,19 +118,13 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     """
     Return the groups of observations at pixels (n, 2) of stars (n,) on a detector of a width, px.
 
-    The stars, the cells of the fine octaves, from the coarsest of a 24th of the width, and strips
-    of rows and columns.
+    The stars, and the cells of the fine octaves, from the coarsest of a 24th of the width.
     """
     found = [Groups('star places', star, None, _together(pixels, star, width))]
     for wave in _FINE_OCTAVES:
-        cells = _cells(pixels, wave * width / _CELLS_PER_WAVE, (0, 1))
+        cells = _cells(pixels, wave * width / _CELLS_PER_WAVE)
         name = f'field at 1/{round(1 / wave)} of the width'
         found.append(Groups(name, cells, pairs_of(cells, star)))
-    for axis, kind in ((1, 'rows'), (0, 'columns')):
-        for share in _STRIPS:
-            strips = _cells(pixels, share * width, (axis,))
-            name = f'{kind} at 1/{round(1 / share)} of the width'
-            found.append(Groups(name, strips, pairs_of(strips, star)))
     return tuple(found)
 
 
@@ -162,7 +150,6 @@ def shared_errors(
     groups: Sequence[Groups],
     from_sky: Floats,
     last_octave: tuple[Floats, Floats],
-    floor_px2: tuple[float, float],
 ) -> tuple[SharedError, ...]:
     """
     Return the errors that observations share.
@@ -179,8 +166,6 @@ def shared_errors(
         Rotation of a displacement fixed to the star into pixel axes.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
-    floor_px2 : (estimate, 1-sigma)
-        Variance per axis that all centroids have beyond their own.
     """
     star = groups[0].group
     sightings = np.maximum(np.bincount(star, used)[star], 1.0)
@@ -193,7 +178,7 @@ def shared_errors(
     weight = np.where(used, 1.0 / variance_px2, 0.0)
     share_px2 = usual_px2 * _factors(on_sky, weight, usual_px2, star)
     found = [_error(groups[0], weight, share_px2, of_stars, share_px2 - usual_px2)]
-    # Two stars that are in the same strips again and again are one pair.
+    # Two stars that are in the same cell again and again are one pair.
     variance_px2 = variance_px2 + sightings * share_px2 - usual_px2
     weight = np.where(used, 1.0 / variance_px2, 0.0)
     moments = [
@@ -202,20 +187,8 @@ def shared_errors(
     # The error of a star that stays at one place may come from the star or from the detector.
     together = max(_pairs(working * np.sqrt(groups[0].together), star), 0.0)
     share = together / max(_pairs(working, star), together, 1e-300)
-    octaves, longest = len(_FINE_OCTAVES), last_octave[1] @ _next_octave(last_octave[0])
-    first = longest * _beside_stars(of_places, share)
-    variances = chain_means(first, _increments(moments[:octaves]))
-    # The floor contains the errors of stars too, which their number determines.
-    stars = np.unique(star[used])
-    places_px2 = float(usual_px2[used].mean())
-    sigma_px2 = math.hypot(floor_px2[1], places_px2 / math.sqrt(max(len(stars), 1)))
-    beyond_px2 = max(floor_px2[0] - places_px2, 0.0)
-    of_floor_px2 = _of_floor(beyond_px2, sigma_px2, np.array(moments[:octaves]))
-    variances = max(variances, of_floor_px2, key=sum)
-    # Strips of rows and of columns are chains of their own, from the coarser to the finer.
-    for first_strip in range(octaves, len(moments), len(_STRIPS)):
-        strips = moments[first_strip : first_strip + len(_STRIPS)]
-        variances += chain_means(_PRIOR, _increments(strips))
+    first = last_octave[1] @ _next_octave(last_octave[0]) * _beside_stars(of_places, share)
+    variances = chain_means(first, _increments(moments))
     for kind, moment, variance in zip(groups[1:], moments, variances, strict=True):
         ratio = max(moment[0] / moment[1], 0.0) ** 2
         found.append(_error(kind, weight, np.full(len(weight), variance), ratio, 0.0))
@@ -316,12 +289,10 @@ def _factors(on_sky: Floats, weight: Floats, share_px2: Floats, star: Indices) -
     return np.asarray(factor[star])
 
 
-def _cells(pixels: Floats, size_px: float, axes: Sequence[int]) -> Indices:
-    """Return the number (n,) of the cell of a size along some axes of each pixel (n, 2)."""
-    index = np.floor((pixels[:, list(axes)] + 0.5) / size_px).astype(np.int64)
+def _cells(pixels: Floats, size_px: float) -> Indices:
+    """Return the number (n,) of the square cell of a size of each pixel (n, 2)."""
+    index = np.floor((pixels + 0.5) / size_px).astype(np.int64)
     index -= index.min(axis=0, initial=0)
-    if len(axes) == 1:
-        return index[:, 0]
     return np.asarray(index[:, 0] * (int(index[:, 1].max(initial=0)) + 1) + index[:, 1])
 
 
@@ -404,25 +375,6 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
         after = transition @ (likelihood * after)
         after /= after.max()
     return means[::-1]
-
-
-def _of_floor(floor_px2: float, sigma_px2: float, moments: Floats) -> list[float]:
-    """
-    Return the variances (k,) of the fine octaves that may cause a floor of the centroids.
-
-    A variance that all centroids have alike is noise of each, or structure of the detector at its
-    place; where no two stars are near each other, the data cannot separate the two.
-    Posterior means: there is no floor, or it is noise, or a share of it, uniform, is structure of
-    one octave, which the pairs of its cells and of the finer ones show (`pair_moment`).
-    """
-    estimate, sigma = moments.T
-    share = (np.arange(_SHARES) + 0.5) / _SHARES
-    shown = share[:, None, None] * floor_px2 * np.triu(np.ones((len(moments), len(moments))))
-    off = ((estimate / sigma) ** 2 - ((estimate - shown) / sigma) ** 2).sum(axis=2)
-    is_floor = math.log(_FLOOR_ODDS) + 0.5 * (floor_px2 / sigma_px2) ** 2
-    of_structure = is_floor + 0.5 * off - math.log(off.size)
-    likely = softmax(np.concatenate([[0.0, is_floor], of_structure.ravel()]))[2:]
-    return list(floor_px2 * share @ likely.reshape(off.shape))
 
 
 def pixel_variance_px2(errors: Sequence[SharedError]) -> float:

@@ -35,12 +35,11 @@ from starcal_ros.records import StarObservations, StarTrackerAlignment
 _SPANS = (0.3, 1.0, 3.0, 10.0)  # correlation times, in spans of the campaign
 _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a large part of the sky
 _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
-_LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma
+_LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma; more where errors are larger
+_BEYOND = 1.0  # the grid ends a factor of e above the RMS of the errors at least
 _NOISE_SIGMA = 0.5  # prior 1-sigma of ln n: data sheets are right to a factor of 1.6
 _UNSTATED_SIGMA = 3.0  # the same where no sigma is stated: within a factor of 20
-_WRONG_SHEETS = 0.02  # prior probability that a data sheet is four times too small or worse
-_LEAST_WRONG = 4  # steps in the grid from the stated noise to four times it
-_BEYOND = 1.0  # the grid of wrong data sheets ends a factor of e above the RMS of the errors
+_WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
 _STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
 # Images are joined in at most 100 groups of neighbours in time, a hundredth of a campaign against
@@ -135,7 +134,7 @@ def tracker_errors(
 
     Notes
     -----
-    The stated sigma is a prior of the noise: log-normal, with a tail of wrong data sheets.
+    The stated sigma is a prior of the noise: log-normal, with the tails of wrong data sheets.
     """
     (m, count), group = error.shape, correlations.group
     size = np.bincount(group)
@@ -190,21 +189,19 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     """
     Return a grid (n,) of ln n for errors (m, 3), the centres of ln s there, and its log prior.
 
-    Right data sheets come first, then wrong ones, up to the size of the errors: with a wrong one
-    the slow error is as large as the noise, not as the stated noise.
+    A stated sigma has a normal prior with the tails of wrong data sheets, which are as no sigma at
+    all: there the slow error is as large as the noise, not as the stated noise.
     """
-    sigma = _NOISE_SIGMA if is_stated else _UNSTATED_SIGMA
     step = _LOG_NOISE[1] - _LOG_NOISE[0]
     log_rms = 0.5 * math.log(max(float((error**2).mean()), 1e-300))
-    top = max(float(_LOG_NOISE[-1]), log_rms + _BEYOND)
-    wrong = step * np.arange(_LEAST_WRONG, math.ceil(top / step) + 1)
-    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * sigma / _UNSTATED_SIGMA)
-    log_prior = [-0.5 * (_LOG_NOISE / sigma) ** 2, odds - 0.5 * (wrong / _UNSTATED_SIGMA) ** 2]
-    return (
-        np.concatenate([_LOG_NOISE, wrong]),
-        np.concatenate([np.zeros(len(_LOG_NOISE)) if is_stated else _LOG_NOISE, wrong]),
-        np.concatenate(log_prior),
-    )
+    more = max(math.ceil((log_rms + _BEYOND - _LOG_NOISE[-1]) / step), 0)
+    log_noise: Floats = np.append(_LOG_NOISE, _LOG_NOISE[-1] + step * np.arange(1, more + 1))
+    unstated = -0.5 * (log_noise / _UNSTATED_SIGMA) ** 2
+    if not is_stated:
+        return log_noise, log_noise, unstated
+    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * _NOISE_SIGMA / _UNSTATED_SIGMA)
+    right, wrong = -0.5 * (log_noise / _NOISE_SIGMA) ** 2, odds + unstated
+    return log_noise, np.where(wrong > right, log_noise, 0.0), np.logaddexp(right, wrong)
 
 
 def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise: float) -> float:
@@ -250,11 +247,12 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     span_s = max(float(np.ptp(time_s)), 1e-9)
     apart_s = np.abs(np.subtract.outer(time_s[some], time_s[some]))
     boresight = camera_from_icrf.as_matrix()[some, 2]
-    angle_deg = np.degrees(np.arccos(np.clip(boresight @ boresight.T, -1.0, 1.0)))
+    # Squared chords: a Gaussian of the angle itself is no covariance on a sphere.
+    chord2 = 2.0 - 2.0 * boresight @ boresight.T
     names = [f'over {share * span_s:.3g} s' for share in _SPANS]
     kernels = [of_groups(np.exp(-apart_s / (share * span_s))) for share in _SPANS]
     names += [f'over {one:g} deg' for one in _ANGLES_DEG]
-    kernels += [of_groups(np.exp(-0.5 * (angle_deg / one) ** 2)) for one in _ANGLES_DEG]
+    kernels += [of_groups(np.exp(-0.5 * chord2 / math.radians(one) ** 2)) for one in _ANGLES_DEG]
     axes = tuple(eigh(K, check_finite=False) for K in kernels)
     return Correlations(group, tuple(names), np.array(kernels), axes)
 
@@ -293,6 +291,7 @@ _UNKNOWN_RATE_RAD_S = 6.4e-4  # per axis: a low orbit, 1.1e-3, about an unknown 
 # comes round nor often turns away and back.
 _NEAR_S = 600.0
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
+_TRACY_WIDOM_99 = 2.0234  # 99 % quantile of the Tracy-Widom law of order 1
 _FEWEST_RATES = 3  # their scatter replaces a sigma that a sender does not state
 
 
@@ -348,10 +347,12 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     if np.count_nonzero(known) >= _FEWEST_RATES:
         unstated = np.sqrt(np.diag(scatter))
     own = np.where(sigma > 0, sigma, unstated)[:, :, None] ** 2 * np.eye(3)
-    # The errors explain the scatter up to their 2 sigma; only the rest is a difference of rates.
-    likely = 1.0 + 2.0 * math.sqrt(2.0 / max(np.count_nonzero(known) - 1, 1))
-    values, vectors = np.linalg.eigh(scatter - likely * own[known].mean(axis=0))
-    without_errors = (vectors * values.clip(0.0)) @ vectors.T
+    # Errors alone scatter so along their best direction; only the rest is a difference of rates.
+    errors = own[known].mean(axis=0) + _LEAST_RAD2_S2 * np.eye(3)
+    values, vectors = eigh(scatter, errors)
+    columns = errors @ vectors
+    differing = (values - largest_scatter(np.count_nonzero(known) - 1)).clip(0.0)
+    without_errors = (columns * differing) @ columns.T
     own[~known] = without_errors + _UNKNOWN_RATE_RAD_S**2 * np.eye(3)
     weight = known / (np.trace(without_errors) + np.einsum('mii->m', own) + _LEAST_RAD2_S2)
     mean = (weight @ np.where(known[:, None], rate, 0.0)) / weight.sum()
@@ -360,6 +361,20 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     shrunk = np.linalg.solve(total, off[:, :, None])[:, :, 0] @ without_errors
     root = np.asarray(np.linalg.cholesky(own + _LEAST_RAD2_S2 * np.eye(3)))
     return Rates(mean + shrunk, root)
+
+
+def largest_scatter(freedom: int) -> float:
+    """
+    Return the variance of errors of unit variance in three axes, along the axis of the largest.
+
+    The 99 % quantile for a covariance of so many degrees of freedom: the Tracy-Widom law of the
+    largest eigenvalue of a Wishart matrix with the centring of Ma (Bernoulli 18, 2012), which is
+    right to a tenth of the chance.
+    """
+    samples, axes = math.sqrt(max(freedom, 1) - 0.5), math.sqrt(3.0 - 0.5)
+    edge = samples + axes
+    width = edge * (1.0 / samples + 1.0 / axes) ** (1.0 / 3.0)
+    return float((edge**2 + _TRACY_WIDOM_99 * width) / max(freedom, 1))
 
 
 def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:

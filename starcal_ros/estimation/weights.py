@@ -80,18 +80,16 @@ class CentroidVariance:
     """
     Correction of the centroid covariances C: ``f(magnitude) (scale C + floor_px2 I)``.
 
-    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air;
-    ``floor_sigma_px2`` is its 1-sigma, infinite where all C are alike.  The scale corrects a wrong
-    detector gain.  The factor f covers errors that come with brightness, as of saturated cores:
-    linear between ``class_magnitude`` (k,), ascending, with the values ``class_factor`` (k,), and
-    constant outside; 1 where both are empty.
+    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air.
+    The scale corrects a wrong detector gain.  The factor f covers errors that come with
+    brightness, as of saturated cores: linear between ``class_magnitude`` (k,), ascending, with the
+    values ``class_factor`` (k,), and constant outside; 1 where both are empty.
     """
 
     scale: float
     floor_px2: float
     class_magnitude: tuple[float, ...] = ()
     class_factor: tuple[float, ...] = ()
-    floor_sigma_px2: float = math.inf
 
     def of(self, covariance_px2: Floats, magnitude: NDArray[np.floating]) -> Floats:
         """Corrected covariances (n, 3) uu, uv, vv of stars of magnitudes (n,)."""
@@ -124,24 +122,27 @@ def estimate_variance(
 
     Notes
     -----
-    Scale and floor are found by scoring: weighted least squares of the squared residuals on the
-    measured variance and one, with the variance of a square as weight, less of it near 4.5 sigma
-    (`_part`).
+    Scale and floor maximise the restricted likelihood of the residuals, whose gradient is the sum
+    of ``freedom / 2 (square / freedom - variance) / variance^2`` times the derivatives of the
+    variance: weighted least squares of squares over freedom on the measured variance and one, the
+    weights renewed, with less of a square near 4.5 sigma (`_part`).
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
-    squared = (residual_px[used] ** 2).sum(axis=1) / np.maximum(freedom[used], _LEAST_FREEDOM)
+    left = np.maximum(freedom[used], _LEAST_FREEDOM)
+    squared = (residual_px[used] ** 2).sum(axis=1) / left
     # The median of a squared length of two normal axes is ln 2 of its mean.
     scale, floor_px2 = max(float(np.median(squared / own)) / math.log(2.0), 1e-12), 0.0
     for _ in range(_ROUNDS):
         before = scale, floor_px2
         expected = scale * own + floor_px2
-        weight = _part(squared / expected) / expected**2
-        scale, floor_px2, sigma_px2 = _line(own, squared, weight)
+        weight = 0.5 * left * _part(squared / expected) / expected**2
+        scale, floor_px2 = _line(own, squared, weight)
         if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
             break
     ratio = squared / (scale * own + floor_px2)
-    nodes, factors = _brightness(ratio, np.asarray(magnitude, np.float64)[used])
-    return CentroidVariance(scale, floor_px2, nodes, factors, sigma_px2)
+    counted = 0.5 * left * _part(ratio)
+    nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
+    return CentroidVariance(scale, floor_px2, nodes, factors)
 
 
 def _part(ratio: Floats) -> Floats:
@@ -154,15 +155,14 @@ def _part(ratio: Floats) -> Floats:
     return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
 
 
-def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, float]:
-    """Return scale and floor of ``squared = scale own + floor``, not negative, and its sigma."""
+def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
+    """Return scale and floor of ``squared = scale own + floor``, not negative."""
     weighted = weight * own
     by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
     determinant = by_own * by_one - both**2
-    scale, floor_px2, sigma_px2 = right_own / by_own, 0.0, math.inf
+    scale, floor_px2 = right_own / by_own, 0.0
     if determinant > _ALIKE * by_own * by_one:
-        sigma_px2 = math.sqrt(by_own / determinant)
         scale = (by_one * right_own - both * right_one) / determinant
         floor_px2 = (by_own * right_one - both * right_own) / determinant
     if floor_px2 < 0:
@@ -170,15 +170,18 @@ def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, f
     if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
         scale = float(np.clip(scale, *_SCALE_LIMITS))
         floor_px2 = max((right_one - scale * both) / by_one, 0.0)
-    return scale, floor_px2, sigma_px2
+    return scale, floor_px2
 
 
-def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _brightness(
+    ratio: Floats, counted: Floats, magnitude: Floats
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """
     Return magnitudes and factors of a smooth function of brightness.
 
-    Scoring of the exponential likelihood of ``ratio`` (n,), squared residuals over variance, with
-    a normal prior of the logarithms: few stars, or none that differ, give factors near 1.
+    Scoring of the exponential likelihood of ``ratio`` (n,), squared residuals over variance, of
+    which each counts as ``counted`` (n,) stars, with a normal prior of the logarithms: few stars,
+    or none that differ, give factors near 1.
     """
     count = min(_NODES, len(ratio) // _STARS_PER_NODE)
     if count < 2:
@@ -187,7 +190,7 @@ def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tu
     if len(nodes) < 2:
         return (), ()
     place = np.rint((magnitude - nodes[0]) / np.ptp(nodes) * _BINS).astype(np.int64)
-    stars, summed = (np.bincount(place, _part(ratio) * one) for one in (1.0, ratio))
+    stars, summed = (np.bincount(place, counted * one) for one in (1.0, ratio))
     bins = nodes[0] + np.ptp(nodes) / _BINS * np.arange(len(stars))
     basis = np.stack([np.interp(bins, nodes, row) for row in np.eye(len(nodes))], axis=1)
     log_factor = np.zeros(len(nodes))
@@ -334,9 +337,7 @@ def tracker_attitudes(
             trackers.append(dataclasses.replace(exact, sigma_rad=stated[0], images=images))
         return Attitudes(error, covariance, seen, np.zeros(m, bool), tuple(trackers))
     is_stated = tracker_sigma_is_given(data.options)
-    misfit = misfit_images(
-        error / stated, variance, seen, problem.star_tracker, data.time_ns, is_stated
-    )
+    misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, is_stated)
     known_trackers = before.trackers if before else ()
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
@@ -459,40 +460,10 @@ def judge(
         raise NotObservable('no image has three stars that fit')
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
-        # As the residuals have it: they are smaller than the errors by the degrees of freedom.
-        left = 0.5 * float(freedom[kept].mean())
-        floor = (left * variance.floor_px2, left * variance.floor_sigma_px2)
         errors = shared_errors(
-            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave, floor
+            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave
         )
     return Weighting(variance, errors, kept, attitudes)
-
-
-def damped(one: Weighting, other: Weighting, share: float) -> Weighting:
-    """
-    Return the other conclusions, with weights a share of the way from one to the other.
-
-    Weights and residuals may oscillate from round to round, as a step may overshoot.
-    """
-    a, b, to = one.variance, other.variance, other.attitudes
-    if share == 1.0 or one.attitudes is None or to is None:
-        return other
-    before = one.attitudes.trackers
-    if len(a.class_factor) != len(b.class_factor) or len(before) != len(to.trackers):
-        return other
-
-    def part(this: float, that: float) -> float:
-        return this + share * (that - this)
-
-    trackers = tuple(
-        dataclasses.replace(that, working=part(this.working, that.working))
-        for this, that in zip(before, to.trackers, strict=True)
-    )
-    scale, floor_px2 = part(a.scale, b.scale), part(a.floor_px2, b.floor_px2)
-    factor = tuple(map(part, a.class_factor, b.class_factor))
-    variance = dataclasses.replace(b, scale=scale, floor_px2=floor_px2, class_factor=factor)
-    attitudes = dataclasses.replace(to, trackers=trackers)
-    return dataclasses.replace(other, variance=variance, attitudes=attitudes)
 
 
 def has_converged(one: Weighting, other: Weighting, table: StarTable) -> bool:

@@ -273,8 +273,10 @@ def estimate_with_smallest_lens(
     The model of the prior camera comes first, then the others by the number of their coefficients.
     A model is accepted where the likelihood of a field beside it is not larger than chance makes
     it: structure over the detector, which a model does not lose by having more coefficients alone.
-    Where none is accepted, the model with the least evidence for a field is, each coefficient
-    counted as 2.  A model that cannot be estimated is left out.
+    A further model is left out if the stars show one of its coefficients less than the prior of
+    any lens does, as in a field of a degree.  Where none is accepted, the model with the least
+    evidence for a field is, each coefficient counted as 2.  A model that cannot be estimated is
+    left out.
 
     Raises
     ------
@@ -299,8 +301,10 @@ def estimate_with_smallest_lens(
         except TooFewObservations as error:
             shortage = error if prior.camera.has_lens(model) else shortage
             continue  # the stars do not determine this model
-        if estimate.termination != 'converged' and best is not None:
-            continue  # lost on the way: its lack of a field means nothing
+        if best is not None and not (
+            estimate.termination == 'converged' and _is_shown_by_stars(estimate)
+        ):
+            continue  # lost on the way, or not for these stars: its lack of a field means nothing
         camera = estimate.geometry.camera
         if not np.isfinite(line_of_sight(camera, pixel_grid(camera, 15, 15))).all():
             continue  # beyond the stars it folds
@@ -313,6 +317,14 @@ def estimate_with_smallest_lens(
     if best is None:
         raise shortage
     return best
+
+
+def _is_shown_by_stars(estimate: Estimate) -> bool:
+    """Return True if the stars outweigh the default prior of each lens coefficient."""
+    problem = estimate.linear.problem
+    variance = np.diag(estimate.covariance)[: problem.camera_count]
+    # Stars with as much information as the prior halve its variance.
+    return not (problem.is_weak & (variance > 0.5 * problem.prior_sigma**2)).any()
 
 
 def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:

@@ -389,18 +389,13 @@ def common_px2(made: Images, sigma_px: Floats, k: int, step: float) -> float:
     K = null_space(np.ones((1, m)))
     apart = np.abs(np.subtract.outer(np.arange(m), np.arange(m)))
     evidence, ratio = [], []
-    # No correlation, one that decays and one that lasts.
-    for R, before in (
-        (np.eye(m), 0.5),
-        (0.9 ** (step * apart), 0.45),
-        (0.5 * np.eye(m) + 0.5 * np.ones((m, m)), 0.05),
-    ):
+    for R in (np.eye(m), 0.9 ** (step * apart)):  # no correlation, and one that decays
         found = 0.0
         for log_px in np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70):
             V = K.T @ (noise + math.exp(2 * log_px) * R) @ K
             likelihood = multivariate_normal.pdf(K.T @ shown, cov=V)
             found += likelihood * math.exp(-0.5 * ((log_px - CENTRE) / SIGMA) ** 2)
-        evidence.append(before * found)
+        evidence.append(found)
         share = float(R[~np.eye(m, dtype=bool)].mean())
         ratio.append(share / (1.0 - share))
     return float(np.dot(evidence, ratio) / sum(evidence) * sigma_px[k] ** 2)

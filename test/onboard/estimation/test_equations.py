@@ -16,7 +16,6 @@ from four_images import (  # type: ignore[import-not-found]
     prior_precision,
     SHAPE,
     Small,
-    usual,
     WIDTH,
 )
 import numpy as np
@@ -38,16 +37,6 @@ from starcal_ros.estimation.unknowns import Layout, unknowns_in_state
 # Finite differences leave 1e-10 of a derivative, and attitude errors of 20 arcsec, which enter the
 # derivatives of the star trackers to first order, 1e-8.
 EXACT = 5e-8
-
-
-@pytest.fixture(scope='module')
-def given() -> Small:
-    return usual()[0]
-
-
-@pytest.fixture(scope='module')
-def truth() -> Dense:
-    return usual()[1]
 
 
 @pytest.fixture(scope='module')

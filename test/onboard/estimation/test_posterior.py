@@ -20,7 +20,6 @@ from four_images import (  # type: ignore[import-not-found]
     Small,
     small,
     solution,
-    usual,
     whitener,
     WIDTH,
 )
@@ -49,16 +48,6 @@ EXACT = 2e-7
 # Amplitudes of the next term of the lens: none, and two that the stars may show.
 OF_TERM = np.array([-2.0, 1.5, 2.2])
 OCTAVES_PX = np.array([0.03, 0.02, 0.01])
-
-
-@pytest.fixture(scope='module')
-def given() -> Small:
-    return usual()[0]
-
-
-@pytest.fixture(scope='module')
-def truth() -> Dense:
-    return usual()[1]
 
 
 def solved(given: Small) -> Posterior:

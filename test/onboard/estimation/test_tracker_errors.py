@@ -10,14 +10,19 @@ from numpy.random import Generator
 import pytest
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation import tracker_errors as module
 from starcal_ros.estimation.amplitudes import interval_factor
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.tracker_errors import correlations_of, tracker_errors, TrackerErrors
+from starcal_ros.estimation.tracker_errors import (
+    correlations_of,
+    largest_scatter,
+    tracker_errors,
+    TrackerErrors,
+)
 from studies.worlds import simulate, World
 
 CADENCE_NS = 60 * 10**9
@@ -71,7 +76,7 @@ def test_the_restricted_likelihood_is_that_of_dense_contrasts() -> None:
     assert values - values[0, 0] == pytest.approx(expected - expected[0, 0], abs=1e-9)
 
 
-def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
+def test_correlations_are_in_time_and_in_the_distance_of_the_boresights() -> None:
     attitudes = Rotation.from_euler('xz', [[0, 0], [10, 40], [30, 80], [180, 0]], degrees=True)
     time_ns = np.array([0, 10, 40, 100], np.int64) * 10**9
     found = correlations_of(time_ns, attitudes)
@@ -90,9 +95,12 @@ def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
         assert pytest.approx(np.exp(-apart / (100.0 * share))) == K
     for width, K in zip((10.0, 30.0, 60.0), kernels[4:], strict=True):
         assert np.diag(K) == pytest.approx(1.0)
-        assert K[0, 1] == pytest.approx(math.exp(-0.5 * (10.0 / width) ** 2))
-        assert K[0, 2] == pytest.approx(math.exp(-0.5 * (30.0 / width) ** 2))
-        assert K[0, 3] == pytest.approx(math.exp(-0.5 * (180.0 / width) ** 2))
+        chords = 2.0 * np.sin(0.5 * np.radians([10.0, 30.0, 180.0])) / math.radians(width)
+        assert K[0, 1:] == pytest.approx(np.exp(-0.5 * chords**2))
+    # All over the sky too it is a covariance; with angles for chords one eigenvalue was -0.008.
+    sky = Rotation.random(60, random_state=np.random.default_rng(1))
+    for K in correlations_of(time_ns[0] + np.arange(60), sky).kernels[4:]:
+        assert np.linalg.eigvalsh(K).min() > -1e-12
 
 
 def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -> TrackerErrors:
@@ -104,14 +112,15 @@ def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -
     contrasts = null_space(np.ones((1, m)))
     logs, slows, noises, covariances, of_mean = [], [], [], [], []
     log_likelihoods, plain = [], []
-    sigma = 0.5 if is_stated else 3.0
-    # Of fifty data sheets one states no more than none: its noise is four times larger and more.
+    # One of fifty data sheets states no more than none.
+    right, wrong = (norm(0.0, size).logpdf for size in (0.5, 3.0))
+    sheets = []
     rms = math.sqrt((error**2).mean())
-    right = np.linspace(-2.1, 2.8, 15)
-    # Where none is stated, the slow error is as large as the noise.
-    sheets = [(b, 0.0 if is_stated else b, -0.5 * (b / sigma) ** 2) for b in right]
-    for b in 0.35 * np.arange(4, math.ceil(max(2.8, math.log(rms) + 1.0) / 0.35) + 1):
-        sheets.append((b, b, -0.5 * (b / 3.0) ** 2 + math.log(0.02 / 0.98 * sigma / 3.0)))
+    for b in -2.1 + 0.35 * np.arange(15 + max(math.ceil((math.log(rms) - 1.8) / 0.35), 0)):
+        by_sheet, by_none = right(b) + math.log(0.98), wrong(b) + math.log(0.02)
+        prior = np.logaddexp(by_sheet, by_none) if is_stated else by_none
+        # Where none is stated, the slow error is as large as the noise.
+        sheets.append((b, 0.0 if is_stated and by_sheet > by_none else b, prior))
     for K in kernels:
         for a in np.linspace(-4.5, 4.0, 18):
             for b, centre, log_prior in sheets:
@@ -304,3 +313,15 @@ def test_a_slow_error_is_as_large_about_an_axis_of_more_noise(stated_arcsec: flo
     assert 0.4 < about / across < 2.5
     if stated_arcsec:
         assert across == pytest.approx(stated_arcsec, rel=0.3)
+
+
+@pytest.mark.parametrize('freedom', [1, 3, 17, 100])
+def test_errors_alone_scatter_beyond_the_largest_of_three_axes_once_in_a_hundred(
+    freedom: int,
+) -> None:
+    rng = np.random.default_rng(freedom)
+    errors = rng.normal(size=(10_000, freedom, 3))
+    largest = np.linalg.eigvalsh(errors.transpose(0, 2, 1) @ errors / freedom)[:, -1]
+    # 100 campaigns of 10,000 leave 10 % of their number; the law is right to as much.
+    chance = np.mean(largest > largest_scatter(freedom))
+    assert chance == pytest.approx(0.01, rel=0.4)

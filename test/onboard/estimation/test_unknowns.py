@@ -20,7 +20,6 @@ from four_images import (  # type: ignore[import-not-found]
     Small,
     small,
     TURN_S,
-    usual,
     whitener,
     WIDTH,
 )
@@ -46,16 +45,6 @@ from starcal_ros.estimation.unknowns import (
 # Finite differences are exact to 1e-10 of a column; attitude errors of 20 arcsec enter the
 # derivatives of the star trackers to first order, which leaves their square: 1e-8.
 EXACT = 2e-8
-
-
-@pytest.fixture(scope='module')
-def given() -> Small:
-    return usual()[0]
-
-
-@pytest.fixture(scope='module')
-def truth() -> Dense:
-    return usual()[1]
 
 
 def star_matrix(given: Small) -> tuple[Floats, Floats]:

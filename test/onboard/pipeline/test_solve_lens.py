@@ -49,7 +49,10 @@ def test_a_lens_that_cannot_be_estimated_loses_without_a_traceback(source: str) 
         for record in read_observations([KB97 / 'observations.mcap'], '/observations'):
             ensemble = ensemble.add(record)
         found, _ = estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)
-        assert found.geometry.camera.intrinsics[0] == pytest.approx(180540.9, rel=0.01)
+        camera = found.geometry.camera
+        assert camera.intrinsics[0] == pytest.approx(180540.9, rel=0.01)
+        # In half a degree the stars show no other coefficients: k4 was -7e14 in an equidistant.
+        assert camera.model == setup.prior.camera.model
         return
     given = of_random_pointings(1, images=12)
     ensemble, rng, middle = true_observations(given), np.random.default_rng(1), (648.0, 512.0)
@@ -57,7 +60,7 @@ def test_a_lens_that_cannot_be_estimated_loses_without_a_traceback(source: str) 
     for image in ensemble.images:
         few = image.select(np.isin(np.arange(len(image)), rng.permutation(len(image))[:6]))
         noise = rng.normal(size=few.measured_px.shape) * 30.0
-        px = middle + (few.measured_px - middle) * 0.02 + noise
+        px = middle + (few.measured_px - middle) * 0.005 + noise
         images.append(dataclasses.replace(few, measured_px=px))
     options = CalibrationOptions(
         star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec,
