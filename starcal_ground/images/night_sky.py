@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import choose_image_topic, stated_tracker, Topics
+from starcal_ground.blind import search
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.images import FEWEST_SOURCES
 from starcal_ground.campaign import Source
@@ -65,8 +66,8 @@ def _through_air(
     lost = refusals(one for one in images if one.time_ns in stars.icrf_from_camera)
     notes = [note] if note else []
     notes += [
-        f'{row.count} of {len(images)} images, identified by their stars, refused as'
-        f' {row.reason}: {row.detail or row.meaning}'
+        f'{row.count} of {len(images)} images, identified by their brightest stars, do not fit the'
+        f' camera common to all and are refused as {row.reason}: {row.detail or row.meaning}'
         for row in lost
     ]
     return images, '; '.join(notes)
@@ -141,11 +142,12 @@ def from_photographs(
         for one in stated_facts.focal_lengths_of(photographs)
     }
     places = [one.pointing for one in photographs if one.pointing]
+    catalog = _catalog_of(values)
     try:
-        stars = _found(_images(photographs, damaged, channel), values, hints, places)
+        stars = _found(_images(photographs, damaged, channel), values, catalog, hints, places)
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
-    is_rendered, curve = _tone_curve(photographs, stars, _catalog_of(values), channel)
+    is_rendered, curve = _tone_curve(photographs, stars, catalog, channel)
     # A FITS file whose rows have no stated order is mirrored by that order.
     by_rows = stars.mirrored and not any(one.is_upright for one in photographs)
     stars = _half_turned(stars) if by_rows else stars
@@ -289,8 +291,9 @@ def camera_of_bags(
         height, width = first.pixels.shape
         focal_px = 1000.0 * lens[0] / lens[1]
         hints = {image_files.GIVEN: by_stars.ideal_camera((width, height), focal_px)}
+    catalog, every = _catalog_of(values), itertools.chain([first] if first else [], images)
     try:
-        stars = _found(itertools.chain([first] if first else [], images), values, hints)
+        stars = _found(every, values, catalog, hints)
     except NotFromStars as error:
         if not refused:
             raise
@@ -317,6 +320,7 @@ def _of_one_size(
 def _found(
     images: Iterator[Image],
     values: Mapping[str, object],
+    catalog: StarCatalog,
     hints: Mapping[str, CameraModel],
     places: Sequence[tuple[float, float]] = (),
 ) -> by_stars.FromStars:
@@ -328,10 +332,13 @@ def _found(
     """
     if url := str(values.get('camera_info_url', '')):
         hints = {url: read_camera_info(url)}
-    catalog = _catalog_of(values)
     too_few = stated_facts.too_few_stars(hints, catalog, bool(values.get('catalog')), places)
     least = option_groups(values)['calibration'].min_images
-    return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
+    try:
+        return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
+    finally:
+        if values.get('catalog'):  # another reading of the file would not use them
+            search.forget_indices()
 
 
 def _catalog_of(values: Mapping[str, object]) -> StarCatalog:

@@ -98,13 +98,12 @@ def check_field_of_stars(
     """
     fx, _, fy = (float(value) for value in camera.intrinsics[:3])
     field_sr = min(camera.width * camera.height / (fx * fy), 4.0 * math.pi)
-    direction = catalog.direction_icrs
-    faintest = direction[-_FAINTEST:]
-    for part in (direction[::16], direction):  # a part of the catalog mostly has enough
-        inside = faintest @ part.T > 1.0 - field_sr / (2.0 * math.pi)
-        in_field = max(float(np.count_nonzero(inside)) / max(len(faintest), 1) - 1.0, 0.0)
-        if in_field >= _FEWEST_STARS:
-            return
+    faintest = catalog.direction_icrs[-_FAINTEST:]
+    chord = math.sqrt(field_sr / math.pi)  # of a cap of this area: its radius
+    inside = catalog.tree.query_ball_point(faintest, chord, return_length=True)
+    in_field = max(float(inside.sum()) / max(len(faintest), 1) - 1.0, 0.0)
+    if in_field >= _FEWEST_STARS:
+        return
     raise OptionError(
         f'magnitude_limit: {magnitude_limit:g} leaves {counted(len(catalog), "star")} in the'
         f' catalog, {in_field:.2g} in a mean field of the camera where it is deepest; raise it, or'
