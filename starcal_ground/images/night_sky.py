@@ -44,7 +44,6 @@ _FEW = 5  # images that are looked at for stars, or whose stars show a tone curv
 # The scatter of 15 brightnesses is known to a fifth.
 _FEWEST_BRIGHTNESSES, _CLEARLY_LESS = 15, 0.8
 _ATTITUDE_TOPIC = '/stars/attitude'
-# The site does not matter: at an unknown time its zenith is unknown too.
 _NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
 
 
@@ -164,7 +163,7 @@ def from_photographs(
     stated = {**site, **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
-        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
+        stated, words_of_site = _at_unknown_time(stated)
     mirrored = (
         'mirrored top to bottom: the stars show that the rows of the files are last to first'
         if by_rows
@@ -265,9 +264,17 @@ def from_bags(
     stars = camera_of_bags(bags, choose_image_topic(bags, topics), values, lens=lens)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
+    note = ''
     if is_located and min(stars.icrf_from_camera) < CLOCKS_SET_NS:
-        values = {'velocity_sigma_m_s': EARTH_M_S, **values, **_NOWHERE}
-    return _set_up(stars, bags, values, folder, is_located, topics)
+        values, note = _at_unknown_time(values)
+    return _set_up(stars, bags, values, folder, is_located, topics, [note] * bool(note))
+
+
+def _at_unknown_time(values: Mapping[str, object]) -> tuple[dict[str, object], str]:
+    """Options for images without a date, and a note on a site: its zenith is unknown too."""
+    has_site = any(values.get(name, nowhere) != nowhere for name, nowhere in _NOWHERE.items())
+    note = 'the site is not used: the images have no date' * has_site
+    return {'velocity_sigma_m_s': EARTH_M_S, **values, **_NOWHERE}, note
 
 
 def camera_of_bags(

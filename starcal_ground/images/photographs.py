@@ -209,14 +209,20 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
         stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
     diagonal_px = math.hypot(stated.width, stated.height)
     if focal_length_mm or pixel_um:
-        given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
+        focal_mm, size_um = focal_length_mm or stated_mm, pixel_um or stated_um
+        for name, other, value in (
+            ('--focal-length-mm', '--pixel-size-um', size_um),
+            ('--pixel-size-um', '--focal-length-mm', focal_mm),
+        ):
+            if not value > 0:
+                raise IngestError(f'{path}: {name} needs {other}: the file does not state it')
+        given_px = _focal_px(focal_mm, size_um)
         if _SHORTEST < given_px / diagonal_px < _LONGEST:
             return replace(stated, focal_lengths=(FocalLength(given_px, GIVEN),))
-        if not math.isnan(given_px):
-            raise IngestError(
-                f'{path}: {GIVEN} give a focal length of {given_px:.3g} px for'
-                f' {stated.width} x {stated.height} pixels'
-            )
+        raise IngestError(
+            f'{path}: {GIVEN} give a focal length of {given_px:.3g} px for'
+            f' {stated.width} x {stated.height} pixels'
+        )
     # No camera has others.
     return replace(
         stated,

@@ -66,9 +66,15 @@ def histogram(residuals: Residuals) -> svg.Chart:
 
 
 def before_and_after(
-    residuals: Residuals, observations: Sequence[StarObservations], prior: CameraGeometry
+    residuals: Residuals,
+    observations: Sequence[StarObservations],
+    prior: CameraGeometry,
+    has_tracker: bool,
 ) -> svg.Chart | None:
     """Share of the stars within a distance of their prediction, by the prior and now; log axis."""
+    attitude = (
+        'the attitude that the star tracker reported' if has_tracker else 'the best attitude'
+    )
     before = [
         np.hypot(*(image.measured_px - predicted_px(image, prior)).T)
         for image in observations
@@ -91,8 +97,8 @@ def before_and_after(
         'Residuals before and after',
         svg.plot(curves, 'distance from the prediction (px)', 'stars within it (%)', x=(low, None),
                  y=(0.0, 100.0), log='x', is_left=True),
-        'Distance of the stars from their prediction: by the attitude that the star tracker '
-        'reported and the prior, and after the calibration.',
+        f'Distance of the stars from their prediction: by {attitude} and the prior, and after the'
+        ' calibration.',
     )  # fmt: skip
 
 

@@ -366,7 +366,8 @@ def charts_of(
     if maps is not None:
         charts['cells'] = detector_figures.cell_counts(maps.stars, camera)
         charts['shape'] = detector_figures.line_of_sight_sigma(maps, camera, is_alone=True)
-        charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
+        if calibration.has_alignment:
+            charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
     if calibration.sigma_budget:
         parts = verdict.parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
@@ -374,7 +375,9 @@ def charts_of(
     if residuals is not None and residuals.used.any():
         charts |= _residual_charts(calibration, residuals)
         if prior is not None:
-            charts['before'] = figures.before_and_after(residuals, observations, prior)
+            charts['before'] = figures.before_and_after(
+                residuals, observations, prior, calibration.has_alignment
+            )
     return {name: chart for name, chart in charts.items() if chart is not None}
 
 

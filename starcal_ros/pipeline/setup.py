@@ -390,14 +390,14 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
     """
     Setup from a mapping of option names to values, all checked.
 
-    ``prior`` replaces the camera file and alignment of the options. Raises OptionError for an
-    unknown name or a bad value. Raises ProductError or CatalogError when the prior camera or the
-    catalog cannot be read.
+    ``prior`` replaces the camera file and alignment of the options; its camera is converted to the
+    stated lens model, as that of a file is. Raises OptionError for an unknown name or a bad value.
+    Raises ProductError or CatalogError when the prior camera or the catalog cannot be read.
     """
     groups = option_groups(values)
     frames: SetupOptions = groups['frames']
     is_aligned = prior is not None or any(frames.prior_alignment)
-    prior = prior or _prior(frames)
+    prior = _in_stated_model(frames, prior or _prior(frames))
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
@@ -493,17 +493,23 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: not set; give the camera YAML of the prior camera')
     camera = camera_yaml.read_camera_info(frames.camera_info_url)
+    check_prior_camera(camera, frames.camera_info_url)
+    if not any(frames.prior_alignment):
+        return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
+
+
+def _in_stated_model(frames: SetupOptions, prior: CameraGeometry) -> CameraGeometry:
+    """A prior whose camera has the stated lens model; raises OptionError where that is no lens."""
+    camera = prior.camera
     if frames.lens_model not in ('prior', 'auto', camera.model):
         camera, worst_px = convert(camera, frames.lens_model)
         if not math.isfinite(worst_px):
             raise OptionError(
                 f'lens_model: {frames.lens_model} does not cover the field of the prior camera,'
-                f' {frames.camera_info_url}'
+                f' {frames.camera_info_url or "found by the stars"}'
             )
-    check_prior_camera(camera, frames.camera_info_url)
-    if not any(frames.prior_alignment):
-        return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
+    return replace(prior, camera=camera)
 
 
 def read_dark(path: str, width: int, height: int) -> Pixels | None:
