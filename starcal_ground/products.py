@@ -213,8 +213,20 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
         raise ProductError(f'{path}: not a record of a failure: {error}') from error
 
 
+def has_stated_prior(calibration: Calibration) -> bool:
+    """False where nobody stated a camera: the prior is a first solution from the same images."""
+    try:
+        options = untrusted.json_value(calibration.provenance['options'])
+    except (KeyError, ValueError):
+        return True
+    is_stated = not isinstance(options, dict) or options.get('camera_info_url') != ''
+    return calibration.has_alignment or is_stated
+
+
 def prior_of(calibration: Calibration) -> CameraGeometry | None:
-    """Camera and alignment before a calibration, of its model; None if not recorded."""
+    """Camera and alignment stated before a calibration, of its model; None if not recorded."""
+    if not has_stated_prior(calibration):
+        return None
     camera = calibration.geometry.camera
     count = len(camera.parameters)
     try:

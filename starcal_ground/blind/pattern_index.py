@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
+from scipy.special import comb
 
 from starcal_ros.arrays import Floats, Indices, Singles
 from starcal_ros.sky.catalog import direction_tree, StarCatalog
@@ -46,10 +47,15 @@ _SMALLEST, _LARGEST = -10, 9  # scales: discs of 0.05 to 36 degrees of radius
 _SPACING = 0.7
 # Stars per disc from scale 0 on, 7 below: at most about a million patterns.
 _STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)
+# Discs of a deep catalog of the whole sky have fewer stars, so that an index takes 0.1 GB.  Of 56
+# simulated frames of 0.6 and 1.2 degrees and a sky of 1.6 million stars, 55 were identified with 5
+# in a disc and 56 with 7, which took six times as long.
+_MOST_PATTERNS, _FEWEST_STARS = 3_000_000, 5
 _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
 # A, B, C, D as they are, then with C and D, A and B, and both exchanged.
 _ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
 _AT_ONCE = 20_000  # patterns of discs, whose arrays fit into a cache
+_DISCS_AT_ONCE = 50_000  # whose pairs with stars take 10 MB
 _MANY = 2000  # discs, from which a walk through two trees is faster than one search for each
 _CELL = 0.04  # about twice the tolerance: two cells along each place, and a table of a few MB
 # A and B are the farthest apart, and C is nearer to A: C and D lie in a lens of this corner.
@@ -67,13 +73,13 @@ class PatternIndex:
     """
 
     radius_rad: float
-    members: Indices
+    members: NDArray[np.int32]
     grid: PatternGrid
 
     def stars(self, rows: Indices) -> Indices:
         """Rows (n, 4) of the catalog of A to D of patterns (n,) of the grid."""
         patterns = self.grid.patterns[rows]
-        return np.asarray(self.members[patterns['group'][:, None], patterns['order']])
+        return np.asarray(self.members[patterns['group'][:, None], patterns['order']], np.int64)
 
 
 def scales_for(half_diagonal_rad: float) -> list[int]:
@@ -93,7 +99,8 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     """
     Index of the patterns of the brightest stars of each disc of a scale.
 
-    It takes up to half a second and is kept in memory.  The catalog is sorted by magnitude.
+    It takes up to half a second, or some seconds for millions of stars, and is kept in memory.
+    The catalog is sorted by magnitude.
     """
     radius_rad = _radius_rad(scale)
     of_disc = _STARS[max(scale, 0)]
@@ -104,12 +111,18 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     else:
         centres = _occupied(stars, _SPACING * radius_rad)
     tree = tree_of_brightest(catalog, len(stars))
-    members = brightest_within(tree, centres, radius_rad, of_disc)
+    some_discs = np.array_split(centres, len(centres) // _DISCS_AT_ONCE + 1)
+    brightest = [brightest_within(tree, some, radius_rad, of_disc) for some in some_discs]
+    members = np.concatenate(brightest, dtype=np.int32)
+    held = np.count_nonzero(members >= 0, axis=1)
+    while of_disc > _FEWEST_STARS and comb(held.clip(max=of_disc), 4).sum() > _MOST_PATTERNS:
+        of_disc -= 1
+    members = members[:, :of_disc]
     parts = _patterns_by_disc(stars.T.astype(np.float32), members)
     return PatternIndex(radius_rad, members, pattern_grid(parts))
 
 
-def _patterns_by_disc(stars: Singles, members: Indices) -> Iterator[Patterns]:
+def _patterns_by_disc(stars: Singles, members: NDArray[np.int32]) -> Iterator[Patterns]:
     """Patterns of stars (3, s) in discs of members (d, k), those of some discs at a time."""
     held = np.count_nonzero(members >= 0, axis=1)
     # Outside the region of a deep table nearly all discs are without a pattern.
@@ -267,7 +280,14 @@ def pattern_grid(parts: Iterable[Patterns]) -> PatternGrid:
     # The rows of a sparse matrix are sorted by counting.
     of_cell = (np.ones(len(cell), np.int8), (cell, np.arange(len(cell), dtype=np.int32)))
     by_cell = coo_array(of_cell, shape=(math.prod(_CELLS), max(len(cell), 1))).tocsr()
-    return PatternGrid(np.concatenate(every).take(by_cell.indices), by_cell.indptr)
+    place = np.empty_like(by_cell.indices)
+    place[by_cell.indices] = np.arange(len(cell), dtype=np.int32)
+    patterns, end = np.empty(len(cell), PATTERN), len(cell)
+    while every:  # each part is freed once it is placed
+        part = every.pop()
+        patterns[place[end - len(part) : end]] = part
+        end -= len(part)
+    return PatternGrid(patterns, by_cell.indptr)
 
 
 def _coordinates(patterns: Patterns) -> Singles:

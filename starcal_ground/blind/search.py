@@ -272,6 +272,12 @@ def _result(
     )
 
 
+def forget_indices() -> None:
+    """Free the indices of all catalogs: 0.3 GB for one of millions of stars."""
+    for kept in (pattern_index.pattern_index, _bright_stars, _bright_everywhere):
+        kept.cache_clear()
+
+
 class _Candidate(NamedTuple):
     """
     A pattern of an image that matches one of the catalog.

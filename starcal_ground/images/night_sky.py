@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import choose_image_topic, stated_tracker, Topics
+from starcal_ground.blind import search
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.images import FEWEST_SOURCES
 from starcal_ground.campaign import Source
@@ -44,7 +45,6 @@ _FEW = 5  # images that are looked at for stars, or whose stars show a tone curv
 # The scatter of 15 brightnesses is known to a fifth.
 _FEWEST_BRIGHTNESSES, _CLEARLY_LESS = 15, 0.8
 _ATTITUDE_TOPIC = '/stars/attitude'
-# The site does not matter: at an unknown time its zenith is unknown too.
 _NOWHERE = {'latitude_deg': 0.0, 'longitude_deg': 0.0}
 
 
@@ -66,8 +66,8 @@ def _through_air(
     lost = refusals(one for one in images if one.time_ns in stars.icrf_from_camera)
     notes = [note] if note else []
     notes += [
-        f'{row.count} of {len(images)} images, identified by their stars, refused as'
-        f' {row.reason}: {row.detail or row.meaning}'
+        f'{row.count} of {len(images)} images, identified by their brightest stars, do not fit the'
+        f' camera common to all and are refused as {row.reason}: {row.detail or row.meaning}'
         for row in lost
     ]
     return images, '; '.join(notes)
@@ -142,11 +142,12 @@ def from_photographs(
         for one in stated_facts.focal_lengths_of(photographs)
     }
     places = [one.pointing for one in photographs if one.pointing]
+    catalog = _catalog_of(values)
     try:
-        stars = _found(_images(photographs, damaged, channel), values, hints, places)
+        stars = _found(_images(photographs, damaged, channel), values, catalog, hints, places)
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
-    is_rendered, curve = _tone_curve(photographs, stars, _catalog_of(values), channel)
+    is_rendered, curve = _tone_curve(photographs, stars, catalog, channel)
     # A FITS file whose rows have no stated order is mirrored by that order.
     by_rows = stars.mirrored and not any(one.is_upright for one in photographs)
     stars = _half_turned(stars) if by_rows else stars
@@ -163,7 +164,7 @@ def from_photographs(
     stated = {**site, **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
-        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
+        stated, words_of_site = _at_unknown_time(stated)
     mirrored = (
         f'{BY_ROWS}: the stars show that the rows of the files are last to first'
         if by_rows
@@ -264,9 +265,17 @@ def from_bags(
     stars = camera_of_bags(bags, choose_image_topic(bags, topics), values, lens=lens)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
+    note = ''
     if is_located and min(stars.icrf_from_camera) < CLOCKS_SET_NS:
-        values = {'velocity_sigma_m_s': EARTH_M_S, **values, **_NOWHERE}
-    return _set_up(stars, bags, values, folder, is_located, topics)
+        values, note = _at_unknown_time(values)
+    return _set_up(stars, bags, values, folder, is_located, topics, [note] * bool(note))
+
+
+def _at_unknown_time(values: Mapping[str, object]) -> tuple[dict[str, object], str]:
+    """Options for images without a date, and a note on a site: its zenith is unknown too."""
+    has_site = any(values.get(name, nowhere) != nowhere for name, nowhere in _NOWHERE.items())
+    note = 'the site is not used: the images have no date' * has_site
+    return {'velocity_sigma_m_s': EARTH_M_S, **values, **_NOWHERE}, note
 
 
 def camera_of_bags(
@@ -290,8 +299,9 @@ def camera_of_bags(
         height, width = first.pixels.shape
         focal_px = 1000.0 * lens[0] / lens[1]
         hints = {image_files.GIVEN: by_stars.ideal_camera((width, height), focal_px)}
+    catalog, every = _catalog_of(values), itertools.chain([first] if first else [], images)
     try:
-        stars = _found(itertools.chain([first] if first else [], images), values, hints)
+        stars = _found(every, values, catalog, hints)
     except NotFromStars as error:
         if not refused:
             raise
@@ -318,6 +328,7 @@ def _of_one_size(
 def _found(
     images: Iterator[Image],
     values: Mapping[str, object],
+    catalog: StarCatalog,
     hints: Mapping[str, CameraModel],
     places: Sequence[tuple[float, float]] = (),
 ) -> by_stars.FromStars:
@@ -329,10 +340,13 @@ def _found(
     """
     if url := str(values.get('camera_info_url', '')):
         hints = {url: read_camera_info(url)}
-    catalog = _catalog_of(values)
     too_few = stated_facts.too_few_stars(hints, catalog, bool(values.get('catalog')), places)
     least = option_groups(values)['calibration'].min_images
-    return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
+    try:
+        return by_stars.from_stars(images, catalog, [*hints.values()], least, too_few)
+    finally:
+        if values.get('catalog'):  # another reading of the file would not use them
+            search.forget_indices()
 
 
 def _catalog_of(values: Mapping[str, object]) -> StarCatalog:

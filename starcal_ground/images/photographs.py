@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Image files: photographs with the facts that they state, and series that become messages.
-
-Photographs are JPEG, PNG, TIFF, FITS and camera raw.  A series, FITS, TIFF or PNG, gets the times
-of its exposures and one scale: a ROS image has 8 or 16 bit per pixel.  Integers that fit are kept;
-other values, mostly floating point, are mapped to 16 bit with one recorded scale for all images.
-"""
+"""Photographs, JPEG, PNG, TIFF, FITS and camera raw: facts that they state, and their light."""
 
 from __future__ import annotations
 
@@ -40,10 +34,11 @@ from starcal_ground.file_kinds import (
 )
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import FocalLength, Moment
+from starcal_ground.images.image_series import scale_of
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.fits_keywords import Card, FACTS, number_of, value_of
+from starcal_ros.formats.fits_keywords import FACTS, number_of
 from starcal_ros.formats.image_files import (
     content_of,
     decoded,
@@ -51,17 +46,15 @@ from starcal_ros.formats.image_files import (
     in_rgb,
     MOST_VALUES,
     read_fits,
-    read_image,
 )
-from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic
+from starcal_ros.formats.messages.sensor_messages import CHANNELS
 from starcal_ros.text import counted
 
 # These names mark images whose content does not, as damaged ones; HEIC of telephones is not read.
 _ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', '.fits', '.fit', '.fts', '.heic')
 _DIAGONAL_35_MM = 43.2666  # diagonal of a frame of 36 mm x 24 mm
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
-_EXIF, _GPS = 0x8769, 0x8825
-_FOCAL_LENGTH, _BITS = 0x920A, 0x0102
+_EXIF, _GPS = 0x8769, 0x8825  # groups of tags, Exif 2.32
 _BITS_OF_PNG = 24  # place in the file
 _SAME_STAMP_NS = NANOSECONDS_PER_SECOND  # file times are often equal; stamps must differ
 # Outside of it a clock was not set, or a file is damaged; stamps of ROS end in 2038.
@@ -206,17 +199,23 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
             _facts_of_raw(path) if kind is RAW else _facts_of_picture(path, kind)
         )
         stated = _of_tags(path, tags, gps, width, height)
-        stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+        stated_mm, stated_um = _real(tags.get('FocalLength')), _pixel_um(tags, width)
     diagonal_px = math.hypot(stated.width, stated.height)
     if focal_length_mm or pixel_um:
-        given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
+        focal_mm, size_um = focal_length_mm or stated_mm, pixel_um or stated_um
+        for name, other, value in (
+            ('--focal-length-mm', '--pixel-size-um', size_um),
+            ('--pixel-size-um', '--focal-length-mm', focal_mm),
+        ):
+            if not value > 0:
+                raise IngestError(f'{path}: {name} needs {other}: the file does not state it')
+        given_px = _focal_px(focal_mm, size_um)
         if _SHORTEST < given_px / diagonal_px < _LONGEST:
             return replace(stated, focal_lengths=(FocalLength(given_px, GIVEN),))
-        if not math.isnan(given_px):
-            raise IngestError(
-                f'{path}: {GIVEN} give a focal length of {given_px:.3g} px for'
-                f' {stated.width} x {stated.height} pixels'
-            )
+        raise IngestError(
+            f'{path}: {GIVEN} give a focal length of {given_px:.3g} px for'
+            f' {stated.width} x {stated.height} pixels'
+        )
     # No camera has others.
     return replace(
         stated,
@@ -293,7 +292,7 @@ def pixels_of_photograph(path: Path, channel: str = '', is_rendered: bool | None
     if values.dtype in (np.uint8, np.uint16):
         return np.ascontiguousarray(values)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    scale = _scale([values.dtype], low, high)
+    scale = scale_of([values.dtype], low, high)
     return scale.to_dn(values) if scale.step > 0 else np.zeros(values.shape, np.uint16)
 
 
@@ -335,7 +334,7 @@ def _srgb_to_light() -> NDArray[np.uint16]:
 _SRGB_TO_LIGHT = _srgb_to_light()
 
 
-_Tags = Mapping[int, Any]
+_Tags = Mapping[str, Any]  # values by the names of the tags in Exif 2.32
 
 
 @contextlib.contextmanager
@@ -353,7 +352,7 @@ def _quiet() -> Iterator[None]:
 def _facts_of_picture(path: Path, kind: FileKind) -> tuple[_Tags, _Tags, int, int]:
     """Tags of EXIF and GPS, width and height."""
     with needing('', IngestError, path):
-        from PIL import Image
+        from PIL import ExifTags, Image
     start = content_of(path, _JPEG_HEADER_BYTES) if kind is JPEG else content_of(path)
     try:
         # Opened, not decoded: size and tags only.
@@ -362,10 +361,12 @@ def _facts_of_picture(path: Path, kind: FileKind) -> tuple[_Tags, _Tags, int, in
             width, height = image.size
             _check_size(path, width, height)
             exif = image.getexif()
-            tags = {**dict(exif), **dict(exif.get_ifd(_EXIF))}
-            gps = dict(exif.get_ifd(_GPS))
+            by_number = {**dict(exif), **dict(exif.get_ifd(_EXIF))}
+            tags = {ExifTags.TAGS.get(tag, ''): value for tag, value in by_number.items()}
+            by_number = dict(exif.get_ifd(_GPS))
+            gps = {ExifTags.GPSTAGS.get(tag, ''): value for tag, value in by_number.items()}
             if kind is PNG:  # Pillow has no mode for colours of 16 bit
-                tags[_BITS] = start[_BITS_OF_PNG]
+                tags['BitsPerSample'] = start[_BITS_OF_PNG]
     except IngestError:
         raise
     except Exception as error:  # a damaged file makes Pillow raise anything
@@ -384,11 +385,11 @@ def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
         sizes, stated, lens = raw.sizes, raw.other, raw.lens
     taken = stated.timestamp  # the digits of the camera's clock, whatever its time zone
     tags = {
-        0x829A: stated.shutter_speed,
-        _FOCAL_LENGTH: stated.focal_length,
-        0x9003: f'{taken:%Y:%m:%d %H:%M:%S}' if taken else '',
-        0xA434: f'{lens.make} {lens.model}'.strip(),
-        _BITS: 16,
+        'ExposureTime': stated.shutter_speed,
+        'FocalLength': stated.focal_length,
+        'DateTimeOriginal': f'{taken:%Y:%m:%d %H:%M:%S}' if taken else '',
+        'LensModel': f'{lens.make} {lens.model}'.strip(),
+        'BitsPerSample': 16,
     }
     _check_size(path, sizes.width, sizes.height)
     return tags, {}, sizes.width, sizes.height
@@ -433,21 +434,20 @@ def _rawpy(path: Path) -> Any:
 def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Photograph:
     """Facts of tags of EXIF."""
     time_ns, dated, utc = _exif_time(path, tags)
-    # Make, Model, BodySerialNumber, LensModel
-    names = (tags.get(tag) for tag in (0x010F, 0x0110, 0xA431, 0xA434))
+    names = (tags.get(tag) for tag in ('Make', 'Model', 'BodySerialNumber', 'LensModel'))
     words = [str(name).strip('\0 ') for name in names if name]
-    focal_mm, pixel_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+    focal_mm, pixel_um = _real(tags.get('FocalLength')), _pixel_um(tags, width)
     by_tags = 'focal length and pixel size of EXIF'
     if words and focal_mm > 0:
         words.append(f'{focal_mm:g} mm')
     focal_px = _focal_px(focal_mm, pixel_um)
-    equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
+    equivalent_mm = _real(tags.get('FocalLengthIn35mmFilm'))  # 0: unknown
     if math.isnan(focal_px) and equivalent_mm > 0:
         focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
         by_tags = 'FocalLengthIn35mmFilm of EXIF'
     scales = () if math.isnan(focal_px) else (FocalLength(focal_px, by_tags),)
     site, camera = _exif_site(gps), ' '.join(words)
-    size, bits = path.stat().st_size, int(np.max(tags.get(_BITS, 8)))
+    size, bits = path.stat().st_size, int(np.max(tags.get('BitsPerSample', 8)))
     return Photograph(path, time_ns, dated, utc, width, height, scales, site, camera, size, bits)
 
 
@@ -459,10 +459,16 @@ def _real(value: object) -> float:
         return math.nan
 
 
-def _pixel_um(tags: Mapping[int, Any], width: int) -> float:
-    """Size of a pixel by FocalPlaneXResolution, of the full image of PixelXDimension."""
-    per_unit, unit_mm = _real(tags.get(0xA20E)), _UNIT_MM.get(tags.get(0xA210, 2), math.nan)
-    full = _real(tags.get(0xA002, width))
+def _text(tags: _Tags, *names: str) -> str:
+    """Text of the first of some tags that has one; empty for none."""
+    return str(next(filter(None, map(tags.get, names)), '')).strip('\0 ')
+
+
+def _pixel_um(tags: _Tags, width: int) -> float:
+    """Size of a pixel by FocalPlaneXResolution, of the full image of ExifImageWidth."""
+    per_unit = _real(tags.get('FocalPlaneXResolution'))
+    unit_mm = _UNIT_MM.get(tags.get('FocalPlaneResolutionUnit', 2), math.nan)
+    full = _real(tags.get('ExifImageWidth', width))
     if not (per_unit > 0 and full > 0):
         return math.nan
     return 1000.0 * unit_mm / per_unit * full / width
@@ -473,16 +479,16 @@ def _focal_px(focal_mm: float, pixel_um: float) -> float:
     return 1000.0 * focal_mm / pixel_um if focal_mm > 0 and pixel_um > 0 else math.nan
 
 
-def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
+def _exif_time(path: Path, tags: _Tags) -> tuple[int, bool, bool]:
     """Stamp of the middle of the exposure, and whether it has a date and a time zone."""
-    exposure_s = _real(tags.get(0x829A))
+    exposure_s = _real(tags.get('ExposureTime'))
     half_s = 0.5 * exposure_s if 0 < exposure_s < _LONGEST_EXPOSURE_S else 0.0
-    zone = str(tags.get(0x9011) or tags.get(0x9010) or '').strip('\0 ')  # OffsetTimeOriginal
-    text = str(tags.get(0x9003) or tags.get(0x0132) or '').strip('\0 ')  # DateTimeOriginal
+    zone = _text(tags, 'OffsetTimeOriginal', 'OffsetTime')
+    text = _text(tags, 'DateTimeOriginal', 'DateTime')
     with contextlib.suppress(ValueError, OverflowError):
         aware = datetime.strptime(f'{text} {zone or "+0000"}', '%Y:%m:%d %H:%M:%S %z')
         if _DATES[0] <= aware < _DATES[1]:
-            digits = str(tags.get(0x9291) or '').strip('\0 ')  # SubSecTimeOriginal
+            digits = _text(tags, 'SubsecTimeOriginal')
             part_s = float(f'0.{digits}') if digits.isdecimal() and len(digits) < 10 else 0.0
             middle_s = aware.timestamp() + part_s + half_s
             return round(middle_s * NANOSECONDS_PER_SECOND), True, bool(zone)
@@ -495,17 +501,17 @@ def _time_of_file(path: Path) -> int:
         return min(max(path.stat().st_mtime_ns, _FIRST_NS), _LAST_NS)
 
 
-def _exif_site(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
+def _exif_site(gps: _Tags) -> tuple[float, float, float] | None:
     try:
         degrees = [
             # Degrees, minutes and seconds, or fewer of them.
             sum(float(part) / 60.0**k for part, k in zip(gps[tag], range(3), strict=False))
-            * (-1.0 if str(gps[tag - 1]).upper()[:1] in 'SW' else 1.0)
-            for tag in (2, 4)  # GPSLatitude, GPSLongitude, each after its reference
+            * (-1.0 if str(gps[f'{tag}Ref']).upper()[:1] in 'SW' else 1.0)
+            for tag in ('GPSLatitude', 'GPSLongitude')
         ]
     except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
-    height_m = _real(gps.get(6))
+    height_m = _real(gps.get('GPSAltitude'))
     if not (abs(degrees[0]) <= 90 and abs(degrees[1]) <= 180):
         return None
     return degrees[0], degrees[1], height_m if -500 < height_m < 1e5 else 0.0
@@ -546,176 +552,3 @@ def _of_fits(path: Path, image: FileImage) -> tuple[Photograph, float, float]:
         'ROWORDER' in header,
     )
     return stated, number_of(header, 'focal length'), number_of(header, 'pixel size')
-
-
-_ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
-_FULL = 65000  # largest 16-bit value written: the end of the range means saturation
-
-
-@dataclass(frozen=True)
-class ImageOptions:
-    """
-    How the files are read.
-
-    ``time_key`` is the FITS keyword of the middle of the exposure (empty: the standard keywords);
-    ``times`` holds stamps by file name, which replace it.  ``hdu`` is the number or name of a FITS
-    extension (empty: the first image), ``channel`` red, green or blue of a colour image, ``bayer``
-    the pattern of a mosaic, ``value_range`` the range mapped to 16 bit (None: that of the images).
-    """
-
-    time_key: str = ''
-    times: Mapping[str, int] | None = None
-    hdu: str = ''
-    channel: str = ''
-    bayer: str = ''
-    value_range: tuple[float, float] | None = None
-    temperature_key: str = ''
-
-
-@dataclass(frozen=True)
-class ImageFile:
-    """
-    An image file: stamp of the middle of the exposure, size, range and noise of its pixels.
-
-    ``saturation`` is the FITS keyword SATURATE, NaN without one; ``temperature_degc`` likewise.
-    ``pixels_of`` says which pixels of the file they are, empty for all.
-    """
-
-    path: Path
-    time_ns: int
-    width: int
-    height: int
-    dtype: np.dtype[Any]
-    low: float
-    high: float
-    noise: float
-    saturation: float
-    temperature_degc: float
-    pixels_of: str = ''
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Mapping of pixel values to 16 bit, ``dn = round((value - offset) / step)``; or none."""
-
-    offset: float
-    step: float
-    dtype: type[np.uint8] | type[np.uint16]
-
-    @property
-    def is_none(self) -> bool:
-        """True if pixel values are not scaled."""
-        return (self.offset, self.step) == (0.0, 1.0)
-
-    def to_dn(self, values: NDArray[Any]) -> Pixels:
-        """Pixels of values; not-a-number becomes the median of the image."""
-        if self.is_none and values.dtype.kind in 'ui':
-            return self._cast(values)
-        middle = float(np.nanmedian(values)) if np.isnan(values).any() else 0.0
-        pixels = self._cast(np.zeros(values.shape, self.dtype))
-        for top in range(0, len(values), _ROWS):
-            known = np.nan_to_num(values[top : top + _ROWS], nan=middle)
-            dn = np.rint((known - self.offset) / self.step)
-            pixels[top : top + _ROWS] = np.clip(dn, 0, np.iinfo(self.dtype).max)
-        return pixels
-
-    def _cast(self, values: NDArray[Any]) -> Pixels:
-        return values.astype(np.uint8) if self.dtype is np.uint8 else values.astype(np.uint16)
-
-
-def look(path: Path, options: ImageOptions) -> ImageFile:
-    """Stamp, size and range of an image file; raises IngestError with the remedy."""
-    image = _of_options(path, options)
-    values, header = image.values, image.header
-    finite = np.isfinite(values)
-    if not finite.any():
-        raise IngestError(f'{path}: no pixel is a finite number')
-    some = values.flat[int(finite.argmax())]
-    steps = np.abs(np.diff(values[:: max(1, len(values) // 200)].astype(np.float64), axis=1))
-    height, width = values.shape
-    return ImageFile(
-        path,
-        _time_ns(path, header, options),
-        width,
-        height,
-        values.dtype,
-        float(values.min(where=finite, initial=some)),
-        float(values.max(where=finite, initial=some)),
-        # The median step between neighbours is 0.954 sigma for white noise.
-        float(np.nanmedian(steps)) / 0.954,
-        number_of(header, 'saturation'),
-        value_of(header, options.temperature_key.upper()),
-        image.pixels_of,
-    )
-
-
-def pixels_of(path: Path, options: ImageOptions, scale: Scale) -> Pixels:
-    """Pixels (height, width) of an image file, in 8 or 16 bit."""
-    pixels = scale.to_dn(_of_options(path, options).values)
-    pixels.setflags(write=False)
-    return pixels
-
-
-def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
-    """The scale of all images; none if whole numbers fit 16 bit.  Raises IngestError."""
-    kinds = [file.dtype for file in files] if options.value_range is None else []
-    low, high = options.value_range or (
-        min(file.low for file in files),
-        max(file.high for file in files),
-    )
-    scale = _scale(kinds, low, high)
-    if not scale.step > 0:
-        raise IngestError(f'--value-range: {low:g} to {high:g} is empty')
-    return scale
-
-
-def _scale(kinds: Sequence[np.dtype[Any]], low: float, high: float) -> Scale:
-    """The scale of values of some types from ``low`` to ``high``; without a type to 16 bit."""
-    if kinds and all(kind.kind in 'ui' for kind in kinds):
-        if low >= 0 and high <= 65535:
-            eight = all(kind.itemsize == 1 for kind in kinds)
-            return Scale(0.0, 1.0, np.uint8 if eight else np.uint16)
-        if high - low <= _FULL:
-            return Scale(low, 1.0, np.uint16)
-    return Scale(low, (high - low) / _FULL, np.uint16)
-
-
-def check_alike(files: Sequence[ImageFile]) -> None:
-    """Check that images have one size and different stamps; raises IngestError."""
-    first = files[0]
-    for file in files:
-        if (file.width, file.height) != (first.width, first.height):
-            raise IngestError(
-                f'{file.path}: {file.width} x {file.height} pixels, {first.path} has '
-                f'{first.width} x {first.height}: import the images of one camera and mode'
-            )
-    by_time = sorted(files, key=lambda file: file.time_ns)
-    for before, after in itertools.pairwise(by_time):
-        if before.time_ns == after.time_ns:
-            raise IngestError(f'{after.path}: has the time of {before.path}')
-
-
-def _of_options(path: Path, options: ImageOptions) -> FileImage:
-    image = read_image(path, options.hdu, options.channel, options.bayer)
-    if not (image.mosaic and not options.bayer):
-        return image
-    if not options.channel:
-        raise IngestError(
-            f'{path}: a mosaic, {image.mosaic.upper()} by its header: choose --channel red, green'
-            ' or blue'
-        )
-    values = of_mosaic(image.values, image.mosaic, options.channel)
-    return image._replace(values=values)
-
-
-def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
-    if options.times is not None:
-        if path.name not in options.times:
-            raise IngestError(f'{path}: not in the table of --times')
-        return options.times[path.name]
-    if not header:
-        raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
-    try:
-        return fits_facts.middle_of_exposure(header, options.time_key)
-    except (ValueError, OverflowError) as error:
-        raise IngestError(f'{path}: {error}') from error

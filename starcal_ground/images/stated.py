@@ -17,11 +17,13 @@ from starcal_ground.images.from_stars import FromStars
 from starcal_ground.images.photographs import GIVEN, Photograph
 from starcal_ros.camera import CameraModel
 from starcal_ros.sky.astrometry import air_above, SiteOptions
-from starcal_ros.sky.catalog import direction_tree, StarCatalog
+from starcal_ros.sky.catalog import StarCatalog
 
 # Half field under which the bundled catalog may have too few stars for a search.
 _NARROW_RAD = math.radians(2.0)
 _MOUNT_RAD = math.radians(1.0)  # error of the pointing that a mount reports
+# Stars of the deepest part of a catalog: the densest field is about one of them.
+_FAINTEST = 10_000
 _NEAR_POLE = 0.02  # sine of the distance from the pole: north has no direction there
 # Mean of the doubled position angles on both sides of a mount, which scatter by some degrees.
 _SAME_SIDES = 0.98
@@ -159,12 +161,11 @@ def _stars_of_field(
     area_sr = 4.0 * math.asin(float(np.prod(np.sin(np.arctan(half)))))  # sr of a pyramid
     if radius_rad > _NARROW_RAD or not (is_own or places):
         return len(catalog) * area_sr / (4.0 * math.pi)
-    tree = direction_tree(catalog.direction_icrs)
     if is_own:
-        centres = catalog.direction_icrs
+        centres = catalog.direction_icrs[-_FAINTEST:]
     else:
         centres = erfa.s2c(*np.radians(places).T)
         radius_rad += _MOUNT_RAD
     chord = 2.0 * math.sin(0.5 * radius_rad)
-    most = int(tree.query_ball_point(centres, chord, return_length=True).max())
+    most = int(catalog.tree.query_ball_point(centres, chord, return_length=True).max())
     return most if is_own else most * area_sr / (2.0 * math.pi * (1.0 - math.cos(radius_rad)))

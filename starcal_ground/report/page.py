@@ -297,7 +297,8 @@ def charts_of(
     if maps is not None:
         charts['cells'] = detector_figures.cell_counts(maps.stars, camera)
         charts['shape'] = detector_figures.line_of_sight_sigma(maps, camera, is_alone=True)
-        charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
+        if calibration.has_alignment:
+            charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
     if calibration.sigma_budget:
         parts = verdict.parts_that_matter(calibration.sigma_budget)
         charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)

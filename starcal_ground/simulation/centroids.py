@@ -206,31 +206,18 @@ def scenario_information(
     columns: Sequence[int],
     bounds: Sequence[tuple[Floats, Floats, Mask]] = (),
 ) -> Floats:
-    """Information (k, k) of all images on the camera parameters of some columns."""
+    """Information (k, k) of all images, their rotations free, on some camera parameters."""
     information = np.zeros((len(columns), len(columns)))
     for index, shown in enumerate(synthetic.scenes(scenario)):
         covariance, _, keep = bounds[index] if bounds else scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
-        information += camera_information(
-            scenario.truth.camera, in_camera, covariance[keep], columns
-        )
+        _, J_parameters, J_rotation = project_jacobians(scenario.truth.camera, in_camera)
+        J = np.concatenate([J_parameters[..., columns], J_rotation], axis=-1)
+        W = np.linalg.inv(covariance[keep])
+        N = np.einsum('nia,nij,njb->ab', J, W, J, optimize=True)
+        # The rotation of the image is eliminated.
+        information += N[:-3, :-3] - N[:-3, -3:] @ np.linalg.solve(N[-3:, -3:], N[-3:, :-3])
     return information
-
-
-def camera_information(
-    camera: CameraModel, in_camera: Floats, covariance_px2: Floats, columns: Sequence[int]
-) -> Floats:
-    """
-    Information (k, k) of an image on the camera parameters of some columns, its rotation free.
-
-    ``in_camera`` (n, 3) and ``covariance_px2`` (n, 2, 2) are those of its stars.
-    """
-    _, J_parameters, G = project_jacobians(camera, in_camera)
-    W, J = np.linalg.inv(covariance_px2), J_parameters[..., columns]
-    N_cc = np.einsum('nia,nij,njb->ab', J, W, J, optimize=True)
-    N_ca = np.einsum('nia,nij,njb->ab', J, W, G, optimize=True)
-    N_aa = np.einsum('nia,nij,njb->ab', G, W, G, optimize=True)
-    return np.asarray(N_cc - N_ca @ np.linalg.solve(N_aa, N_ca.T))
 
 
 def scaled_inverse(information: Floats) -> Floats:

@@ -93,13 +93,12 @@ def check_field_of_stars(
     """
     fx, _, fy = (float(value) for value in camera.intrinsics[:3])
     field_sr = min(camera.width * camera.height / (fx * fy), 4.0 * math.pi)
-    direction = catalog.direction_icrs
-    faintest = direction[-_FAINTEST:]
-    for part in (direction[::16], direction):  # a part of the catalog mostly has enough
-        inside = faintest @ part.T > 1.0 - field_sr / (2.0 * math.pi)
-        in_field = max(float(np.count_nonzero(inside)) / max(len(faintest), 1) - 1.0, 0.0)
-        if in_field >= _FEWEST_STARS:
-            return
+    faintest = catalog.direction_icrs[-_FAINTEST:]
+    chord = math.sqrt(field_sr / math.pi)  # of a cap of this area: its radius
+    inside = catalog.tree.query_ball_point(faintest, chord, return_length=True)
+    in_field = max(float(inside.sum()) / max(len(faintest), 1) - 1.0, 0.0)
+    if in_field >= _FEWEST_STARS:
+        return
     raise OptionError(
         f'magnitude_limit: {magnitude_limit:g} leaves {counted(len(catalog), "star")} in the'
         f' catalog, {in_field:.2g} in a mean field of the camera where it is deepest; raise it, or'
@@ -383,14 +382,14 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
     """
     Setup from a mapping of option names to values, all checked.
 
-    ``prior`` replaces the camera file and alignment of the options. Raises OptionError for an
-    unknown name or a bad value. Raises ProductError or CatalogError when the prior camera or the
-    catalog cannot be read.
+    ``prior`` replaces the camera file and alignment of the options; its camera is converted to the
+    stated lens model, as that of a file is. Raises OptionError for an unknown name or a bad value.
+    Raises ProductError or CatalogError when the prior camera or the catalog cannot be read.
     """
     groups = option_groups(values)
     frames: SetupOptions = groups['frames']
     is_aligned = prior is not None or any(frames.prior_alignment)
-    prior = prior or _prior(frames)
+    prior = _in_stated_model(frames, prior or _prior(frames))
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
@@ -482,14 +481,20 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: not set; give the camera YAML of the prior camera')
     camera = camera_yaml.read_camera_info(frames.camera_info_url)
+    check_prior_camera(camera, frames.camera_info_url)
+    if not any(frames.prior_alignment):
+        return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
+
+
+def _in_stated_model(frames: SetupOptions, prior: CameraGeometry) -> CameraGeometry:
+    """A prior whose camera has the stated lens model; raises OptionError where that is no lens."""
+    camera = prior.camera
     if frames.lens_model not in ('prior', 'auto', camera.model):
         camera, worst_px = convert(camera, frames.lens_model)
         if not math.isfinite(worst_px):
             raise OptionError(
                 f'lens_model: {frames.lens_model} does not cover the field of the prior camera,'
-                f' {frames.camera_info_url}'
+                f' {frames.camera_info_url or "found by the stars"}'
             )
-    check_prior_camera(camera, frames.camera_info_url)
-    if not any(frames.prior_alignment):
-        return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
+    return replace(prior, camera=camera)

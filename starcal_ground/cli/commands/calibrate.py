@@ -70,6 +70,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.cli import into_folder
     from starcal_ground.images.first_setup import assumed
+    from starcal_ground.products import has_stated_prior
 
     if args.output is None:
         raise OptionError(f'-o/--output DIR: not given: the {_DIR}, e.g. -o out')
@@ -89,7 +90,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         arguments.print_json(answer_of(made, source, stated, args.output))
     elif not args.quiet:
-        print_calibration(made.calibration, made.setup.prior)
+        is_stated = has_stated_prior(made.calibration)
+        print_calibration(made.calibration, made.setup.prior if is_stated else None)
         _print_assumed(assumed(source, stated, made.ensemble), made.calibration)
         print_text(f'\nproducts written to {args.output}' + (f'\n{report}' if report else ''))
         _print_verdict(made.calibration)
@@ -155,7 +157,7 @@ def answer_of(
     }
 
 
-def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
+def print_calibration(calibration: Calibration, prior: CameraGeometry | None) -> None:
     """Print parameters, statistics and causes of the sigma; changes are relative to the prior."""
     from starcal_ground.report import verdict
 

@@ -67,7 +67,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from starcal_ground.images.photographs import ImageOptions
+    from starcal_ground.images.image_series import ImageOptions
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ros.formats.products.camera_yaml import read_camera_info
 

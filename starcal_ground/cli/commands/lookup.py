@@ -3,8 +3,8 @@
 Write a table of lines of sight and their sigma by pixel.
 
 Writes u_px, v_px, the unit vector x, y, z in the camera frame, shape_sigma_arcsec (1-sigma of the
-direction, common rotation removed) and sigma_arcsec (in the star tracker frame). The lines of
-sight include the residual field if there is one.
+direction, common rotation removed) and, if there is an alignment, sigma_arcsec (in the star
+tracker frame). The lines of sight include the residual field if there is one.
 
   # 25 x 25 pixels over the detector
   starcal lookup out -o lines_of_sight.csv
@@ -48,15 +48,16 @@ def run(args: argparse.Namespace) -> int:
     camera = calibration.geometry.camera
     pixels = pixel_grid(camera, args.points, args.points)
     table = line_of_sight_table(camera, calibration.map_covariance, pixels)
-    write_lookup_table(table, args.output)
+    write_lookup_table(table, args.output, calibration.has_alignment)
     terminal.print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return arguments.EXIT_ACCEPTED
 
 
-def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
+def write_lookup_table(table: LineOfSightTable, path: Path, has_alignment: bool = True) -> None:
     """
     Write a table in the format of the file extension, .csv or .npz.
 
+    A camera without an alignment has no sigma in the star tracker frame.
     Raises ProductError for another extension, or a file that cannot be written.
     """
     import numpy as np
@@ -64,6 +65,8 @@ def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
     from starcal_ros.formats.products.product_files import write_atomically
 
     columns: dict[str, Any] = table.columns()  # the stub of savez_compressed wants no others
+    if not has_alignment:
+        del columns['sigma_arcsec']
     if path.suffix == '.csv':
         rows = (
             ','.join(repr(float(value)) for value in row)

@@ -18,7 +18,7 @@ import numpy as np
 
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.images import photographs
+from starcal_ground.images import image_series
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
@@ -65,10 +65,10 @@ class Recorded:
 
 def look_at_all(
     paths: Sequence[Path],
-    options: photographs.ImageOptions,
+    options: image_series.ImageOptions,
     guard: Guard,
     on_image: Callable[[], None] = lambda: None,
-) -> tuple[list[photographs.ImageFile], list[str]]:
+) -> tuple[list[image_series.ImageFile], list[str]]:
     """
     The image files in order of time, and one line for each file that cannot be taken.
 
@@ -77,16 +77,16 @@ def look_at_all(
     files, problems = [], []
     for path in paths:
         try:
-            files.append(guard.call(path, photographs.look, path, _options_of(path, options)))
+            files.append(guard.call(path, image_series.look, path, _options_of(path, options)))
         except IngestError as error:
             problems.append(str(error))
         on_image()
     if files:
-        photographs.check_alike(files)
+        image_series.check_alike(files)
     return sorted(files, key=lambda file: file.time_ns), problems
 
 
-def _options_of(path: Path, options: photographs.ImageOptions) -> photographs.ImageOptions:
+def _options_of(path: Path, options: image_series.ImageOptions) -> image_series.ImageOptions:
     """Options without the times of the other images, which are not sent with each."""
     if options.times is None:
         return options
@@ -119,8 +119,8 @@ def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
 
 def write_bag(
     bag: Path,
-    files: Sequence[photographs.ImageFile],
-    options: photographs.ImageOptions,
+    files: Sequence[image_series.ImageFile],
+    options: image_series.ImageOptions,
     guard: Guard,
     attitudes: Attitudes,
     velocities: Velocities | None = None,
@@ -139,7 +139,7 @@ def write_bag(
     covered = [_gap_s(attitudes, file.time_ns) for file in files]
     notes = [*attitudes.notes, *(velocities.notes if velocities else ())]
     notes += _coverage_notes(files, attitudes, covered)
-    scale = photographs.common_scale(files, options)
+    scale = image_series.common_scale(files, options)
     notes += _scale_notes(files, scale)
     pixels_of = list(dict.fromkeys(file.pixels_of for file in files if file.pixels_of))
     notes += [f'pixels of the images: {words}' for words in pixels_of]
@@ -167,7 +167,7 @@ def write_bag(
     return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 
-def _near(attitudes: Attitudes, files: Sequence[photographs.ImageFile]) -> Attitudes:
+def _near(attitudes: Attitudes, files: Sequence[image_series.ImageFile]) -> Attitudes:
     """Attitudes from a minute before the first image to a minute after the last."""
     stamps = attitudes.time_ns
     first_ns, last_ns = files[0].time_ns - _MARGIN_NS, files[-1].time_ns + _MARGIN_NS
@@ -191,7 +191,7 @@ def _span(first_ns: int, last_ns: int) -> str:
 
 
 def _coverage_notes(
-    files: Sequence[photographs.ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
+    files: Sequence[image_series.ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
 ) -> list[str]:
     longest_s = AttitudeOptions().max_attitude_gap_s
     outside = [file for file, gap_s in zip(files, gaps_s, strict=True) if math.isinf(gap_s)]
@@ -216,7 +216,7 @@ def _coverage_notes(
     return notes
 
 
-def _scale_notes(files: Sequence[photographs.ImageFile], scale: photographs.Scale) -> list[str]:
+def _scale_notes(files: Sequence[image_series.ImageFile], scale: image_series.Scale) -> list[str]:
     if scale.is_none:
         return []
     notes = [f'pixel values are {scale.offset:.9g} + {scale.step:.9g} DN']
@@ -231,9 +231,9 @@ def _scale_notes(files: Sequence[photographs.ImageFile], scale: photographs.Scal
 
 def _write_messages(
     writer: BagWriter,
-    files: Sequence[photographs.ImageFile],
-    options: photographs.ImageOptions,
-    scale: photographs.Scale,
+    files: Sequence[image_series.ImageFile],
+    options: image_series.ImageOptions,
+    scale: image_series.Scale,
     guard: Guard,
     trackers: Mapping[str, Attitudes],
     velocities: Velocities | None,
@@ -258,7 +258,7 @@ def _write_messages(
                     TEMPERATURE_TOPIC, time_ns, content.temperature_degc, 'camera'
                 )
             wanted = _options_of(content.path, options)
-            pixels = guard.call(content.path, photographs.pixels_of, content.path, wanted, scale)
+            pixels = guard.call(content.path, image_series.pixels_of, content.path, wanted, scale)
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
             on_image()
         else:
@@ -269,8 +269,8 @@ def _prior_files(
     prior: Prior,
     params: Path,
     copied: Path,
-    files: Sequence[photographs.ImageFile],
-    scale: photographs.Scale,
+    files: Sequence[image_series.ImageFile],
+    scale: image_series.Scale,
     others: Sequence[str],
 ) -> dict[Path, str]:
     """Texts of the parameter file and of the copy of the prior camera."""

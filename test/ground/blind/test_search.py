@@ -22,6 +22,7 @@ from starcal_ground.blind.pattern_index import (
     pattern_index,
     Patterns,
     patterns_of,
+    scales_for,
     sphere_points,
 )
 from starcal_ground.blind.search import (
@@ -218,6 +219,26 @@ def test_the_index_has_all_patterns_of_the_brightest_stars_of_each_disc(
         off = numbers(again) - numbers(patterns[part])
         same.append((again['order'] == np.arange(4)).all(axis=1) & (abs(off) < 1e-3).all(axis=1))
     assert np.concatenate(same).mean() > 0.9999  # two orders may be equal to rounding
+
+
+def test_a_deep_catalog_of_the_whole_sky_has_an_index_of_bounded_size() -> None:
+    """Of 400,000 stars: with seven in each disc there were 4.4 million patterns."""
+    count, rng = 400_000, np.random.default_rng(4)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    bundled = load_catalog().select(np.zeros(count, np.int64))
+    sky = dataclasses.replace(
+        bundled,
+        id=np.arange(count),
+        ra_rad=np.arctan2(directions[:, 1], directions[:, 0]) % (2 * math.pi),
+        dec_rad=np.arcsin(directions[:, 2]),
+        magnitude=np.linspace(3.0, 11.0, count).astype(np.float64),
+    )
+    frame = next(frames(sky, 1.5, 20, 10, 1.0, 1))
+    found = find_sky(frame.xy_px, frame.prior, sky)
+    assert isinstance(found, SkyMatch)
+    (scale, *_) = scales_for(SourceImage(frame.xy_px, frame.prior).half_diagonal_rad)
+    assert 1_000_000 < len(pattern_index(sky, scale).grid.patterns) <= 3_000_000
 
 
 def test_of_stars_at_one_place_the_brightest_matches() -> None:

@@ -22,16 +22,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.images.from_stars import FromStars, ideal_camera
+from starcal_ground.images.image_series import common_scale, ImageOptions, look, pixels_of
 from starcal_ground.images.night_sky import photographs_of
-from starcal_ground.images.photographs import (
-    common_scale,
-    ImageOptions,
-    look,
-    look_at,
-    Photograph,
-    pixels_of,
-    pixels_of_photograph,
-)
+from starcal_ground.images.photographs import look_at, Photograph, pixels_of_photograph
 from starcal_ground.images.stated import focal_lengths_of, half_turns, site_of, too_few_stars
 from starcal_ros.errors import IngestError
 from starcal_ros.sky.astrometry import air_above, SiteOptions

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.api import calibrate_images
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags.topics import Topics
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.search import SkyMatch
 from starcal_ground.cli.main import main
@@ -32,6 +33,7 @@ from starcal_ground.images.from_stars import (
     ideal_camera,
 )
 from starcal_ground.images.night_sky import (
+    _set_up,
     _through_air,
     _tone_curve,
     from_photographs,
@@ -40,7 +42,7 @@ from starcal_ground.images.night_sky import (
 from starcal_ground.simulation.rendering import images
 import starcal_ros
 from starcal_ros.arrays import Pixels
-from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.products.product_files import read_calibration
@@ -83,10 +85,22 @@ def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignme
     assert not calibration.has_alignment
     said = capsys.readouterr().out
     assert 'none: attitudes from the stars' in said
-    # No star tracker is a cause of its sigma, and no column is of an alignment.
-    assert 'star tracker' not in said and 'with alignment' not in said
+    # No star tracker is a cause of its sigma, no column is of an alignment or of a first solution.
+    assert 'star tracker' not in said and 'with alignment' not in said and 'prior' not in said
     page = (tmp_path / 'out' / 'report.html').read_text()
-    assert 'No alignment' in page and 'star tracker slow error' not in page
+    assert 'No alignment' in page and '<title>Star calibration of a camera from its stars' in page
+    for words in (
+        'star tracker slow',
+        'star tracker frame',
+        'star tracker reported',
+        'predicted by the star tracker',
+        'id="figure-change"',
+        'camera_optical_frame on',
+    ):
+        assert words not in page
+    table = tmp_path / 'table.csv'
+    assert main(['lookup', str(tmp_path / 'out'), '-o', str(table)]) == 0
+    assert table.read_text().splitlines()[0] == 'u_px,v_px,x,y,z,shape_sigma_arcsec'
 
 
 @pytest.mark.slow
@@ -451,6 +465,17 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
     assert left_out_px == pytest.approx(others_px)
 
 
+@pytest.mark.parametrize('model', ['equidistant', 'rational_polynomial', 'tilted', 'auto'])
+def test_a_stated_lens_model_is_that_of_the_camera_found(tmp_path: Path, model: str) -> None:
+    source = _set_up(found_stars(), [], {'lens_model': model}, tmp_path, False, Topics())
+    camera, found = source.setup.prior.camera, found_stars().camera
+    assert camera.model == ('plumb_bob' if model == 'auto' else model)
+    pixels = pixel_grid(found, 9, 9)
+    # The series of two models differ by 0.14 px in a corner.
+    again_px = project(camera, line_of_sight(found, pixels))
+    np.testing.assert_allclose(again_px, pixels, rtol=0, atol=0.2)
+
+
 @pytest.mark.slow
 def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_stated(
     tmp_path: Path,
@@ -472,6 +497,8 @@ def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_sta
         assert isinstance(air, functools.partial)
         is_located = air.args[-1]
         assert (site.observer, site.is_known, is_located) == ('ground', is_known, is_known)
+        is_named = 'the site is not used: the images have no date' in source.notes
+        assert is_named == (of_files == {'dated': False})
 
 
 def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
@@ -480,5 +507,8 @@ def test_images_identified_and_then_refused_are_counted_with_the_reason() -> Non
     detail = 'stars match in one part of the image only'
     images = [refused_image(time_ns, 640, 512, 'no_match', detail) for time_ns in (1, 2, 3)]
     _, note = _through_air(stars, SiteOptions(), True, images)
-    assert note == (f'2 of 3 images, identified by their stars, refused as no_match: {detail}')
+    assert note == (
+        '2 of 3 images, identified by their brightest stars, do not fit the camera common to all'
+        f' and are refused as no_match: {detail}'
+    )
     assert _through_air(stars, SiteOptions(), True, images[2:])[1] == ''

@@ -57,6 +57,12 @@ def test_focal_length_by_the_pixels_of_the_sensor_goes_before_it(tmp_path: Path)
     tags: dict[int, object] = {0x920A: 50.0, 0xA20E: 6451.6, 0xA210: 2, 0xA002: 6000, 0xA405: 80}
     one = look_at(jpeg(tmp_path / 'a.jpg', CANON, tags))
     assert one.focal_px == pytest.approx(50.0 / (25.4 / 6451.6 * 100), rel=1e-4)
+    for alone, words in (
+        ({'focal_length_mm': 20.0}, '--focal-length-mm needs --pixel-size-um: the file does not'),
+        ({'pixel_um': 4.0}, '--pixel-size-um needs --focal-length-mm: the file does not state it'),
+    ):
+        with pytest.raises(IngestError, match=words):
+            look_at(jpeg(tmp_path / 'none.jpg', CANON, {}), **alone)
     given = look_at(tmp_path / 'a.jpg', focal_length_mm=20.0, pixel_um=4.0)
     assert given.focal_px == pytest.approx(5000.0)
 

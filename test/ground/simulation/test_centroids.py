@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 import dataclasses
 import math
 
@@ -18,8 +19,10 @@ from starcal_ground.simulation.centroids import (
     true_observations,
 )
 from starcal_ground.simulation.rendering import expose, star_electrons
-from starcal_ground.simulation.scenario import camera_from_icrf, scenario
+from starcal_ground.simulation.scenario import camera_from_icrf, Scenario, scenario
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import project, project_jacobians
+from starcal_ros.records import StarObservations
 from starcal_ros.sky.catalog import load_catalog
 
 
@@ -103,21 +106,23 @@ def test_saturated_and_absent_stars_have_no_use() -> None:
     assert at_border > 1.5 * normal  # half of its light
 
 
+def whitened_rows(tiny: Scenario, images: Sequence[StarObservations]) -> Iterator[list[Floats]]:
+    """Whitening (n, 2, 2) of the stars of each of three images, and dense rows (2 n, 17) by it."""
+    for index, image in enumerate(images):
+        in_camera = image.direction_icrf @ camera_from_icrf(tiny, index).T
+        _, J_parameters, J_rotation = project_jacobians(tiny.truth.camera, in_camera)
+        J = np.zeros((len(image), 2, 17))
+        J[..., :8] = J_parameters[..., [0, 1, 2, 5, 6, 7, 8, 9]]
+        J[..., 8 + 3 * index : 11 + 3 * index] = J_rotation
+        covariance = image.covariance_px2[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        yield [root, (root @ J).reshape(-1, 17)]
+
+
 def test_parameter_bound_is_the_inverse_of_the_dense_information_matrix() -> None:
     tiny = dataclasses.replace(scenario('tiny'), image_count=3)
-    N = np.zeros((8 + 9, 8 + 9))
-    columns = [0, 1, 2, 5, 6, 7, 8, 9]
-    for index, image in enumerate(true_observations(tiny).images):
-        R = camera_from_icrf(tiny, index)
-        _, J_parameters, J_rotation = project_jacobians(
-            tiny.truth.camera, image.direction_icrf @ R.T
-        )
-        J = np.zeros((len(image), 2, 17))
-        J[..., :8] = J_parameters[..., columns]
-        J[..., 8 + 3 * index : 11 + 3 * index] = J_rotation
-        uu, uv, vv = image.covariance_px2.T
-        W = np.linalg.inv(np.stack([uu, uv, uv, vv], axis=-1).reshape(-1, 2, 2))
-        N += np.einsum('nia,nij,njb->ab', J, W, J)
+    A = np.concatenate([rows for _, rows in whitened_rows(tiny, true_observations(tiny).images)])
+    N = A.T @ A
     scale = 1 / np.sqrt(np.diag(N))
     dense = np.linalg.inv(N * np.outer(scale, scale)) * np.outer(scale, scale)
     bound = cramer_rao_covariance(tiny)
@@ -130,19 +135,7 @@ def test_parameter_bound_is_the_scatter_of_least_squares() -> None:
     """Monte Carlo of least squares with a camera and a free attitude for each image."""
     tiny = dataclasses.replace(scenario('tiny'), image_count=3)
     exact = true_observations(tiny, centroid_noise=False)
-    columns = [0, 1, 2, 5, 6, 7, 8, 9]
-    rows, roots = [], []
-    for index, image in enumerate(exact.images):
-        in_camera = image.direction_icrf @ camera_from_icrf(tiny, index).T
-        _, J_parameters, J_rotation = project_jacobians(tiny.truth.camera, in_camera)
-        J = np.zeros((len(image), 2, 17))
-        J[..., :8] = J_parameters[..., columns]
-        J[..., 8 + 3 * index : 11 + 3 * index] = J_rotation
-        uu, uv, vv = image.covariance_px2.T
-        covariance = np.stack([uu, uv, uv, vv], axis=-1).reshape(-1, 2, 2)
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
-        roots.append(root)
-        rows.append((root @ J).reshape(-1, 17))
+    roots, rows = zip(*whitened_rows(tiny, exact.images), strict=True)
     A = np.concatenate(rows)
     scale = np.linalg.norm(A, axis=0)
     estimator = np.linalg.pinv(A / scale) / scale[:, None]

@@ -12,7 +12,7 @@ from astropy.io import fits
 import numpy as np
 import pytest
 
-from starcal_ground.images.photographs import ImageOptions, look
+from starcal_ground.images.image_series import ImageOptions, look
 from starcal_ground.mission.ingest import sources
 from starcal_ground.mission.ingest.mission_records import Guard
 from starcal_ros.errors import IngestError

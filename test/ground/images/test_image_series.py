@@ -14,7 +14,7 @@ from mission_files import date, images, write_fits  # type: ignore[import-not-fo
 import numpy as np
 import pytest
 
-from starcal_ground.images.photographs import (
+from starcal_ground.images.image_series import (
     check_alike,
     common_scale,
     ImageOptions,
