@@ -24,6 +24,7 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import SetupDiagnosis
 from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ground.child_process import ChildProcess
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
 from starcal_ground.diagnosis.diagnose import (
     diagnose,
@@ -33,7 +34,6 @@ from starcal_ground.diagnosis.diagnose import (
 )
 from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.pipeline import setup
-from starcal_ros.processes import ChildProcess
 from starcal_ros.records import Image
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
