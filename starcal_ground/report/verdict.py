@@ -199,7 +199,7 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
             '',
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
-        *_held(checks.held),
+        *_held(checks),
         ModelRow(
             'The detector has no step',
             f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
@@ -216,12 +216,12 @@ def model_rows(calibration: records.Calibration) -> list[ModelRow]:
     ]
 
 
-def _held(held: Sequence[records.HeldTerm]) -> Iterator[ModelRow]:
+def _held(checks: records.ModelChecks) -> Iterator[ModelRow]:
     """One row for each value that the stars contradict, and one for all others together."""
-    agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
-    for term in held:
+    agreeing = [term for term in checks.held if term.significance < INFORMATIVE_SIGMAS]
+    for term in checks.held:
         if term.significance >= INFORMATIVE_SIGMAS:
-            note, remedy = of_held(term)
+            note, remedy = of_held(term, checks)
             yield ModelRow(
                 f'{term.name} is as assumed',
                 f'{note}: {term.significance:.1f} sigma of the difference',

@@ -341,7 +341,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     for one in found.statements:
         name = f'{one.name} as stated'
         yield GateCheck(name, '', math.nan, math.nan, '', one.passed, one.note)
-    held = [_held_check(term, options) for term in found.held]
+    held = [_held_check(term, found, options) for term in found.held]
     wrong = [one.name for one in found.statements if one.passed is False]
     # A distance that the evidence does not decide on may be the cause all the same.
     wrong += [t.name for t in found.held if t.distance > options.max_held_term_sigma]
@@ -368,7 +368,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     yield from held
 
 
-def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
+def _held_check(term: HeldTerm, found: ModelChecks, options: GateOptions) -> GateCheck:
     """The distance of an assumed value from that by the stars, if they determine it."""
     check = limit_check(
         options,
@@ -379,15 +379,17 @@ def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
     )
     if math.isnan(term.significance):
         return dataclasses.replace(check, passed=None, note=_NOT_BY_STARS)
-    note, remedy = of_held(term)
+    note, remedy = of_held(term, found)
     return dataclasses.replace(check, note=note if check.passed else f'{note}; {remedy}')
 
 
-def of_held(term: HeldTerm) -> tuple[str, str]:
+def of_held(term: HeldTerm, found: ModelChecks) -> tuple[str, str]:
     """Sentences on an assumed value: by the stars, and the remedy if they contradict it."""
     test = prior_test_of(term.name)
     estimated, assumed = significant(term.estimated, 6), significant(term.assumed, 6)
     note = f'{estimated} by the stars, {assumed} assumed'
+    if test.unstated and not any(one.name in test.starts for one in found.statements):
+        return test.unstated
     return f'the stars add {estimated} to it' if test.is_added else note, test.remedy
 
 

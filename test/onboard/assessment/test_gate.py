@@ -198,6 +198,17 @@ def test_a_good_calibration_passes() -> None:
             ),
         ),
         (
+            with_model(held=(HeldTerm('velocity_x_m_s', 0.0, -6e4, 8000.0),), statements=()),
+            'max_held_term_sigma',
+            7.5,
+            7.4,
+            (
+                'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
+                'of 7.4 sigma (max_held_term_sigma); none was received, that of the Earth was '
+                'assumed; publish it, or check the date'
+            ),
+        ),
+        (
             with_model(held=(HeldTerm('clock_offset_min', 0.0, -42.5, 5.0),)),
             'max_held_term_sigma',
             8.5,
