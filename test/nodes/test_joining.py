@@ -263,7 +263,7 @@ def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators: Calibrato
     state = calibrators.run('open A; images 0 1; activate a')
     of_frame(calibrators, 'navcam_2')
     calibrators.open('P1', 'B')
-    assert state.moved.endswith(f'they stay in {calibrators.disk / "A"}')
+    assert str(state).endswith(f'they stay in {calibrators.disk / "A"}')
     assert kept(state) == ('', '')
     calibrators.run('images 2; close')
     calibrators.setup = first

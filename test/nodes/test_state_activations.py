@@ -94,7 +94,8 @@ ACTIVATIONS = {
         'not activated, nobody could read it',
         'b',
     ),
-    '1970': ('activate a; clock 0; solve b', 'activated: ', 'b'),
+    'no /clock yet': ('activate a; clock 0; solve b', 'not activated: the ROS clock is 0', 'a'),
+    '1970': ('activate a; clock 1; solve b', 'activated: ', 'b'),
     '2038': (f'activate a; clock {MAX_STAMP_NS}; solve b', 'activated: ', 'b'),
 }
 
