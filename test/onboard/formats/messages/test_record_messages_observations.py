@@ -31,7 +31,7 @@ def test_observations_round_trip(make: Any) -> None:
         assert_same(record, observations_from_message(message))
 
 
-def first(column: str, value: float) -> np.ndarray:
+def first(column: str, value: float) -> Any:
     """A column of the observations with another first number."""
     changed = getattr(observations_to_message(observations(), 'cam', plain), column).copy()
     changed[0] = value
