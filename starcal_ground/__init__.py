@@ -26,8 +26,10 @@ if TYPE_CHECKING:
         write_calibration,
     )
     from starcal_ground.comparison import compare
+    from starcal_ground.mission.export.wcs import directions_icrf
     from starcal_ground.products import read_residuals
     from starcal_ground.report.page import plot
+    from starcal_ground.undistortion import undistort_maps
     from starcal_ros import (
         Calibration,
         CameraGeometry,
@@ -59,6 +61,7 @@ __all__ = [
     'calibrate_images',
     'calibrate_with_residuals',
     'compare',
+    'directions_icrf',
     'line_of_sight_covariance',
     'line_of_sight_sigma_arcsec',
     'lines_of_sight',
@@ -67,6 +70,7 @@ __all__ = [
     'project',
     'read_calibration',
     'read_residuals',
+    'undistort_maps',
     'write_calibration',
 ]
 
@@ -77,9 +81,11 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
         'calibrate_images': 'api',
         'calibrate_with_residuals': 'api',
         'compare': 'comparison',
+        'directions_icrf': 'mission.export.wcs',
         'observations_of': 'api',
         'plot': 'report.page',
         'read_residuals': 'products',
+        'undistort_maps': 'undistortion',
         'write_calibration': 'api',
     }
 

@@ -25,7 +25,7 @@ from starcal_ground.cli import arguments, terminal
 from starcal_ros.errors import missing_package, StarcalError
 
 COMMANDS = (
-    *('demo', 'calibrate', 'diagnose', 'compare', 'plan', 'report', 'lookup'),
+    *('demo', 'calibrate', 'diagnose', 'compare', 'plan', 'report', 'lookup', 'undistort'),
     *('play', 'monitor', 'simulate', 'export', 'import', 'catalog', 'trend'),
 )
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'

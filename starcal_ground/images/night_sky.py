@@ -28,6 +28,7 @@ from starcal_ground.images import from_stars as by_stars
 from starcal_ground.images import photographs as image_files
 from starcal_ground.images import stated as stated_facts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
+from starcal_ground.undistortion import BY_COLUMNS, BY_ROWS
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars
@@ -164,9 +165,9 @@ def from_photographs(
     if is_located and not all(one.dated for one in photographs):
         stated = {'velocity_sigma_m_s': EARTH_M_S, **stated, **_NOWHERE}
     mirrored = (
-        'mirrored top to bottom: the stars show that the rows of the files are last to first'
+        f'{BY_ROWS}: the stars show that the rows of the files are last to first'
         if by_rows
-        else 'mirrored left to right: the stars show a mirror image'
+        else f'{BY_COLUMNS}: the stars show a mirror image'
     )
     pixels_of = [*dict.fromkeys(one.pixels_of for one in photographs), mirrored * stars.mirrored]
     notes = [

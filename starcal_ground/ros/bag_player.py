@@ -154,10 +154,14 @@ class BagPlayer(printable_log.PrintableLog):
         others = [] if attitudes else self._of(*message_codec.ATTITUDE_TYPES)
         needed = [*self._images, *attitudes] or list(self._players)
         other = self.own.wait_for_topic
+        awaits_answers = bool(other) and self._is_observations(other)
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
 
         def is_read(name: str) -> bool:
-            return bool(self._players[name].get_subscription_count())
+            if not self._players[name].get_subscription_count():
+                return False
+            # Other nodes read images too, and may start before the one that observes the stars.
+            return not awaits_answers or bool(self._readers(name) & self._answering())
 
         matches: list[int] = []
         since_s = time.monotonic()
@@ -184,10 +188,23 @@ class BagPlayer(printable_log.PrintableLog):
         """Topics of the bag of some types."""
         return [topic.name for topic in self._topics if topic.type_name in kinds]
 
+    def _is_observations(self, topic: str) -> bool:
+        return self._paced and self.resolve_topic_name(topic) == self._observations.topic_name
+
     def _other_subscribers(self, topic: str) -> int:
-        name = self.resolve_topic_name(topic)
-        is_own = self._paced and name == self._observations.topic_name
-        return int(self.count_subscribers(name)) - is_own
+        count = int(self.count_subscribers(self.resolve_topic_name(topic)))
+        return count - self._is_observations(topic)
+
+    def _readers(self, topic: str) -> set[tuple[str, str]]:
+        """Nodes that subscribe to a topic of the bag, each by namespace and name."""
+        name = self._players[topic].topic_name
+        ends = self.get_subscriptions_info_by_topic(name)
+        return {(end.node_namespace, end.node_name) for end in ends}
+
+    def _answering(self) -> set[tuple[str, str]]:
+        """Nodes that publish observations, each by namespace and name."""
+        ends = self.get_publishers_info_by_topic(self._observations.topic_name)
+        return {(end.node_namespace, end.node_name) for end in ends}
 
     def _wait_for_observations(self, sent: int) -> None:
         """Wait while a star observer has too many images in its queue."""

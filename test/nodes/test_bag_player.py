@@ -7,6 +7,7 @@ from dataclasses import replace
 import itertools
 from pathlib import Path
 import threading
+import time
 from typing import Any, TYPE_CHECKING
 
 import cv2
@@ -18,11 +19,13 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
+from geometry_msgs.msg import PoseStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
 from node_inputs import parameters  # type: ignore[import-not-found]
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from sample_records import assert_same, observations  # type: ignore[import-not-found]
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
 from starcal.msg import StarObservations
@@ -88,6 +91,24 @@ def test_compressed_images_are_paced(
     client.until(lambda: len(found) == IMAGES)
     assert [one.refusal for one in found] == [''] * len(found)
     assert 'playing anyway' not in player.said()
+
+
+def test_the_node_that_observes_is_waited_for(
+    client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
+) -> None:
+    """Other subscribers of images and attitudes may start first; the first images were lost."""
+    found: list[Any] = client.collect(StarObservations, 'observations')
+    client.collect(CompressedImage, '/image/compressed')
+    client.collect(PoseStamped, '/attitude')
+    play = ('-p', f'bag:={bag}', '-p', 'rate:=0.0', '-p', 'wait_for_subscribers_s:=100.0')
+    player = start_node('bag_player', ros=(*play, '-p', 'wait_for_topic:=observations'))
+    client.until(lambda: bool(client.node.count_publishers('/attitude')))
+    time.sleep(1.5)  # three times as long as the player waits for further subscribers
+    given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
+    start_node('star_observer', ros=(*given, '-r', 'image:=image/compressed'))
+    assert player.wait() == 0, player.said()
+    client.until(lambda: len(found) == IMAGES)
+    assert [one.refusal for one in found] == [''] * IMAGES
 
 
 def test_what_was_latched_is_latched(

@@ -2,8 +2,9 @@
 """
 Write a calibration in the format of another tool.
 
-Writes SPICE kernels (FK and IK, or CK with the attitude of each image), an ALE fragment and ISIS
-keywords, YAML of OpenCV or ROS, arguments of GIANT, a model of mrcal, or C99 source; prints the
+Writes SPICE kernels (FK and IK, or CK with the attitude of each image), FITS headers with the
+world coordinates of each image, an ALE fragment and ISIS keywords, YAML of OpenCV or ROS,
+arguments of GIANT, a model of mrcal, or C99 source; prints the
 parts that the format cannot represent and the error in pixels that this causes. SPICE kernels and
 C represent the whole camera, as do the tables of starcal lookup.
 
@@ -13,6 +14,8 @@ C represent the whole camera, as do the tables of starcal lookup.
   starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-frame MSN_ST1
   # attitude of the camera at each image, by its stars
   starcal export out --to ck -o kernels --spacecraft-id -999 --kernels naif.tls clock.tsc
+  # FITS headers of the images, for Astropy and DS9
+  starcal export out --to wcs -o headers
   # for cv2.projectPoints
   starcal export out --to opencv -o opencv
   # C99 for flight software, and a later calibration as a table for it
@@ -61,6 +64,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
     what = 'LSK and SCLK of the spacecraft, for ck'
     spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
+    what = 'star catalog of the images, for wcs (default: the one of the calibration)'
+    add('--catalog', type=arguments.path, metavar='FILE', help=what)
     what = 'only the binary table, for compiled C code'
     add('--table', action='store_true', help=what)
 
@@ -83,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
         if not recorded.exists():
             raise OptionError(f'--to {args.to}: needs {recorded} with the stars of the images')
         observations = tuple(read_observations([recorded], products.OBSERVATIONS_TOPIC))
-    asked = Request(names, args.table, observations, args.kernels)
+    asked = Request(names, args.table, observations, args.kernels, args.catalog)
     done = export(calibration, args.to, args.output, asked)
     written = ', '.join(str(args.output / name) for name in done.files)
     terminal.print_text(f'written: {written}')

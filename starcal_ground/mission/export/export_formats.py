@@ -28,13 +28,15 @@ class Request:
 
     ``names`` are None where the NAIF ID of the spacecraft is not given; ``table``: only the
     numbers of the calibration, for code that was compiled before; ``observations`` and ``kernels``
-    (LSK and SCLK of the spacecraft) are those of the images.
+    (LSK and SCLK of the spacecraft) are those of the images; ``catalog`` is the file that
+    identified their stars, None for that of the calibration.
     """
 
     names: SpiceNames | None = None
     table: bool = False
     observations: Sequence[StarObservations] = ()
     kernels: Sequence[Path] = ()
+    catalog: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,12 @@ def _c(made: Calibration, asked: Request) -> Content:
     return c_camera.c_content(made, asked.table)
 
 
+def _wcs(made: Calibration, asked: Request) -> Content:
+    from starcal_ground.mission.export import wcs
+
+    return wcs.wcs_of_images(made, asked.observations, asked.catalog)
+
+
 FORMATS = (
     Format(
         'spice',
@@ -124,6 +132,15 @@ FORMATS = (
         'sigma and attitudes between images',
         _ck,
         needs_alignment=True,
+        needs_observations=True,
+    ),
+    Format(
+        'wcs',
+        'FITS header with TAN-SIP for each image',
+        '`image0001.wcs` and so on, in the order of `observations.mcap`: places of the catalog at'
+        ' the date of the image, by its stars; `SIPERR` and `STARRMS` are the errors, px (below)',
+        'sigma; fields beyond 170 degrees',
+        _wcs,
         needs_observations=True,
     ),
     Format(

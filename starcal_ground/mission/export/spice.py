@@ -331,7 +331,7 @@ def _wrapped(text: str) -> list[str]:
 
 CK_FILE = 'camera.bc'
 _LEAST_STARS = 3
-_OUTLIER = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
+OUTLIER_SIGMA = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
 _INTERNAL_NAME = 'starcal: attitude of the calibrated camera'
 
 
@@ -358,7 +358,7 @@ def attitude_by_stars(
         )
         off = np.linalg.norm(rotation.apply(measured) - image.direction_icrf, axis=1)
         off = off * np.sqrt(information)
-        used = used & (off <= _OUTLIER * RAYLEIGH_TO_SIGMA * np.median(off[used]))
+        used = used & (off <= OUTLIER_SIGMA * RAYLEIGH_TO_SIGMA * np.median(off[used]))
     return rotation, float(1.0 / np.sqrt(information[used].sum()))
 
 

@@ -166,6 +166,7 @@ WRITING: dict[str, str] = {
     ): 'o_0.mcap metadata.yaml import.json params.yaml camera.yaml',
     'catalog HERE/gaia.csv -o HERE/o/deep.npz': 'deep.npz',
     'trend HERE/out -o HERE/o': 'trend.html',
+    'undistort HERE/out HERE/frames/0.png -o HERE/o': '0.png camera_info.yaml',
     'export HERE/out --to c -o HERE/o': 'starcal_camera.c starcal_camera.h',
     'export HERE/out --to c --table -o HERE/o': 'starcal_camera.bin',
     'export HERE/out --to giant -o HERE/o': 'giant_camera.json',
@@ -174,6 +175,7 @@ WRITING: dict[str, str] = {
     'export HERE/out --to opencv -o HERE/o': 'opencv.yaml',
     'export HERE/out --to ros -o HERE/o': 'camera_info.yaml alignment.yaml',
     'export HERE/out --to spice --spacecraft-id -9 -o HERE/o': 'camera.tf camera.ti',
+    'export HERE/out --to wcs -o HERE/o': 'image0001.wcs image0010.wcs',
     f'export HERE/out --to ck --spacecraft-id -999 -o HERE/o {_CK}': 'camera.bc',
 }
 """Commands that write, and the files that they write in ``o/``."""

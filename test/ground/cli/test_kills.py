@@ -67,6 +67,7 @@ COMMANDS = (
     Command('calibrate', ('in/bag', '--params', 'in/bag/params.yaml', '-o', 'out')),
     Command('report', ('out',)),
     Command('lookup', ('in/a', '-o', 'out/table.csv', '--points', '100')),
+    Command('undistort', ('in/a', 'in/frames/*.png', '-o', 'out/straight')),
     Command('simulate', ('--scenario', 'tiny', '--seed=3', '--images=3', '-o', 'out/sim')),
     Command('export', ('in/a', '--to', 'spice', '--spacecraft-id=-999', '-o', 'out')),
     Command(

@@ -1,0 +1,101 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Astropy's reading of the headers against catalog places that Astropy moves to the date."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.time import Time
+from astropy.wcs import WCS
+import numpy as np
+import pytest
+
+from starcal_ground import directions_icrf
+from starcal_ground.bags.reader import read_observations
+from starcal_ground.mission.export.export_formats import export, Request
+from starcal_ground.products import OBSERVATIONS_FILE, OBSERVATIONS_TOPIC
+from starcal_ground.simulation.scenario import scenario, scene
+from starcal_ros.camera import line_of_sight, pixel_grid
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.products.product_files import read_calibration
+from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.sky.catalog import load_catalog
+
+
+@pytest.fixture(scope='module')
+def made(tiny_products: Path) -> Calibration:
+    return read_calibration(tiny_products / 'calibration.json')
+
+
+@pytest.fixture(scope='module')
+def images(tiny_products: Path) -> tuple[StarObservations, ...]:
+    return tuple(read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC))
+
+
+@pytest.mark.filterwarnings('ignore::astropy.wcs.FITSFixedWarning')
+def test_astropy_reprojects_the_stars_within_the_stated_residual(
+    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    done = export(made, 'wcs', tmp_path, Request(observations=images))
+    assert done.worst_px < 5e-3
+    catalog = load_catalog()
+    for image, name in zip(images, done.files, strict=True):
+        header = fits.getheader(tmp_path / name)
+        system = WCS(header)
+        stars = catalog.select(catalog.rows_of(image.catalog_id)[0])
+        at_epoch = SkyCoord(
+            ra=stars.ra_rad * units.rad,
+            dec=stars.dec_rad * units.rad,
+            pm_ra_cosdec=stars.pm_ra_cosdec_rad_per_year * units.rad / units.yr,
+            pm_dec=stars.pm_dec_rad_per_year * units.rad / units.yr,
+            distance=10.0 * units.pc,  # only for its proper motion
+            obstime=Time(stars.epoch_jyear, format='jyear'),
+        )
+        places = at_epoch.apply_space_motion(Time(image.time_ns / 1e9, format='unix'))
+        pixels = np.stack(system.world_to_pixel(places), axis=-1)
+        off = pixels - image.measured_px
+        distance = np.linalg.norm(off, axis=1)
+        # Outliers of the fit are no part of its residual: one star in thirty at most.
+        inner = off[distance <= np.quantile(distance, 0.97)]
+        assert np.sqrt(np.mean(inner**2)) <= header['STARRMS'] < 0.25
+        # Both ways, over the whole detector.
+        grid = pixel_grid(made.geometry.camera, 9, 9).reshape(-1, 2)
+        there = system.pixel_to_world(*grid.T)
+        assert np.abs(np.stack(system.world_to_pixel(there), axis=-1) - grid).max() < 1e-3
+        # The inverse polynomials, which Astropy itself does not need.
+        assert np.abs(system.sip_foc2pix(system.sip_pix2foc(grid, 0), 0) - grid).max() < 5e-3
+        # Angles are those of the camera: aberration and catalog change them by 1e-4.
+        u = there.cartesian.xyz.value.T
+        of_camera = line_of_sight(made.geometry.camera, grid)
+        assert u @ u[0] == pytest.approx(of_camera @ of_camera[0], abs=2e-4)
+
+
+def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
+    made: Calibration, images: tuple[StarObservations, ...]
+) -> None:
+    errors = []
+    for index, image in enumerate(images):
+        truth = scene(scenario('tiny'), index)
+        pixels = pixel_grid(made.geometry.camera, 5, 5).reshape(-1, 2)
+        towards, sigma_arcsec = directions_icrf(made, image, pixels)
+        true = line_of_sight(scenario('tiny').truth.camera, pixels) @ truth.camera_from_icrf
+        errors.append(np.linalg.norm(towards - true, axis=1) / (sigma_arcsec * ARCSECOND_RAD))
+    # Ten attitudes and one camera: the mean square has some 15 degrees of freedom.
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
+    with pytest.raises(ValueError, match='fewer than three stars'):
+        directions_icrf(made, images[0].select(np.arange(len(images[0])) < 2), [[0.0, 0.0]])
+
+
+def test_stars_of_another_catalog_are_named(
+    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    strange = dataclasses.replace(images[0], catalog_id=-images[0].catalog_id - 10**7)
+    with pytest.raises(ProductError, match=r'lacks \d+ of \d+ stars .* --catalog'):
+        export(made, 'wcs', tmp_path, Request(observations=[strange]))
+    with pytest.raises(ProductError, match='no image with stars'):
+        export(made, 'wcs', tmp_path, Request())
