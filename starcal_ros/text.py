@@ -32,6 +32,20 @@ def counted(count: int, noun: str) -> str:
     return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
 
 
+def shortened(text: str, most: int) -> str:
+    """
+    The first clauses of a text, which end with semicolons, of at most so many characters.
+
+    >>> shortened('no stars; the lens cap is on; see the report', 40)
+    'no stars; the lens cap is on; ...'
+    """
+    if len(text) <= most:
+        return text
+    kept = text[: most - len(_LEFT_OUT)]
+    return (kept.rpartition('; ')[0] or kept) + _LEFT_OUT
+
+
+_LEFT_OUT = '; ...'
 _SMALLEST, _LARGEST = 1e-9, 1e15
 """Beyond these, zeros are harder to count than an exponent is to read."""
 

@@ -9,8 +9,9 @@ import os
 import threading
 from typing import TypeVar
 
+from starcal_ground.child_process import ChildProcess, ProcessEnded
 from starcal_ros.errors import StarcalError
-from starcal_ros.processes import ChildProcess, one_blas_thread, ProcessEnded
+from starcal_ros.processes import one_blas_thread
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')

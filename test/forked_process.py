@@ -14,7 +14,7 @@ import subprocess
 import sys
 from typing import Any
 
-from starcal_ros import processes
+from starcal_ground import child_process
 
 FORKSERVER = multiprocessing.get_context('forkserver')
 FORKSERVER.set_forkserver_preload(
@@ -73,7 +73,7 @@ class ForkedNode(ForkedProcess):
         super().__init__(_run, name, arguments, str(log), dict(os.environ))
 
 
-class ForkedChild(processes.ChildProcess):
+class ForkedChild(child_process.ChildProcess):
     """A child process that answers calls."""
 
     def __init__(self) -> None:
@@ -90,13 +90,13 @@ class ForkedChild(processes.ChildProcess):
 
 
 def _answer(folder: str, requests: Connection, answers: Connection) -> None:
-    """In the new process: what `processes` does as a module."""
+    """In the new process: what `child_process` does as a module."""
     os.chdir(folder)
     for number, connection in enumerate((requests, answers)):
         os.dup2(connection.fileno(), number)
         connection.close()
     sys.stdin = os.fdopen(0, closefd=False)
-    processes.main()
+    child_process.main()
 
 
 def _run(name: str, arguments: list[str], log: str, environment: Mapping[str, str]) -> None:

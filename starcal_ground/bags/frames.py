@@ -189,7 +189,7 @@ def read_frames(
     for raw in read_ahead(reader.read_raw(paths, topics.read, on_damage)):
         in_order = True
         if raw.type_name in message_codec.IMAGE_TYPES:
-            stamp_ns = sensor_messages.image_stamp_ns(raw)
+            stamp_ns = reader.image_stamp_ns(raw)
             goes_back = stamp_ns < newest_ns and raw.place is not None
             if goes_back:
                 break

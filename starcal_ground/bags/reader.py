@@ -36,12 +36,14 @@ import struct
 from typing import Any, IO
 import zlib
 
+import numpy as np
+
 from starcal_ground.bags import rosbag2
-from starcal_ros.errors import BagError, errors_as, NotABag
+from starcal_ros.errors import BagError, errors_as, ImageRefused, NotABag
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
-from starcal_ros.formats.messages.sensor_messages import image_of, image_stamp_ns
+from starcal_ros.formats.messages.sensor_messages import image_of, view_image
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import (
@@ -61,9 +63,11 @@ if not rosbag2.READS_BAGS:
     from mcap.records import Message as McapMessage
     from mcap.stream_reader import get_chunk_data_stream, StreamReader
     from mcap.summary import Summary
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys.store import Typestore
     import zstandard
 
-    from starcal_ros.formats.bag.typestore import of_this_version, typestore_of
+    from starcal_ros.formats.bag.typestore import store_with, typestore_of
 
     # Damaged bytes are parsed as an arbitrary record: the exceptions have no common base class.
     _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
@@ -576,6 +580,14 @@ def by_stamp(
         yield RawMessage(*kind, log_time_ns, memoryview(_message(record.data)), place)
 
 
+def image_stamp_ns(raw: RawMessage) -> int:
+    """Stamp of a serialised image; the time of its recording if it cannot be decoded."""
+    try:
+        return codec.stamp_ns(view_image(raw).header.stamp)
+    except ImageRefused:
+        return codec.nearest_stamp_ns(raw.log_time_ns)
+
+
 def _records_at(file: Path, offset: int) -> list[McapRecord]:
     """Records of the chunk at an offset, or the record there; raises BagError after a change."""
     try:
@@ -630,13 +642,41 @@ def decode(raw: RawMessage) -> Message:
 
 
 def cdr_of_this_version(raw: RawMessage) -> bytes:
-    """Bytes of a message for ROS, whose definition is that of this version; raises BagError."""
+    """
+    Bytes of a message for ROS, whose definition is that of this version; raises BagError.
+
+    The fields that a message of another version lacks are zeros, as of a sender that does not
+    have them.
+    """
     if rosbag2.READS_BAGS:
         return raw.data
     try:
-        return bytes(of_this_version(raw.type_name, raw.definition, raw.view))
+        store, own = typestore_of(raw.type_name, raw.definition), store_with(raw.type_name)
+        if store is own:
+            return raw.data
+        message = store.deserialize_cdr(raw.view, raw.type_name)
+        whole = _filled(own, (Nodetype.NAME, raw.type_name), message)
+        return bytes(own.serialize_cdr(whole, raw.type_name))
     except Exception as error:
         raise _undecodable(raw, error) from error
+
+
+def _filled(store: Typestore, kind: Any, value: Any = None) -> Any:
+    """Return a value as one of a field of a store; what it lacks, or all for None, is zero."""
+    node, content = kind
+    if node == Nodetype.NAME:
+        fields = store.fielddefs[content][1]
+        return store.types[content](
+            *(_filled(store, of_field, getattr(value, name, None)) for name, of_field in fields)
+        )
+    if node == Nodetype.BASE:
+        return ('' if content[0] == 'string' else 0) if value is None else value
+    item, size = content
+    is_number = item[0] == Nodetype.BASE and item[1][0] != 'string'
+    if value is None:
+        length = size if node == Nodetype.ARRAY else 0
+        value = np.zeros(length, item[1][0]) if is_number else [None] * length
+    return value if is_number else [_filled(store, item, one) for one in value]
 
 
 def _undecodable(raw: RawMessage, error: Exception) -> BagError:

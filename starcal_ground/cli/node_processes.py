@@ -16,9 +16,9 @@ import tempfile
 import time
 from typing import NoReturn, TYPE_CHECKING
 
+from starcal_ground.child_process import module_command
 from starcal_ros.errors import StarcalError
 from starcal_ros.files import mark
-from starcal_ros.processes import module_command
 
 if TYPE_CHECKING:
     from starcal_ros.records import Calibration

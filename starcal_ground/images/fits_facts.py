@@ -13,16 +13,9 @@ import erfa
 import numpy as np
 
 from starcal_ground.images.time_systems import from_mjd, from_text, system_of, SYSTEMS
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.fits_keywords import (
-    Card,
-    FACTS,
-    number_of,
-    stated,
-    text_of,
-    value_of,
-    values_of,
-)
+from starcal_ros.formats.fits_keywords import Card, FACTS, stated, text_of, value_of
 
 # Keywords with the time of day of a date alone: a custom older than the standard.
 _CLOCKS = {
@@ -30,6 +23,23 @@ _CLOCKS = {
     'DATE-BEG': ('TIME-BEG',),
     'DATE-END': ('TIME-END', 'UTC-END', 'UT-END', 'UTEND', 'UTSTOP'),
 }
+# A unit in brackets at the start of a comment (section 4.3.2), over that of the table.
+_UNITS: Mapping[str, Mapping[str, float]] = {
+    's': {
+        's': 1.0, 'sec': 1.0, 'second': 1.0, 'ms': 1e-3, 'msec': 1e-3, 'millisecond': 1e-3,
+        'us': 1e-6, 'usec': 1e-6, 'microsecond': 1e-6, 'min': 60.0, 'minute': 60.0,
+        'h': 3600.0, 'hr': 3600.0, 'hour': 3600.0, 'd': 86400.0,
+    },
+    'mm': {'mm': 1.0, 'cm': 10.0, 'm': 1000.0},
+    'um': {'um': 1.0, 'micron': 1.0, 'micrometer': 1.0, 'mm': 1000.0, 'm': 1e6},
+    'arcsec': {'arcsec': 1.0, '"': 1.0, 'deg': 3600.0, 'arcmin': 60.0},
+    'm': {'m': 1.0, 'km': 1000.0, 'ft': 0.3048},
+}  # fmt: skip
+_BRACKETS = re.compile(r'\s*\[([^]]*)\]')
+# Words for another unit than seconds, in a comment without brackets.
+_OTHER_UNIT = re.compile(
+    r'\b(m|u|milli|micro)s(ec(ond)?s?)?\b|\bminutes?\b|\bhours?\b', re.IGNORECASE
+)
 _ZONE = re.compile(r'(.*:.*?)\s*(?:([+-])(\d\d):?(\d\d)|(Z|UTC?|GMT))')
 _JD_OF_MJD = 2400000.5
 # Two times that differ by less are the same: Julian dates of three digits, system of time.  Zones
@@ -37,6 +47,45 @@ _JD_OF_MJD = 2400000.5
 _SAME_TIME_S, _UNKNOWN_EXPOSURE_S = 120.0, 600.0
 _SAME_SCALE = 0.1  # the search begins with a focal length within 25 %
 _INSTEAD = 'give --time-key or --times'
+
+
+def number_of(header: Mapping[str, Card], fact: str) -> float:
+    """
+    A fact in the unit of its row; NaN if it is not stated, or outside of its range.
+
+    Raises ValueError for an exposure time in an unknown unit.
+    """
+    row, key = FACTS[fact], stated(header, fact)
+    if not key:
+        return math.nan
+    value = value_of(header, key) * _unit(header, key, row.unit)
+    return value if row.low <= value <= row.high else math.nan
+
+
+def values_of(header: Mapping[str, Card], fact: str) -> Floats:
+    """Values of all keywords of a fact; NaN where there is none."""
+    return np.array([value_of(header, key) for key in FACTS[fact].keywords])
+
+
+def _unit(header: Mapping[str, Card], key: str, unit: str) -> float:
+    """Unit of a keyword over that of the table: by its comment, or TIMEUNIT."""
+    units = _UNITS.get(unit)
+    comment = str(header[key].comment)
+    if units is None:
+        return 1.0
+    brackets = _BRACKETS.match(comment)
+    words = unit
+    if brackets:
+        words = brackets[1].strip()
+    elif unit == 's' and _OTHER_UNIT.search(comment):
+        words = comment
+    elif key == 'XPOSURE' and 'TIMEUNIT' in header:
+        words = str(header['TIMEUNIT'].value).strip()
+    name = re.split(r'/| per ', words.strip())[0].strip()
+    factor = units.get(name) or units.get(name.lower().removesuffix('s'))
+    if factor is None and unit == 's':  # a stamp would be wrong, without a check by the stars
+        raise ValueError(f'{key} is in {words!r}, expected a unit as [s] or [ms]')
+    return math.nan if factor is None else factor
 
 
 class Moment(NamedTuple):

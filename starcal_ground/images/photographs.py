@@ -33,12 +33,12 @@ from starcal_ground.file_kinds import (
     UNKNOWN,
 )
 from starcal_ground.images import fits_facts
-from starcal_ground.images.fits_facts import FocalLength, Moment
+from starcal_ground.images.fits_facts import FocalLength, Moment, number_of
 from starcal_ground.images.image_series import scale_of
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.fits_keywords import FACTS, number_of
+from starcal_ros.formats.fits_keywords import FACTS
 from starcal_ros.formats.image_files import (
     content_of,
     decoded,

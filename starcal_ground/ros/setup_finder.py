@@ -24,6 +24,7 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import SetupDiagnosis
 from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ground.child_process import ChildProcess
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
 from starcal_ground.diagnosis.diagnose import (
     diagnose,
@@ -34,7 +35,6 @@ from starcal_ground.diagnosis.diagnose import (
 from starcal_ros.formats.messages import message_codec, sensor_messages
 from starcal_ros.pipeline import setup
 from starcal_ros.pipeline.detector_frames import NO_FRAMES
-from starcal_ros.processes import ChildProcess
 from starcal_ros.records import Image
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
@@ -195,6 +195,15 @@ class Unmatched:
     ----------
     on_answer : callable
         Called with each diagnosis, in the thread that waited for it.
+
+    Attributes
+    ----------
+    diagnosis : Diagnosis or None
+        Why the last images matched nothing; None: not asked yet, or they match again.
+    in_a_row : int
+        Number of images without a match since the last one with a match.
+    latest_ns : int
+        Stamp of the last image that matched nothing; 0 for none.
     """
 
     def __init__(
@@ -207,48 +216,31 @@ class Unmatched:
         self._on_answer = on_answer
         self._lock = threading.Lock()
         self._images: deque[Image] = deque(maxlen=_KEPT)
-        self._in_a_row = 0
+        self.in_a_row = self.latest_ns = 0
         self._next = self._first()
         self._process: ChildProcess | None = None
         self._is_closed = False
         self._thread: threading.Thread | None = None
-        self._diagnosis: Diagnosis | None = None
+        self.diagnosis: Diagnosis | None = None
 
     def _first(self) -> int:
         return _IN_A_ROW if self._setup.is_aligned else IMAGES_OF_AN_ALIGNMENT
 
-    @property
-    def diagnosis(self) -> Diagnosis | None:
-        """Why the last images matched nothing; None: not asked yet, or they match again."""
-        with self._lock:
-            return self._diagnosis
-
-    @property
-    def in_a_row(self) -> int:
-        """Number of images without a match since the last one with a match."""
-        with self._lock:
-            return self._in_a_row
-
-    @property
-    def latest_ns(self) -> int:
-        """Stamp of the last image that matched nothing; 0 for none."""
-        with self._lock:
-            return self._images[-1].time_ns if self._images else 0
-
     def matched(self) -> None:
         """Forget the diagnosis: an image matched."""
         with self._lock:
-            self._in_a_row, self._diagnosis, self._next = 0, None, self._first()
+            self.in_a_row, self.diagnosis, self._next = 0, None, self._first()
 
     def add(self, image: Image) -> None:
         """Keep an image that matched nothing, and have it diagnosed if it is time."""
         with self._lock:
             self._images.append(image)
-            self._in_a_row += 1
+            self.latest_ns = image.time_ns
+            self.in_a_row += 1
             busy = self._thread is not None and self._thread.is_alive()
-            if busy or self._is_closed or self._in_a_row < self._next:
+            if busy or self._is_closed or self.in_a_row < self._next:
                 return
-            self._next = 2 * self._in_a_row if self._setup.is_aligned else self._in_a_row + 1
+            self._next = 2 * self.in_a_row if self._setup.is_aligned else self.in_a_row + 1
             question = (
                 tuple(self._images),
                 wire_attitudes(self._attitudes, self._setup.attitude.attitude_direction),
@@ -280,9 +272,9 @@ class Unmatched:
         finally:
             process.end()
         with self._lock:
-            if not self._in_a_row:
+            if not self.in_a_row:
                 return  # images match again
-            self._diagnosis = diagnosis
+            self.diagnosis = diagnosis
         self._on_answer(diagnosis)
 
 

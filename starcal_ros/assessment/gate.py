@@ -357,10 +357,10 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         REMEDIES['detector step'],
     )
     yield _unless_chance(check, step.p_value, _STEP_P_VALUE)
-    yield from (_held_check(term, options) for term in found.held)
+    yield from (_held_check(term, found, options) for term in found.held)
 
 
-def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
+def _held_check(term: HeldTerm, found: ModelChecks, options: GateOptions) -> GateCheck:
     """The distance of an assumed value from that by the stars, if they determine it."""
     check = limit_check(
         options,
@@ -372,10 +372,12 @@ def _held_check(term: HeldTerm, options: GateOptions) -> GateCheck:
     if math.isnan(term.significance):
         return dataclasses.replace(check, passed=None, note=_NOT_BY_STARS)
     test, estimated = prior_test_of(term.name), significant(term.estimated, 6)
-    note = f'{estimated} by the stars, {significant(term.assumed, 6)} assumed'
-    if test.is_added:
+    note, remedy = f'{estimated} by the stars, {significant(term.assumed, 6)} assumed', test.remedy
+    if test.unstated and not any(one.name in test.starts for one in found.statements):
+        note, remedy = test.unstated
+    elif test.is_added:
         note = f'the stars add {estimated} to it'
-    return dataclasses.replace(check, note=note if check.passed else f'{note}; {test.remedy}')
+    return dataclasses.replace(check, note=note if check.passed else f'{note}; {remedy}')
 
 
 def _group(part: ResidualBin) -> str:

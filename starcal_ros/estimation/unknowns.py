@@ -691,13 +691,15 @@ class PriorTest:
 
     The names of its numbers in the checks begin with ``starts``: labels, or by ``as_stated`` name
     and unit of what an operator states.  ``is_added``: the number is what the stars add to a value
-    that is stated.  The remedy is for a prior that the stars contradict.
+    that is stated.  The remedy is for a prior that the stars contradict; ``unstated`` are finding
+    and remedy in its place where no message of the images states the value.
     """
 
     starts: tuple[str, ...] = ()
     remedy: str = 'estimate it, or widen its prior (estimate, prior_sigma)'
     is_added: bool = False
     as_stated: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
+    unstated: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -839,7 +841,13 @@ UNKNOWNS: dict[str, Kind] = {
         option=_velocity_option,
         remedy='state the velocity (topic, observer_velocity_m_s; photographs: observer)',
         tested=PriorTest(
-            ('velocity',), 'correct it so; on the ground state observer: ground', is_added=True
+            ('velocity',),
+            'correct it so; on the ground state observer: ground',
+            is_added=True,
+            unstated=(
+                'none was received, that of the Earth was assumed',
+                'publish it, or check the date',
+            ),
         ),
     ),
     'refraction': Kind(_refraction, cause='refraction', line=2, assumption=_refraction_text),

@@ -13,10 +13,6 @@ import math
 import re
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from starcal_ros.arrays import Floats
-
 
 class Card(NamedTuple):
     """Value and comment of a FITS keyword."""
@@ -98,23 +94,6 @@ FACTS: Mapping[str, Row] = {
 }  # fmt: skip
 
 _ANGLES = {key for row in FACTS.values() if row.unit == 'deg' for key in row.keywords}
-# A unit in brackets at the start of a comment (section 4.3.2), over that of the table.
-_UNITS: Mapping[str, Mapping[str, float]] = {
-    's': {
-        's': 1.0, 'sec': 1.0, 'second': 1.0, 'ms': 1e-3, 'msec': 1e-3, 'millisecond': 1e-3,
-        'us': 1e-6, 'usec': 1e-6, 'microsecond': 1e-6, 'min': 60.0, 'minute': 60.0,
-        'h': 3600.0, 'hr': 3600.0, 'hour': 3600.0, 'd': 86400.0,
-    },
-    'mm': {'mm': 1.0, 'cm': 10.0, 'm': 1000.0},
-    'um': {'um': 1.0, 'micron': 1.0, 'micrometer': 1.0, 'mm': 1000.0, 'm': 1e6},
-    'arcsec': {'arcsec': 1.0, '"': 1.0, 'deg': 3600.0, 'arcmin': 60.0},
-    'm': {'m': 1.0, 'km': 1000.0, 'ft': 0.3048},
-}  # fmt: skip
-_BRACKETS = re.compile(r'\s*\[([^]]*)\]')
-# Words for another unit than seconds, in a comment without brackets.
-_OTHER_UNIT = re.compile(
-    r'\b(m|u|milli|micro)s(ec(ond)?s?)?\b|\bminutes?\b|\bhours?\b', re.IGNORECASE
-)
 _SEXAGESIMAL = re.compile(r'([+-]?)(\d+)[:\s](\d+)(?:[:\s](\d+(?:\.\d*)?))?\s*([NSEW]?)', re.I)
 
 
@@ -131,24 +110,6 @@ def text_of(header: Mapping[str, Card], fact: str) -> str:
     """Text of a fact, empty if there is none."""
     key = stated(header, fact)
     return str(header[key].value).strip() if key else ''
-
-
-def number_of(header: Mapping[str, Card], fact: str) -> float:
-    """
-    A fact in the unit of its row; NaN if it is not stated, or outside of its range.
-
-    Raises ValueError for an exposure time in an unknown unit.
-    """
-    row, key = FACTS[fact], stated(header, fact)
-    if not key:
-        return math.nan
-    value = _value(header, key) * _unit(header, key, row.unit)
-    return value if row.low <= value <= row.high else math.nan
-
-
-def values_of(header: Mapping[str, Card], fact: str) -> Floats:
-    """Values of all keywords of a fact; NaN where there is none."""
-    return np.array([value_of(header, key) for key in FACTS[fact].keywords])
 
 
 def value_of(header: Mapping[str, Card], key: str) -> float:
@@ -174,24 +135,3 @@ def _value(header: Mapping[str, Card], key: str) -> float:
         return float((words.split() or [''])[0].upper().replace('D', 'E'))
     except ValueError:
         return math.nan
-
-
-def _unit(header: Mapping[str, Card], key: str, unit: str) -> float:
-    """Unit of a keyword over that of the table: by its comment, or TIMEUNIT."""
-    units = _UNITS.get(unit)
-    comment = str(header[key].comment)
-    if units is None:
-        return 1.0
-    brackets = _BRACKETS.match(comment)
-    words = unit
-    if brackets:
-        words = brackets[1].strip()
-    elif unit == 's' and _OTHER_UNIT.search(comment):
-        words = comment
-    elif key == 'XPOSURE' and 'TIMEUNIT' in header:
-        words = str(header['TIMEUNIT'].value).strip()
-    name = re.split(r'/| per ', words.strip())[0].strip()
-    factor = units.get(name) or units.get(name.lower().removesuffix('s'))
-    if factor is None and unit == 's':  # a stamp would be wrong, without a check by the stars
-        raise ValueError(f'{key} is in {words!r}, expected a unit as [s] or [ms]')
-    return math.nan if factor is None else factor

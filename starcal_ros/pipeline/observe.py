@@ -320,4 +320,7 @@ def check_order(image: Image, latest_ns: int | None) -> None:
     """
     if latest_ns is not None and image.time_ns <= latest_ns:
         late_s = (latest_ns - image.time_ns) * 1e-9
-        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')
+        words = f'{late_s:.6f} s before the last image used'
+        if not late_s:
+            words = 'the stamp of the last image used: two publishers on one topic?'
+        raise ImageRefused('out_of_order', words)

@@ -317,10 +317,9 @@ def read_values(params: Path) -> dict[str, object]:
 
 
 def paths_from(values: Mapping[str, object], folder: Path) -> dict[str, object]:
-    """Options whose relative paths of files to read are relative to a folder."""
-    names = [
-        field.name for field in options.option_fields(SetupOptions) if field.metadata['is_path']
-    ]
+    """Options whose relative paths are relative to a folder."""
+    fields = options.option_fields(SetupOptions, CalibratorOptions)
+    names = [field.name for field in fields if field.metadata['is_path']]
     paths = {name: values[name] for name in names if isinstance(values.get(name), str)}
     return {
         **values,

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field, replace
 import fcntl
+import functools
 import hashlib
 import hmac
 import itertools
@@ -33,7 +34,7 @@ from pathlib import Path
 import re
 import shutil
 import stat
-from typing import Any
+from typing import Any, TypeVar
 
 from starcal_ros.errors import ArchiveError, BagError, errors_as, OptionError, ProductError
 from starcal_ros.files import PART, sync_folder
@@ -65,8 +66,15 @@ _LEAST_KEY_BYTES, _MOST_KEY_BYTES = 16, 4096
 _CHECKSUM, _HMAC = 'sha256', 'hmac_sha256'
 
 
+T = TypeVar('T')
+
+
 class _WrongKey(ValueError):
     """A file is sound, but for its HMAC."""
+
+
+class _OtherVersion(ValueError):
+    """A file has another schema."""
 
 
 @dataclass(frozen=True)
@@ -271,12 +279,13 @@ class Archive:
         self._check_key()
         images: dict[int, _KeptImage] = {}
         for path, name in self._files(_ENSEMBLE, _IMAGE_NAME):
-            image = self._read_image(path, name)
+            image = self._read(path, functools.partial(self._image, name))
             if image is not None and image.time_ns not in images:
                 images[image.time_ns] = _KeptImage(image, path)
                 self._next_image = max(self._next_image, int(name[1]) + 1)
         for path, _ in self._files(_ENSEMBLE, re.compile(re.escape(_REFUSED))):
-            self._counts = self._read_counts(path)
+            counts = self._read(path, lambda data: _counts(self._opened(data, ARCHIVE_SCHEMA)))
+            self._counts = counts or _RefusedFile(ARCHIVE_SCHEMA)
         self._images = images
         refused = dict(self._counts.refused)
         return Ensemble(tuple(kept.image for kept in images.values()), refused)
@@ -326,14 +335,14 @@ class Archive:
         history: dict[str, Activation] = {}
         last_number = 0
         for path, name in self._files(_CALIBRATIONS, _EVENT_NAME):
-            event, last_number = int(name[1]), int(name[2])
-            record = self._read_event(path, event, last_number)
+            last_number = int(name[2])
+            record = self._read(path, functools.partial(self._event, name))
             if record is not None:
                 # A kill while a joined history was written leaves an event with two numbers.
                 history.pop(record.origin, None)
                 history[record.origin] = record
-                self._events[event] = _KeptEvent(record.origin, path)
-                self.last_event = max(self.last_event, event)
+                self._events[record.event] = _KeptEvent(record.origin, path)
+                self.last_event = max(self.last_event, record.event)
         records = list(history.values())
         same = [record for record in records if record.calibration.number == last_number]
         if same and records[-1].calibration.number != last_number:
@@ -523,47 +532,32 @@ class Archive:
             else:
                 self.damage.append(f'{path}: not a regular file, skipped')
 
-    def _read_image(self, path: Path, name: re.Match[str]) -> StarObservations | None:
+    def _read(self, path: Path, reader: Callable[[bytes], T]) -> T | None:
+        """Content of a file by its reader; None where it is set aside, or of another version."""
         try:
-            data = _content(path)
-            self._seal.check_mark(name[2] or '', int(name[1]), data)
-            return _image_of(data)
-        except ValueError as error:
-            self._set_aside(path, str(error))
-            return None
-
-    def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
-        content = self._unsealed(path, product_files.SCHEMA)
-        if content is None:
-            return None
-        archive = content.get('archive')
-        if not isinstance(archive, dict) or archive.get('schema') != ARCHIVE_SCHEMA:
+            return reader(_content(path))
+        except _OtherVersion:
             self.damage.append(f'{path}: of another version, skipped')
-            return None
-        try:
-            return _activation(content, event, number)
         except (ProductError, ValueError) as error:
             self._set_aside(path, str(error))
-            return None
+        return None
 
-    def _read_counts(self, path: Path) -> _RefusedFile:
-        content = self._unsealed(path, ARCHIVE_SCHEMA)
-        try:
-            return _RefusedFile(ARCHIVE_SCHEMA) if content is None else _counts(content)
-        except ValueError as error:
-            self._set_aside(path, str(error))
-            return _RefusedFile(ARCHIVE_SCHEMA)
+    def _image(self, name: re.Match[str], data: bytes) -> StarObservations:
+        self._seal.check_mark(name[2] or '', int(name[1]), data)
+        return _image_of(data)
 
-    def _unsealed(self, path: Path, schema: int) -> Mapping[str, Any] | None:
-        """The JSON object of a file with the right seals and this schema; else None."""
-        try:
-            content = self._seal.opened(_content(path))
-        except ValueError as error:
-            self._set_aside(path, str(error))
-            return None
+    def _event(self, name: re.Match[str], data: bytes) -> Activation:
+        content = self._opened(data, product_files.SCHEMA)
+        archive = content.get('archive')
+        if not isinstance(archive, dict) or archive.get('schema') != ARCHIVE_SCHEMA:
+            raise _OtherVersion
+        return _activation(content, int(name[1]), int(name[2]))
+
+    def _opened(self, data: bytes, schema: int) -> Mapping[str, Any]:
+        """The JSON object of a file with the right seals and this schema."""
+        content = self._seal.opened(data)
         if content.get('schema') != schema:
-            self.damage.append(f'{path}: of another version, skipped')
-            return None
+            raise _OtherVersion
         return content
 
     def _set_aside(self, path: Path, why: str) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import array
 from collections.abc import Sequence
 import contextlib
+from dataclasses import replace
 import math
 import sys
 import threading
@@ -26,7 +27,7 @@ from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.messages.message_codec import make_header, record_to_message
+from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header, record_to_message
 from starcal_ros.formats.messages.record_messages import (
     alignment_to_message,
     calibration_to_message,
@@ -42,6 +43,7 @@ from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros import node
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.state import Answer, CalibratorState
+from starcal_ros.text import shortened
 
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
@@ -55,6 +57,7 @@ _LOOK_S = 0.5  # period of checks for the service and the timeout
 _LONGEST_PAUSE_S = 300.0  # longest pause after the time limit, before a driver is called again
 _RETRY_S = 1.0  # after a failed write
 _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
+_MOST_CHARACTERS = 200  # of an answer, a line or two on a terminal; the log has all
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
 
@@ -93,8 +96,7 @@ class Calibrator(node.StarcalNode):
         self._setup = load_setup(values)
         check_site(self._setup.site)
         self._state.open(self._setup, self._own)
-        if self._state.moved:
-            self.get_logger().info(self._state.moved)
+        self.get_logger().info(str(self._state))
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)
         # Answers and verdicts use today's parameters: the gate judges stored calibrations again.
@@ -208,6 +210,24 @@ class Calibrator(node.StarcalNode):
             return node.WARN, last.message, numbers
         return node.OK, 'collecting' if active is None else 'calibration active', numbers
 
+    def silent(self) -> list[str]:
+        """Return the topic of the observations if none has come yet."""
+        has_come = self.taken(self._on_observations)
+        return [] if has_come else [self.resolve_topic_name('observations')]
+
+    def _with_silence(self, answer: Answer) -> Answer:
+        """Return the answer with the reason, first, if no observations have come."""
+        if answer.success or self._state.ensemble.images or not (silent := self.silent()):
+            return answer
+        (topic,) = silent
+        where = self.inputs.elsewhere(topic)
+        if not where:
+            images = self.inputs.published(IMAGE_TYPE)
+            unread = [name for name in images if not self.count_subscribers(name)]
+            where = ', '.join(f'{name} has a publisher and no subscriber' for name in unread)
+        why = f'no message on {topic}' + (f': {where}' if where else '')
+        return replace(answer, message=f'{why}; {answer.message}')
+
     def _foreign_transforms(self) -> str:
         """Return which transforms another node publishes as well; empty: none."""
         if not self._own_transforms or self.count_publishers('/tf_static') < 2:
@@ -254,7 +274,8 @@ class Calibrator(node.StarcalNode):
                 self._status.publish(message)
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
-        return self._publish_and_answer(self._note_gate(self._state.solve()), response)
+        answer = self._with_silence(self._note_gate(self._state.solve()))
+        return self._publish_and_answer(answer, response)
 
     def _on_solve(self, request: Any, response: Any) -> Any:
         answer = self._note_gate(
@@ -264,7 +285,7 @@ class Calibrator(node.StarcalNode):
         )
         if answer.calibration is not None:
             response.calibration = calibration_to_message(answer.calibration, node.make_message)
-        return self._publish_and_answer(answer, response)
+        return self._publish_and_answer(self._with_silence(answer), response)
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
         answer = self._state.reset()
@@ -367,6 +388,7 @@ class Calibrator(node.StarcalNode):
                 response.message = f'internal error: {type(error).__name__}: {error}'
                 self._last_answer = Answer(False, response.message)
             self.get_logger().info(response.message)
+            response.message = shortened(response.message, _MOST_CHARACTERS)
             tell_health()
             return response
 

@@ -32,6 +32,10 @@ def with_reliability(qos: QoSProfile, reliability: ReliabilityPolicy) -> QoSProf
     return QoSProfile(depth=qos.depth, durability=qos.durability, reliability=reliability)
 
 
+_OWN_IMAGES = '/annotated_image'  # of a star observer: no driver sends them
+_NAMED = 2  # topics: a third does not help to find the right one
+
+
 @dataclass
 class _Input:
     kinds: tuple[Any, ...]
@@ -103,6 +107,28 @@ class Inputs:
         """Names of the topics on the graph, after remapping."""
         with self._lock:
             return sorted(entry.name for entry in self._inputs)
+
+    def elsewhere(self, name: str) -> str:
+        """Where messages of an input may be that nobody sends to it; empty: nowhere."""
+        with self._lock:
+            entry = next((entry for entry in self._inputs if entry.name == name), None)
+        if entry is None or self._node.count_publishers(name):
+            return ''
+        # The first type of an input is for nothing else: transforms are no attitudes.
+        others = self.published(_type_name(entry.kinds[0]))
+        return f'{" and ".join(others[:_NAMED])} has a publisher' if others else ''
+
+    def published(self, type_name: str) -> list[str]:
+        """Names of the topics of a type that have a publisher and are no inputs of this node."""
+        own = {*self.names()}
+        return [
+            name
+            for name, types in self._node.get_topic_names_and_types()
+            if type_name in types
+            and name not in own
+            and not name.endswith(_OWN_IMAGES)
+            and self._node.count_publishers(name)
+        ]
 
     def lost(self) -> dict[str, int]:
         """

@@ -45,6 +45,7 @@ from starcal_ros.text import printable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
+NO_CLOCK = 'no /clock: start its publisher, or set use_sim_time to false'
 
 _END_S = 30  # for the middleware to let a node go; on busy cores it takes a second
 _ANSWERED_S = 1.0  # after a signal, by which the thread of rclpy has shut ROS down
@@ -70,11 +71,12 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         self._publishers_made: list[Any] = []
         self.inputs = inputs.Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
+        self._elsewhere: dict[str, str] = {}  # by silent topic: others that have a publisher
         self._errors = 0
         self._taken: Counter[Callable[[Any], None]] = Counter()
         self._counting = threading.Lock()  # guards the counts of errors and messages
         self._level: bytes | None = None
-        self._listening_since_s = math.inf
+        self._silent_from_s = math.inf
         self._trim_due_s = 0.0
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -85,8 +87,12 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
 
     def destroy_node(self) -> None:
         """Leave the graph too: rclpy keeps the node in it as long as the state machine exists."""
-        super().destroy_node()
+        # First, as rclpy destroys all that depends on a node before its handle: the five services
+        # of the state machine share it, and the last of them that is destroyed ends it.  The
+        # other order crashed once on Kilted.  In either order Fast DDS of Kilted may not return
+        # (some of a thousand ends beside other processes): `end_quietly` then ends the process.
         self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
 
     def configure(self) -> None:
         """Read parameters and files, create the publishers; StarcalError if they are invalid."""
@@ -174,13 +180,13 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         if time.monotonic() > self._trim_due_s:
             self._trim_due_s = time.monotonic() + _TRIM_S
             return_freed_memory()
-        if time.monotonic() > self._listening_since_s + _SILENT_S:
-            self._listening_since_s = math.inf
-            for topic in self.silent():
-                self.get_logger().warning(
-                    f'{topic}: no message in {_SILENT_S:.0f} s, from'
-                    f' {self.count_publishers(topic)} publishers'
-                )
+        silent = self.silent() if self.is_active and time.monotonic() > self._silent_from_s else []
+        for topic in set(silent) - set(self._elsewhere):
+            self.get_logger().warning(
+                f'{topic}: no message in {_SILENT_S:.0f} s, from'
+                f' {self.count_publishers(topic)} publishers'
+            )
+        self._elsewhere = {topic: self.inputs.elsewhere(topic) for topic in silent}
         self.publish_health()
 
     def publish_health(self) -> None:
@@ -209,8 +215,12 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
     def _health(self) -> Health:
         if self.is_active:
             level, text, numbers = self.health()
-            if self._incompatible and level == OK:
-                level, text = WARN, 'not received: ' + '; '.join(self._incompatible)
+            doubts = [f'not received: {"; ".join(self._incompatible)}'] * bool(self._incompatible)
+            doubts += [f'{topic}: {why}' for topic, why in self._elsewhere.items() if why]
+            if level != ERROR and self._waits_for_clock():
+                level, text = WARN, NO_CLOCK
+            elif level == OK and doubts:
+                level, text = WARN, '; '.join(doubts)
         else:
             state = self._state_machine.current_state[1]
             level, text, numbers = WARN, self.failure or f'not active: {state}', {}
@@ -223,6 +233,11 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
             'callback_errors': self._errors,
         }
         return level, text, {**numbers, **common}
+
+    def _waits_for_clock(self) -> bool:
+        """Return True in simulated time before the first message of /clock."""
+        is_simulated = bool(self.get_parameter('use_sim_time').value)
+        return is_simulated and not self.get_clock().now().nanoseconds
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure; with a bad parameter or file the node stays unconfigured."""
@@ -252,7 +267,7 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
             self.deactivate()
             super().on_deactivate(state)
         elif outcome == TransitionCallbackReturn.SUCCESS:
-            self._listening_since_s = time.monotonic()
+            self._silent_from_s = time.monotonic() + _SILENT_S
             self.get_logger().info(f'active, listening to {", ".join(self.inputs.names())}')
         return outcome
 

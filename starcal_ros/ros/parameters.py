@@ -24,6 +24,10 @@ from starcal_ros.errors import OptionError
 from starcal_ros.pipeline.setup import paths_from
 from starcal_ros.record_fields import MOST
 
+# A launch file writes its own parameters to a temporary file of this name: their paths are
+# relative to the working folder, as those of the command line.
+_OF_LAUNCH = 'launch_params_'
+
 
 class OptionParameters:
     """
@@ -89,19 +93,18 @@ def folders_of_paths(arguments: Sequence[str], node: str) -> dict[tuple[str, obj
     ``arguments`` and ``node`` as for `unread_sections`.
     """
     folders: dict[tuple[str, object], Path] = {}
-    for flag, file in itertools.pairwise(arguments):
-        sections = options.parameter_sections(Path(file)) if flag == '--params-file' else {}
+    for file, sections in _parameter_files(arguments):
+        if file.name.startswith(_OF_LAUNCH):
+            continue
+        folder = file.absolute().parent
         for section, body in sections.items():
             values = body.get('ros__parameters') if isinstance(body, dict) else None
             if isinstance(values, dict) and options.section_applies(section, node):
-                paths = paths_from(values, Path(file).absolute().parent)
+                paths = paths_from(values, folder)
                 folders |= {
-                    (name, value): Path(file).absolute().parent
+                    (name, value): folder
                     for name, value in values.items()
-                    # A launch file writes its parameters to a temporary file of its own.
-                    if isinstance(value, str)
-                    and paths[name] != value
-                    and (Path(str(paths[name])).exists() or not Path(value).exists())
+                    if isinstance(value, str) and paths[name] != value
                 }
     return folders
 
@@ -121,8 +124,7 @@ def unread_sections(arguments: Sequence[str], node: str, executable: str) -> lis
     """
     own = {executable, node.rpartition('/')[2]}
     warnings = []
-    for flag, file in itertools.pairwise(arguments):
-        sections = options.parameter_sections(Path(file)) if flag == '--params-file' else {}
+    for file, sections in _parameter_files(arguments):
         meant = [name for name in sections if options.meant_node(name, own)]
         if any(options.section_applies(name, node) for name in meant):
             continue  # the others are those of the same node in other namespaces
@@ -132,6 +134,12 @@ def unread_sections(arguments: Sequence[str], node: str, executable: str) -> lis
             if '*' not in name.replace('/**/', '')  # rcl has more wildcards
         ]
     return warnings
+
+
+def _parameter_files(arguments: Sequence[str]) -> list[tuple[Path, dict[str, object]]]:
+    """Return the parameter files of a command line with their sections."""
+    files = [Path(file) for flag, file in itertools.pairwise(arguments) if flag == '--params-file']
+    return [(file, options.parameter_sections(file)) for file in files]
 
 
 def _as_parameter(default: Any) -> Any:

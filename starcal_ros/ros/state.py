@@ -19,6 +19,7 @@ from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup, with_method
 from starcal_ros.ros.joining import Collections, HISTORY, joined, Kept
+from starcal_ros.text import counted
 
 if TYPE_CHECKING:
     from starcal_ros.ros.archive import Archive
@@ -57,7 +58,7 @@ class CalibratorState:
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibrations
-        self.moved = ''  # a sentence on the records in memory when the folder was opened
+        self._moved = ''  # a sentence on the records in memory when the folder was opened
         # Guards the fields below; never held during a solve.  Activations change only with both
         # locks held, `_disk` first.
         self._records = threading.Lock()
@@ -110,7 +111,7 @@ class CalibratorState:
             self._setup, self._folder, self._archive = setup, options.state_dir, archive
             self._camera = _camera_of(setup)
             self._ensemble, self._history = ensemble, kept.history
-            self._collections, self.moved = kept.collections, moved
+            self._collections, self._moved = kept.collections, moved
             self._active, self.withheld = self._accepted_from(
                 self._history[-1].event if self._history else 0
             )
@@ -150,6 +151,17 @@ class CalibratorState:
             )
             record = by_event.get(record.before) if record.before < record.event else None
         return record, tuple(refused)
+
+    def __str__(self) -> str:
+        """Return one line: the state folder, the active calibration and the images."""
+        active = self.active
+        words = [
+            f'state_dir {self._folder or "not given"}',
+            f'calibration {active.number} active' if active else 'no calibration active',
+            counted(len(self.ensemble.images), 'image'),
+            self._moved,
+        ]
+        return '; '.join(filter(None, words))
 
     def close(self) -> None:
         """Write what is not on disk, release the state folder; safe to call twice."""
@@ -319,6 +331,8 @@ class CalibratorState:
     ) -> Answer:
         """Activate a calibration from now on, and save it before anyone else can activate one."""
         active = replace(calibration, number=number, active_since_ns=self._now_ns())
+        if not active.active_since_ns:  # in simulated time before the first message of /clock
+            return Answer(False, 'not activated: the ROS clock is 0, as before the first /clock')
         try:
             product_files.check_readable(active)
         except errors.ProductError as error:

@@ -147,6 +147,7 @@ def test_a_stored_calibration_that_the_gate_refuses_is_not_active(
     assert level == b'\x01'
     assert text.startswith('calibration 1 is not active, the gate refuses it now: largest change')
     assert 'max_change_px' in text and text in first.said()
+    assert f'state_dir {tmp_path}/state; no calibration active; 0 images' in first.said()
     assert values['active'] == 'none' and values['last_gate'] == f'refused: {text}'
     assert values['state_refused_calibrations'] == '1'
     first.stop()
@@ -186,6 +187,22 @@ def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_rece
     client.until(lambda: client.health()[:2] == (b'\x00', 'waiting for images'))
     publishers[0].publish(QuaternionStamped())
     client.until_value('messages', '1')
+
+
+def test_a_driver_in_another_namespace_is_named(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    for name in BOTH:
+        start_node(name, ros=parameters(tiny_bag))
+    client.node.create_publisher(Image, '/sat2/camera/image_raw', 10)
+    there = '/sat2/camera/image_raw has a publisher'
+    client.until(lambda: f'/image: {there}' in client.health()[1])
+    assert client.health()[0] == b'\x01'
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert answer.message.startswith(
+        f'no message on /observations: {there} and no subscriber; too'
+    )
+    assert len(answer.message) <= 200
 
 
 IMPLAUSIBLE = 'm/s is faster than any spacecraft: left out; send m/s'

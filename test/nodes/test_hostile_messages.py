@@ -25,6 +25,7 @@ pytest.importorskip('starcal.msg')
 from flight import Flight  # type: ignore[import-not-found]
 from geometry_msgs.msg import QuaternionStamped, TransformStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
+from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
 from node_campaign import Campaign  # type: ignore[import-not-found]
 from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
@@ -63,7 +64,6 @@ MAY_BE_INFINITE = frozenset(
         'p_value',
     ]
 )
-CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
 SHUTDOWNS = (5, 6, 7)  # a node rightly executes it
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -135,15 +135,10 @@ def assert_common_requests_are_answered(client: Client, name: str, process: Node
         (ChangeState, 'change_state', change),
     ):
         assert_requests_are_answered(client, kind, f'/{name}/{service}', request, process)
+    manager = Manager(client, name)
     for transition in (CONFIGURE, ACTIVATE):  # each may be refused
-        change_state(client, name, transition)
-    assert client.call(GetState, f'/{name}/get_state').current_state.label == 'active'
-
-
-def change_state(client: Client, name: str, transition: int) -> None:
-    request = ChangeState.Request()
-    request.transition.id = transition
-    client.call(ChangeState, f'/{name}/change_state', transition=request.transition)
+        manager.change(transition)
+    assert manager.state() == 'active'
 
 
 def small_image() -> Any:
@@ -293,10 +288,11 @@ def test_calls_to_a_node_that_is_deactivated_are_answered(
         service = client.node.create_client(Trigger, f'/calibrator/{name}')
         calls.append((service, Trigger.Request()))
     client.until(lambda: all(service.service_is_ready() for service, _ in calls))
+    manager = Manager(client, 'calibrator')
     for transitions in ((DEACTIVATE, ACTIVATE), (DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE)):
         futures = [service.call_async(request) for service, request in calls]
         for transition in transitions:
-            change_state(client, 'calibrator', transition)
+            manager.change(transition)
         client.until(lambda: all(future.done() for future in futures))  # noqa: B023
     assert filled.process.poll() is None
 

@@ -111,6 +111,7 @@ JOINS = {
         'b a',
     ),
     'removed folder': ('open A; images 0 1; activate a; close; remove A; open A', '0 1', 'a'),
+    'reset': ('open A; images 0 1; reset; images 3', '3', ''),
     # A reset is an event of the images: they do not come back from anywhere.
     'reset on full A, A': (
         'open A; images 0 1; activate a; full; reset; images 2; close; room; open A',
@@ -188,6 +189,7 @@ def test_the_limit_of_images_holds(calibrators: Calibrators) -> None:
     calibrators.setup = dataclasses.replace(calibrators.setup, calibration=few)
     state = calibrators.run('P2 open A; P2 images 0 1 2 3; P2 close; open -; images 4 5 6; open A')
     assert len(state.ensemble.images) == state.status().images_saved == 4
+    assert len(list((calibrators.disk / 'A' / 'ensemble').glob('*.mcap'))) == 4
 
 
 def of_frame(calibrators: Calibrators, frame: str) -> None:
@@ -263,7 +265,7 @@ def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators: Calibrato
     state = calibrators.run('open A; images 0 1; activate a')
     of_frame(calibrators, 'navcam_2')
     calibrators.open('P1', 'B')
-    assert state.moved.endswith(f'they stay in {calibrators.disk / "A"}')
+    assert str(state).endswith(f'they stay in {calibrators.disk / "A"}')
     assert kept(state) == ('', '')
     calibrators.run('images 2; close')
     calibrators.setup = first

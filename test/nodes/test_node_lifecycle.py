@@ -22,7 +22,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager, NO_TRANSITION  # type: ignore[import-not-found]
 from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import rclpy
 from std_msgs.msg import Empty
@@ -35,9 +35,6 @@ pytestmark = pytest.mark.nodes
 NUMBERS = sorted(
     {value for name in dir(Transition) if isinstance(value := getattr(Transition, name), int)}
 )
-NO_TRANSITION = 200
-CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
-ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 SHUTDOWN = {
     'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
     'inactive': Transition.TRANSITION_INACTIVE_SHUTDOWN,
@@ -51,36 +48,6 @@ ALLOWED: dict[str, tuple[tuple[int, str, tuple[int, ...]], ...]] = {
     'active': ((DEACTIVATE, 'inactive', (ACTIVATE,)),),
     'finalized': (),
 }
-
-
-class Manager:
-    """Client of the lifecycle services of one node."""
-
-    def __init__(self, client: Client, name: str) -> None:
-        self._client = client
-        self._change = client.node.create_client(ChangeState, f'/{name}/change_state')
-        self._get = client.node.create_client(GetState, f'/{name}/get_state')
-        client.until(lambda: self._change.service_is_ready() and self._get.service_is_ready())
-        # The first answer may be lost, before the node has found its reader: what changes nothing.
-        client.ask(self._change, _to(NO_TRANSITION), again_s=5.0)
-        client.ask(self._get, GetState.Request(), again_s=5.0)
-
-    def _call(self, service: Any, request: Any) -> Any:
-        future = service.call_async(request)
-        self._client.until(future.done)
-        return future.result()
-
-    def change(self, number: int) -> bool:
-        """Request a transition; return True if the node made it."""
-        return bool(self._call(self._change, _to(number)).success)
-
-    def state(self) -> str:
-        """Label of the present state of the node."""
-        return str(self._call(self._get, GetState.Request()).current_state.label)
-
-
-def _to(number: int) -> Any:
-    return ChangeState.Request(transition=Transition(id=number))
 
 
 def try_everything(manager: Manager, state: str) -> None:

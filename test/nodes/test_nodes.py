@@ -28,8 +28,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from geometry_msgs.msg import QuaternionStamped, TransformStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
@@ -190,7 +189,7 @@ def test_each_service_of_a_calibrator(
     assert not bad.success and 'magic' in bad.message
     for estimate in (['fx'] * 100_000, ['fx', 'fx'], ['x' * 10**6]):
         bad = client.call(Calibrate, '/calibrator/solve', estimate=estimate)
-        assert not bad.success and len(bad.message) < 1000
+        assert not bad.success and len(bad.message) <= 200
 
     answer = client.call(LineOfSightTable, '/calibrator/lookup', points=7)
     assert answer.success and '49 lines of sight' in answer.message
@@ -212,7 +211,8 @@ def test_each_service_of_a_calibrator(
         assert not refused.success and f'points: {points}' in refused.message
 
     reset = client.call(Trigger, '/calibrator/reset')
-    assert reset.success and str(len(tiny_observations.images)) in reset.message
+    dropped = f'{len(tiny_observations.images)} images dropped'
+    assert reset.success and reset.message.startswith(dropped)
     client.until_images(0)
     assert not client.call(Trigger, '/calibrator/calibrate').success
     assert len(published) == 1
@@ -603,15 +603,14 @@ def test_parameters_while_running(client: Client, start_node: StartNode, tiny_ba
     assert gap.floating_point_range[0].from_value == 0.0
     assert 'inertial_to_st' in direction.description
     assert images.integer_range[0].to_value == 100_000
-    client.until(lambda: state_of(client) == 'active')
+    manager = Manager(client, 'star_observer')
+    client.until(lambda: manager.state() == 'active')
     assert 'in use' in set_gap(client, 1.0)
-    assert change_state(client, Transition.TRANSITION_DEACTIVATE)
-    assert change_state(client, Transition.TRANSITION_CLEANUP)
+    assert manager.change(DEACTIVATE) and manager.change(CLEANUP)
     assert set_gap(client, 1.0) == ''
     assert 'max_attitude_gap_s' in set_gap(client, -1.0)
     assert 'Type' in set_gap(client, 1.0, 41)
-    assert change_state(client, Transition.TRANSITION_CONFIGURE)
-    assert change_state(client, Transition.TRANSITION_ACTIVATE)
+    assert manager.change(CONFIGURE) and manager.change(ACTIVATE)
     assert node.process.poll() is None
 
 
@@ -621,19 +620,6 @@ def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DO
     parameter = Parameter(name='max_attitude_gap_s', value=number)
     answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
     return '' if answer.results[0].successful else str(answer.results[0].reason)
-
-
-def state_of(client: Client) -> str:
-    """Lifecycle state of the star observer."""
-    answer = client.call(GetState, '/star_observer/get_state')
-    return str(answer.current_state.label)
-
-
-def change_state(client: Client, transition: int) -> bool:
-    """Request a transition; return True if the node made it."""
-    request = Transition(id=transition)
-    answer = client.call(ChangeState, '/star_observer/change_state', transition=request)
-    return bool(answer.success)
 
 
 def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:

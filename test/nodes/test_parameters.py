@@ -61,10 +61,15 @@ def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path: Path) -> None:
     other = tmp_path / 'other.yaml'
     other.write_text('/**/star_observer:\n  ros__parameters: {flat_field: flat.png}\n')
     given = ['--ros-args', '--params-file', str(params), '--params-file', str(other)]
-    camera = {('camera_info_url', 'camera.yaml'): tmp_path}
+    camera = {
+        ('camera_info_url', 'camera.yaml'): tmp_path,
+        ('state_dir', 'here'): tmp_path,
+    }
     assert folders_of_paths(given, '/calibrator') == camera
     flat = {('flat_field', 'flat.png'): tmp_path}
     assert folders_of_paths(given, '/star_observer') == camera | flat
+    of_launch = params.rename(tmp_path / 'launch_params_x1')
+    assert folders_of_paths(['--params-file', str(of_launch)], '/calibrator') == {}
 
 
 def test_sections_of_others_are_no_concern(tmp_path: Path) -> None:

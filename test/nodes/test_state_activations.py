@@ -78,6 +78,16 @@ ACTIVATIONS = {
         'calibration 1 is not active, the gate refuses it now: largest change',
         'b',
     ),
+    'from one that a roll-back made active before a restart': (
+        'activate a; activate b .1; activate c .2; rollback; kill; open A; rollback',
+        'activated again: ',
+        'a',
+    ),
+    'to one that was active when the active one came': (
+        'activate a; activate b .1; activate c .2; rollback; rollback; activate d .1; rollback',
+        'activated again: ',
+        'a',
+    ),
     'to none': ('activate a; rollback', 'there is no calibration before the active one', 'a'),
     # The limits change, and with them what is active.
     'withheld': ('activate a 0.25; limit 0.01; open A; rollback', 'no calibration is active', ''),
@@ -94,7 +104,8 @@ ACTIVATIONS = {
         'not activated, nobody could read it',
         'b',
     ),
-    '1970': ('activate a; clock 0; solve b', 'activated: ', 'b'),
+    'no /clock yet': ('activate a; clock 0; solve b', 'not activated: the ROS clock is 0', 'a'),
+    '1970': ('activate a; clock 1; solve b', 'activated: ', 'b'),
     '2038': (f'activate a; clock {MAX_STAMP_NS}; solve b', 'activated: ', 'b'),
 }
 

@@ -33,10 +33,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcal_ground.child_process import ChildProcess, ProcessEnded
 from starcal_ground.images.time_systems import from_text, SYSTEMS, to_utc_ns
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.errors import errors_as, IngestError, StarcalError
-from starcal_ros.processes import ChildProcess, ProcessEnded
 from starcal_ros.untrusted import read_text, regular_file
 
 if TYPE_CHECKING:

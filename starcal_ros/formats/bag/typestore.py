@@ -17,7 +17,6 @@ from typing import Any, IO
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
-import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -126,38 +125,6 @@ def _typestore_of(type_name: str, definition: str) -> tuple[Typestore | None, st
         return (own if store.hash_rihs01(type_name) == described(type_name)[1] else store), ''
     except Exception as error:
         return None, ' '.join(str(error).split())[:_LONGEST_REASON]
-
-
-def of_this_version(type_name: str, definition: str, data: memoryview) -> memoryview:
-    """
-    CDR of a message of another version of starcal by the definition of this one.
-
-    The fields that it lacks are zeros, as of a sender that does not know them.  Raises BagError as
-    `typestore_of`, and errors of any class for wrong bytes.
-    """
-    store, own = typestore_of(type_name, definition), store_with(type_name)
-    if store is own:
-        return data
-    message = store.deserialize_cdr(data, type_name)
-    return own.serialize_cdr(_filled(own, (Nodetype.NAME, type_name), message), type_name)
-
-
-def _filled(store: Typestore, kind: Any, value: Any = None) -> Any:
-    """Return a value as one of a field of a store; what it lacks, or all for None, is zero."""
-    node, content = kind
-    if node == Nodetype.NAME:
-        fields = store.fielddefs[content][1]
-        return store.types[content](
-            *(_filled(store, of_field, getattr(value, name, None)) for name, of_field in fields)
-        )
-    if node == Nodetype.BASE:
-        return ('' if content[0] == 'string' else 0) if value is None else value
-    item, size = content
-    is_number = item[0] == Nodetype.BASE and item[1][0] != 'string'
-    if value is None:
-        length = size if node == Nodetype.ARRAY else 0
-        value = np.zeros(length, item[1][0]) if is_number else [None] * length
-    return value if is_number else [_filled(store, item, one) for one in value]
 
 
 def check_definition(type_name: str, definition: str) -> dict[str, Any]:

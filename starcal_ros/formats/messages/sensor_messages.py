@@ -314,14 +314,6 @@ def image_of(
         return refused_from_message(message, stamp_offset_s, refused)
 
 
-def image_stamp_ns(raw: codec.RawMessage) -> int:
-    """Stamp of a serialised image; the time of its recording if it cannot be decoded."""
-    try:
-        return codec.stamp_ns(view_image(raw).header.stamp)
-    except ImageRefused:
-        return codec.nearest_stamp_ns(raw.log_time_ns)
-
-
 def refused_from_message(
     message: codec.Message, stamp_offset_s: float, refused: ImageRefused
 ) -> StarObservations:

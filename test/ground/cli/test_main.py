@@ -22,13 +22,13 @@ import numpy as np
 import pytest
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.child_process import module_command
 from starcal_ground.cli import main, node_processes
 from starcal_ground.cli.arguments import EXIT_INTERRUPTED
 from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import COMMANDS, parser
 from starcal_ros.constants import software_version
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.processes import module_command
 from starcal_ros.records import Image
 
 Run = Callable[..., 'tuple[int, str, str]']

@@ -250,6 +250,17 @@ def test_a_prior_that_the_stars_contradict_is_named(
     assert len(reason) <= 200
 
 
+def test_an_assumed_velocity_that_the_stars_contradict_is_not_called_stated() -> None:
+    held = (HeldTerm('velocity_x_m_s', 0.0, -6e4, 8000.0),)
+    found = dataclasses.replace(GOOD, **with_model(held=held, statements=()))
+    (reason,) = reasons(found, GateOptions(max_held_term_sigma=7.4))
+    assert reason.endswith(
+        '(max_held_term_sigma); none was received, that of the Earth was assumed; publish it, or'
+        ' check the date'
+    )
+    assert len(reason) <= 200
+
+
 def test_images_are_numbered_from_one_as_on_the_report() -> None:
     bins = (ResidualBin('image', 7.0, 9.0, 1000, 1.5, 0.01),)
     found = dataclasses.replace(GOOD, **with_model(predictions=bins))

@@ -151,11 +151,18 @@ def test_an_image_that_nothing_explains_keeps_its_attitude(setup: Setup) -> None
     assert abs(found.icrf_from_star_tracker_xyzw[3]) < 1.0
 
 
-def test_out_of_order_images_say_by_how_much(setup: Setup) -> None:
-    track = observe.Track(setup.prior, image().time_ns + 250_000_000)
+@pytest.mark.parametrize(
+    ('late_ns', 'words'),
+    [
+        (250_000_000, '0.250000 s before the last image used'),
+        (0, 'the stamp of the last image used: two publishers on one topic?'),
+    ],
+)
+def test_out_of_order_images_say_by_how_much(setup: Setup, late_ns: int, words: str) -> None:
+    track = observe.Track(setup.prior, image().time_ns + late_ns)
     found, after = observe.observe_next(image(), attitudes(), setup, track)
     assert found.refusal == 'out_of_order'
-    assert found.detail == '0.250000 s before the last image used'
+    assert found.detail == words
     assert (after.geometry, after.latest_ns) == (track.geometry, track.latest_ns)
 
 

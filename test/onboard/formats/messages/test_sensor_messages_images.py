@@ -175,10 +175,7 @@ def test_a_stamp_that_no_message_can_hold_is_refused(sec: int, offset_s: float) 
         (cv2.imencode('.jpg', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
         (cv2.imencode('.png', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
         (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_encoding'),
-        (cv2.imencode('.png', RAMP)[1].tobytes()[:40], 'bad_layout'),
-        (png(60000, 60000), 'bad_layout'),
         (png(2**31 - 1, 2**31 - 1), 'bad_layout'),
-        (png(4, 3, bytes(10**7)), 'bad_layout'),
     ],
 )
 def test_compressed_refusals(data: bytes, reason: str) -> None:

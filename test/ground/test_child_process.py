@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-from starcal_ros.processes import module_command
+from starcal_ground.child_process import module_command
 
 ROOT = Path(__file__).parents[2]
 TOOL = 'starcal_ground.cli.main'
