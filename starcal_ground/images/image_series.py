@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ground.images import fits_facts
+from starcal_ground.images.fits_facts import number_of
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import IngestError
-from starcal_ros.formats.fits_keywords import Card, number_of, value_of
+from starcal_ros.formats.fits_keywords import Card, value_of
 from starcal_ros.formats.image_files import FileImage, read_image
 from starcal_ros.formats.messages.sensor_messages import of_mosaic
 
