@@ -26,7 +26,7 @@ BY_ROWS, BY_COLUMNS = 'mirrored top to bottom', 'mirrored left to right'
 """Words of the provenance of a calibration whose pixels are those of mirrored image files."""
 _ROWS = 128  # rows of a map made at once: those of 5 megapixels together take a gigabyte
 _OUTSIDE_PX = -1e4  # cv2.remap gives such a pixel no light; it does not define that of NaN
-_ENDINGS = ('.png', '.tif', '.tiff', '.jpg', '.jpeg')  # of files that are written as they were
+_ENDINGS = ('.png', '.tif', '.tiff', '.jpg', '.jpeg')  # kinds of files that keep their kind
 
 
 def straight_camera(camera: CameraModel) -> CameraModel:

@@ -94,7 +94,7 @@ def check_field_of_stars(
     fx, _, fy = (float(value) for value in camera.intrinsics[:3])
     field_sr = min(camera.width * camera.height / (fx * fy), 4.0 * math.pi)
     faintest = catalog.direction_icrs[-_FAINTEST:]
-    chord = math.sqrt(field_sr / math.pi)  # of a cap of this area: its radius
+    chord = math.sqrt(field_sr / math.pi)  # radius of a cap of this area
     inside = catalog.tree.query_ball_point(faintest, chord, return_length=True)
     in_field = max(float(inside.sum()) / max(len(faintest), 1) - 1.0, 0.0)
     if in_field >= _FEWEST_STARS:

@@ -57,7 +57,7 @@ _LOOK_S = 0.5  # period of checks for the service and the timeout
 _LONGEST_PAUSE_S = 300.0  # longest pause after the time limit, before a driver is called again
 _RETRY_S = 1.0  # after a failed write
 _STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
-_MOST_CHARACTERS = 200  # of an answer, a line or two on a terminal; the log has all
+_MOST_CHARACTERS = 200  # longest answer: two lines of a terminal; the log has all of it
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
 

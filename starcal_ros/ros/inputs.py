@@ -32,7 +32,7 @@ def with_reliability(qos: QoSProfile, reliability: ReliabilityPolicy) -> QoSProf
     return QoSProfile(depth=qos.depth, durability=qos.durability, reliability=reliability)
 
 
-_OWN_IMAGES = '/annotated_image'  # of a star observer: no driver sends them
+_OWN_IMAGES = '/annotated_image'  # published by a star observer, never by a driver
 _NAMED = 2  # topics: a third does not help to find the right one
 
 

@@ -37,7 +37,7 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 _MOST_SIP_ORDER = 9  # keywords have one digit for it
 _GOOD_PX = 5e-3  # half of the centroid noise of a bright star
 _MOST_DEG = 85.0  # from the middle: a gnomonic projection ends at 90 degrees
-_MOST_ORDER_OF_SKY = 3  # of the polynomial to the catalog: refraction to 0.1 arcsec at 60 degrees
+_MOST_ORDER_OF_SKY = 3  # follows refraction to 0.1 arcsec 60 degrees from the zenith
 _STARS_A_TERM = 3  # for each of its coefficients: places of the catalog have errors of their own
 
 
