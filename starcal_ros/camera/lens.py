@@ -65,7 +65,7 @@ class LensModel:
     fewest : int
         Least number of coefficients in a camera file, without the last ones, which are zero.
     opencv : str
-        Its namespace in OpenCV: ``pinhole`` (none) or ``fisheye``.
+        Its namespace in OpenCV: ``pinhole`` (none) or ``fisheye``; empty: no such model.
     mrcal, giant : str
         Name of the model in mrcal, and class in GIANT; empty: it has none.
     equations : tuple of str
@@ -84,7 +84,7 @@ class LensModel:
     is_angular: bool = False
     is_redundant: bool = False
     is_guarded: bool = True
-    opencv: str = 'pinhole'
+    opencv: str = ''
     mrcal: str = ''
     giant: str = ''
     ros_aliases: tuple[str, ...] = ()
@@ -402,6 +402,7 @@ def _of_opencv(
         _RATIONAL_EQUATIONS if is_rational else _BROWN_EQUATIONS,
         is_redundant=is_rational,
         is_guarded=is_rational,
+        opencv='pinhole',
         mrcal=mrcal,
         giant=giant,
         ros_aliases=('thin_prism', 'thin_prism_fraunhofer') if is_rational else (),

@@ -273,10 +273,10 @@ def estimate_with_smallest_lens(
     The model of the prior camera comes first, then the others by the number of their coefficients.
     A model is accepted where the likelihood of a field beside it is not larger than chance makes
     it: structure over the detector, which a model does not lose by having more coefficients alone.
-    A further model is left out if the stars show one of its coefficients less than the prior of
-    any lens does, as in a field of a degree.  Where none is accepted, the model with the least
-    evidence for a field is, each coefficient counted as 2.  A model that cannot be estimated is
-    left out.
+    Where none is accepted, the model with the least evidence for a field is, each coefficient
+    counted as 2, of those whose coefficients the stars show more than the prior of any lens does.
+    A model of another kind than that of the prior camera is taken only if they do.  A model that
+    cannot be estimated is left out.
 
     Raises
     ------
@@ -301,17 +301,20 @@ def estimate_with_smallest_lens(
         except TooFewObservations as error:
             shortage = error if prior.camera.has_lens(model) else shortage
             continue  # the stars do not determine this model
-        if best is not None and not (
-            estimate.termination == 'converged' and _is_shown_by_stars(estimate)
-        ):
-            continue  # lost on the way, or not for these stars: its lack of a field means nothing
+        if estimate.termination != 'converged' and best is not None:
+            continue  # lost on the way: its lack of a field means nothing
+        # Coefficients that the stars do not show stay where they started: at those of the prior in
+        # a model that contains its model, where the conversion has put them in another one.
+        is_shown = best is None or _is_shown_by_stars(estimate)
+        if not (is_shown or worst_px == 0.0):
+            continue
         camera = estimate.geometry.camera
         if not np.isfinite(line_of_sight(camera, pixel_grid(camera, 15, 15))).all():
             continue  # beyond the stars it folds
         ratio = estimate.posterior.field.likelihood_ratio
         if ratio < _CHANCE:
             return estimate, started
-        if ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients) < least:
+        if is_shown and ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients) < least:
             least = ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients)
             best = estimate, started
     if best is None:

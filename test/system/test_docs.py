@@ -103,6 +103,7 @@ OTHERS = {
     'xdg-open',
     'export',
     'kill',
+    'sqlite3',
 }
 
 

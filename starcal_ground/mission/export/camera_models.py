@@ -45,7 +45,8 @@ def opencv_yaml(calibration: Calibration, _asked: Request) -> exported.Content:
     ``distortion_coefficients`` are for ``cv2.projectPoints``, or for ``cv2.fisheye`` if
     ``lens_model`` is ``fisheye``.
     """
-    camera, made = exported.fitted(calibration, calibration.geometry.camera.model, ('skew',))
+    own = calibration.geometry.camera.model
+    camera, made = exported.fitted(calibration, own if LENSES[own].opencv else _LARGEST, ('skew',))
     _, D = ros_distortion(camera.model, camera.distortion)
     rotation = calibration.geometry.star_tracker_from_camera.inv().as_matrix()
     aligned = calibration.has_alignment

@@ -11,6 +11,9 @@ from random_pointings import displaced, estimated, of_random_pointings, WIDTH  #
 from scipy.spatial.transform import Rotation
 
 from bench.narrow import bound_px, scenario_of
+from starcal_ground import calibrate
+from starcal_ground.mission.export.camera_models import opencv_yaml
+from starcal_ground.mission.export.export_formats import Request
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario, scenario
 from starcal_ros.arrays import Floats
@@ -152,6 +155,16 @@ def test_a_lens_model_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None
     # Errors of 1.2 of their sigma, rms over the detector, come by chance in one of ten.
     assert map_error_px(camera, made.truth.camera) < 2.0 * np.sqrt(np.mean(sigma_px**2)) < 0.05
     assert lens.from_ros_distortion('division', [0.08]) == ('division', np.array([0.08]))
+    # OpenCV has no such model: the nearest one, with what that costs.
+    prior = prior_of(made, 'division')
+    whole = calibrate(true_observations(made).images, prior, estimate=ESTIMATE['division'])
+    content = opencv_yaml(whole, Request())
+    (text,) = content.files.values()
+    assert 'lens_model: pinhole\n' in str(text) and 'cols: 12' in str(text)
+    assert [loss.part for loss in content.losses] == [
+        'lens model division (here thin_prism)',
+        'skew',
+    ]
 
 
 @pytest.mark.slow
