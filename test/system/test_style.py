@@ -18,7 +18,6 @@ FILES = sorted(
 LONGEST_FUNCTION_LINES = 77
 SUBJECTS = {  # tests of several modules together
     *('activations', 'awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills'),
-    'one_objective',
     *(
         'lens_models',
         'motion',
