@@ -34,7 +34,7 @@ _SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other wor
 _ACK_S = 30.0
 _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS down
 # A node is discovered subscription by subscription; messages before a match are lost.
-_SETTLED_S = 0.5
+_SETTLED_S, _UNMATCHED_S = 0.5, 5.0
 _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (
     message_codec.CALIBRATION_TYPE,
@@ -158,24 +158,34 @@ class BagPlayer(printable_log.PrintableLog):
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
 
         def is_read(name: str) -> bool:
-            if not self._players[name].get_subscription_count():
-                return False
+            matched = self._players[name].get_subscription_count()
+            if not (matched and awaits_answers):
+                return bool(matched)
             # Other nodes read images too, and may start before the one that observes the stars.
-            return not awaits_answers or bool(self._readers(name) & self._answering())
+            return bool(set(self._readers(name)) & self._answering())
 
-        matches: list[int] = []
+        def settled_s() -> float:
+            """Time without a change after which all subscriptions are taken to be matched."""
+            needs = [*needed, *others] if awaits_answers else []
+            ends = [(len(self._readers(name)), self._players[name]) for name in needs]
+            # The graph lists a subscription before messages reach it, and for a while after the
+            # death of its node, when it is never matched.
+            is_matched = all(n <= one.get_subscription_count() for n, one in ends)
+            return _SETTLED_S if is_matched else _UNMATCHED_S
+
+        before: tuple[list[int], list[str]] | None = None
         since_s = time.monotonic()
         while True:
             now_s = time.monotonic()
             counts = [player.get_subscription_count() for player in self._players.values()]
-            if counts != matches:
-                matches, since_s = counts, now_s
             missing = [
                 *(name for name in needed if not is_read(name)),
                 *([] if not others or any(map(is_read, others)) else [' or '.join(others)]),
                 *([other] if other and not self._other_subscribers(other) else []),
             ]
-            if not missing and now_s >= since_s + _SETTLED_S:
+            if (counts, missing) != before:
+                before, since_s = (counts, missing), now_s
+            if not missing and now_s >= since_s + settled_s():
                 return
             if now_s > deadline_s:
                 if missing:
@@ -195,11 +205,11 @@ class BagPlayer(printable_log.PrintableLog):
         count = int(self.count_subscribers(self.resolve_topic_name(topic)))
         return count - self._is_observations(topic)
 
-    def _readers(self, topic: str) -> set[tuple[str, str]]:
-        """Nodes that subscribe to a topic of the bag, each by namespace and name."""
-        name = self._players[topic].topic_name
-        ends = self.get_subscriptions_info_by_topic(name)
-        return {(end.node_namespace, end.node_name) for end in ends}
+    def _readers(self, topic: str) -> list[tuple[str, str]]:
+        """Namespace and name of the node of each subscription to a topic of the bag."""
+        (kind,) = (one.type_name for one in self._topics if one.name == topic)
+        ends = self.get_subscriptions_info_by_topic(self._players[topic].topic_name)
+        return [(end.node_namespace, end.node_name) for end in ends if end.topic_type == kind]
 
     def _answering(self) -> set[tuple[str, str]]:
         """Nodes that publish observations, each by namespace and name."""
