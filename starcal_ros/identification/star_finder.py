@@ -9,7 +9,6 @@ displaced from the position predicted by the others is refused.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -161,9 +160,21 @@ def observe_stars(
         exposure.site,
     )
     _check_catalog(prediction, exposure, geometry, search)
-    predicted_px = _find(image.pixels, background, prediction, geometry, search)
+    predicted_px, sources, streak = _find(image.pixels, background, prediction, geometry, search)
+    # Cosmic rays and hot pixels may be brighter than the stars, and are sharper: the median of the
+    # sources bears some, not most.
+    off_px, _ = cKDTree(np.nan_to_num(predicted_px, nan=-1e6)).query(sources.xy_px)
+    is_star = off_px < _ON_STAR_PX
+    of_brightest = is_star[:_SHOW_PSF]
+    are_most = 2 * np.count_nonzero(of_brightest) > len(of_brightest)
+    stars = sources if are_most else sources.select(is_star)
+    model = model_image(image.pixels, background, stars, search.centroid, streak, sources)
+    if model.psf is None:
+        # The brightest stars may all be saturated: fit the PSF to fainter ones.
+        sources = detection.detect(image.pixels, background)
+        sources, streak = without_streaks(image.pixels, background, sources, geometry.camera)
+        model = model_image(image.pixels, background, sources, search.centroid, streak)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
-    model = _model(image.pixels, background, prediction, search.centroid)
     return measure_predicted(exposure, prediction, model, None, search)
 
 
@@ -355,9 +366,9 @@ def _find(
     prediction: Prediction,
     geometry: CameraGeometry,
     search: StarSearch,
-) -> Floats:
+) -> tuple[Floats, detection.Sources, Streak | None]:
     """
-    Predicted pixels (n, 2) corrected to match the sources of the image.
+    Predicted pixels (n, 2) corrected to match the sources, those sources, and their streaks.
 
     The brighter stars are searched near their predictions first; without a match, the whole image
     is searched over the full range of alignment errors.
@@ -365,58 +376,27 @@ def _find(
     Raises ImageRefused ``no_stars``, ``smeared`` or ``no_match``.
     """
     camera = geometry.camera
-    with contextlib.suppress(ImageRefused):
-        near, _ = _sources_near(pixels, background, prediction)
-        return acquire(prediction, near, geometry, float(SEARCH_RADIUS_PX), _NEAREST_ROLL_RAD)
-    sources, _ = without_streaks(pixels, background, detection.detect(pixels, background), camera)
+    inside = in_image(prediction.xy_px, camera.width, camera.height)
+    near = detection.detect_near(
+        pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX
+    )
+    try:
+        reach_px = float(SEARCH_RADIUS_PX)
+        near, streak = without_streaks(pixels, background, near, camera)
+        matched_px = acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD)
+        return matched_px, near, streak
+    except ImageRefused:
+        pass
+    sources, streak = without_streaks(
+        pixels, background, detection.detect(pixels, background), camera
+    )
     if len(sources.snr) < _MIN_STARS:
         raise ImageRefused(
             'no_stars', f'{counted(len(sources.snr), "star-like source")}, {_MIN_STARS} needed'
         )
     tilt_rad, roll_rad = search.reach_rad(camera)
     reach_px = tilt_rad * float(camera.parameters[0])
-    return acquire(prediction, sources, geometry, reach_px, roll_rad)
-
-
-def _sources_near(
-    pixels: Pixels, background: detection.Background, prediction: Prediction
-) -> tuple[detection.Sources, Streak | None]:
-    """Star-like sources about the brightest predictions, and their streaks."""
-    camera = prediction.camera
-    inside = in_image(prediction.xy_px, camera.width, camera.height)
-    near = detection.detect_near(
-        pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX
-    )
-    return without_streaks(pixels, background, near, camera)
-
-
-def _model(
-    pixels: Pixels,
-    background: detection.Background,
-    matched: Prediction,
-    options: CentroidOptions,
-) -> ImageModel:
-    """
-    PSF, pixel noise and saturation of an image by the sources about its matched predictions.
-
-    All priors that lead to the match give the same sources, and so the same judgement of a star.
-    """
-    sources, streak = _sources_near(pixels, background, matched)
-    # Cosmic rays and hot pixels may be brighter than the stars, and are sharper: the median of the
-    # sources bears some, not most.
-    off_px, _ = cKDTree(np.nan_to_num(matched.xy_px, nan=-1e6)).query(sources.xy_px)
-    is_star = off_px < _ON_STAR_PX
-    of_brightest = is_star[:_SHOW_PSF]
-    are_most = 2 * np.count_nonzero(of_brightest) > len(of_brightest)
-    stars = sources if are_most else sources.select(is_star)
-    model = model_image(pixels, background, stars, options, streak, sources)
-    if model.psf is not None:
-        return model
-    # The brightest stars may all be saturated: fit the PSF to fainter ones.
-    sources, streak = without_streaks(
-        pixels, background, detection.detect(pixels, background), matched.camera
-    )
-    return model_image(pixels, background, sources, options, streak)
+    return acquire(prediction, sources, geometry, reach_px, roll_rad), sources, streak
 
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:
