@@ -71,12 +71,6 @@ def _by(module: str, name: str) -> Maker:
     return make
 
 
-def _wcs(made: Calibration, asked: Request) -> Content:
-    from starcal_ground.mission.export import wcs
-
-    return wcs.wcs_of_images(made, asked.observations, asked.catalog)
-
-
 FORMATS = (
     Format(
         'spice',
@@ -102,7 +96,7 @@ FORMATS = (
         '`image0001.wcs` and so on, in the order of `observations.mcap`: places of the catalog at'
         ' the date of the image, by its stars; `SIPERR` and `STARRMS` are the errors, px (below)',
         'sigma; fields beyond 170 degrees',
-        _wcs,
+        _by('wcs', 'wcs_of_images'),
         needs_observations=True,
     ),
     Format(

@@ -24,6 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export import exported
+from starcal_ground.mission.export.image_attitude import attitude_by_stars
 from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded, short
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
@@ -31,9 +32,7 @@ from starcal_ros.camera.detector_field import COSINE_DOMAIN
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.estimation.problem import camera_at
-from starcal_ros.records import Calibration, StarObservations
-from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
+from starcal_ros.records import Calibration
 
 if TYPE_CHECKING:
     from starcal_ground.mission.export.export_formats import Request
@@ -334,36 +333,7 @@ def _wrapped(text: str) -> list[str]:
 
 
 CK_FILE = 'camera.bc'
-_LEAST_STARS = 3
-OUTLIER_SIGMA = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
 _INTERNAL_NAME = 'starcal: attitude of the calibrated camera'
-
-
-def attitude_by_stars(
-    calibration: Calibration, image: StarObservations
-) -> tuple[Rotation, float] | None:
-    """
-    Attitude icrf_from_camera of an image, and its 1-sigma across the boresight in px.
-
-    None for an image that was refused or has fewer than three stars.
-    """
-    if image.refusal or len(image) < _LEAST_STARS:
-        return None
-    degc = image.temperature_degc
-    geometry = camera_at(calibration, degc) if np.isfinite(degc) else calibration.geometry
-    measured = line_of_sight(geometry.camera, image.measured_px)
-    information = 1.0 / image.covariance_px2[:, [0, 2]].mean(axis=1)
-    used = np.isfinite(measured).all(axis=1)
-    for _ in range(2):  # the second without the stars that the first does not fit
-        if used.sum() < _LEAST_STARS:
-            return None
-        rotation, _ = Rotation.align_vectors(
-            image.direction_icrf[used], measured[used], information[used]
-        )
-        off = np.linalg.norm(rotation.apply(measured) - image.direction_icrf, axis=1)
-        off = off * np.sqrt(information)
-        used = used & (off <= OUTLIER_SIGMA * RAYLEIGH_TO_SIGMA * np.median(off[used]))
-    return rotation, float(1.0 / np.sqrt(information[used].sum()))
 
 
 def ck_of_images(calibration: Calibration, asked: Request) -> exported.Content:

@@ -9,12 +9,12 @@ the velocity was, and refraction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import io
 import json
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,42 +22,47 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from starcal_ground.mission.export import exported
-from starcal_ground.mission.export.spice import attitude_by_stars, OUTLIER_SIGMA
+from starcal_ground.mission.export.image_attitude import (
+    attitude_by_stars,
+    camera_of_image,
+    without_outliers,
+)
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_sigma_arcsec
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import needing, ProductError
-from starcal_ros.estimation.problem import camera_at
 from starcal_ros.records import Calibration, StarObservations
-from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 from starcal_ros.sky.astrometry import julian_year
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+
+if TYPE_CHECKING:
+    from starcal_ground.mission.export.export_formats import Request
 
 _MOST_SIP_ORDER = 9  # keywords have one digit for it
 _GOOD_PX = 5e-3  # half of the centroid noise of a bright star
 _MOST_DEG = 85.0  # from the middle: a gnomonic projection ends at 90 degrees
-_MOST_ORDER_OF_SKY = 3  # follows refraction to 0.1 arcsec 60 degrees from the zenith
+# Refraction 60 degrees from the zenith is followed to 0.03 arcsec over a field of 10 degrees, to
+# 0.6 over one of 20; the rest is in STARRMS.
+_MOST_ORDER_OF_SKY = 3
+_TOO_WIDE = '--to wcs: the field is too wide for a gnomonic projection: use --to opencv'
 _STARS_A_TERM = 3  # for each of its coefficients: places of the catalog have errors of their own
 
 
-def wcs_of_images(
-    calibration: Calibration, observations: Sequence[StarObservations], file: Path | None = None
-) -> exported.Content:
+def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
     """
     A FITS header for each image with stars.
 
-    ``file`` is the catalog that identified them; None: the one of the options of the calibration.
     Raises ProductError if no image has three stars, if the catalog lacks stars of an image, or if
     the field is too wide for a gnomonic projection.  Raises CatalogError for a bad catalog.
     """
     with needing('mission', ProductError, '--to wcs'):
         from astropy.io import fits
     stated = json.loads(calibration.provenance.get('options', '{}')).get('catalog', '')
-    catalog = load_catalog(file or (Path(stated) if stated else None))
+    catalog = load_catalog(asked.catalog or (Path(stated) if stated else None))
     files: dict[str, bytes] = {}
     worst_px = 0.0
-    for number, image in enumerate(observations, 1):
+    for number, image in enumerate(asked.observations, 1):
         attitude = attitude_by_stars(calibration, image)
         if attitude is None:
             continue
@@ -116,7 +121,7 @@ def directions_icrf(
     attitude = attitude_by_stars(calibration, image)
     if attitude is None:
         raise ValueError('image: fewer than three stars determine no attitude')
-    camera = camera_at(calibration, image.temperature_degc).camera
+    camera = camera_of_image(calibration, image)
     directions = attitude[0].apply(line_of_sight(camera, np.asarray(pixels_px, np.float64)))
     off = attitude[0].apply(line_of_sight(camera, image.measured_px)) - image.direction_icrf
     variance = image.covariance_px2[:, [0, 2]].mean(axis=1) / camera.parameters[0] ** 2
@@ -199,7 +204,7 @@ def _system(
     icrf_from_camera: Rotation,
     catalog: StarCatalog,
 ) -> _System:
-    camera = camera_at(calibration, image.temperature_degc).camera
+    camera = camera_of_image(calibration, image)
     rows, known = catalog.rows_of(image.catalog_id)
     if not known.all():
         raise ProductError(
@@ -211,6 +216,8 @@ def _system(
     middle = icrf_from_camera.apply(line_of_sight(camera, crpix_px[0]))
     apparent = _gnomonic(middle, image.direction_icrf)
     shift = _gnomonic(middle, places) - apparent
+    if not np.isfinite(shift).all():
+        raise ProductError(_TOO_WIDE)
     terms = (n for n in range(_MOST_ORDER_OF_SKY, -1, -1))
     order = next(n for n in terms if _STARS_A_TERM * len(_exponents(n, 0)) <= len(image) or n == 0)
     to_catalog = _fitted(apparent, shift, order, 0)
@@ -224,7 +231,7 @@ def _system(
     pixels = pixel_grid(camera, exported.GRID, exported.GRID).reshape(-1, 2)
     plane = _gnomonic(centre, directions(pixels))
     if not np.isfinite(plane).all():
-        raise ProductError('--to wcs: the field is too wide for a gnomonic projection')
+        raise ProductError(_TOO_WIDE)
     stars_plane = _gnomonic(centre, places)
     for sip_order in range(2, _MOST_SIP_ORDER + 1):
         system = _polynomials(centre, crpix_px, pixels - crpix_px, plane, sip_order)
@@ -232,8 +239,8 @@ def _system(
             break
     off_px = crpix_px + system.from_plane(stars_plane) - image.measured_px
     distance_px = np.linalg.norm(off_px, axis=1)
-    good = distance_px <= OUTLIER_SIGMA * RAYLEIGH_TO_SIGMA * np.median(distance_px)
-    return replace(system, stars_px=float(np.sqrt(np.mean(off_px[good] ** 2))))
+    good = off_px[without_outliers(distance_px)]
+    return replace(system, stars_px=float(np.sqrt(np.mean(good**2))))
 
 
 def _polynomials(

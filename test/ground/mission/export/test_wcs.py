@@ -19,11 +19,12 @@ from starcal_ground.bags.reader import read_observations
 from starcal_ground.mission.export.export_formats import export, Request
 from starcal_ground.products import OBSERVATIONS_FILE, OBSERVATIONS_TOPIC
 from starcal_ground.simulation.scenario import scenario, scene
+from starcal_ground.undistortion import straight_camera
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.records import Calibration, StarObservations, TemperatureTerms
 from starcal_ros.sky.catalog import load_catalog
 
 
@@ -89,6 +90,31 @@ def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
     with pytest.raises(ValueError, match='fewer than three stars'):
         directions_icrf(made, images[0].select(np.arange(len(images[0])) < 2), [[0.0, 0.0]])
+
+
+def test_an_image_of_unknown_temperature_has_the_camera_of_the_calibration(
+    made: Calibration, images: tuple[StarObservations, ...]
+) -> None:
+    thermal = TemperatureTerms(
+        reference_degc=20.0, focal_per_degc=(1e-5,), focal_per_degc_sigma=(1e-6,)
+    )
+    changing = dataclasses.replace(made, temperature=thermal)
+    unknown = dataclasses.replace(images[0], temperature_degc=float('nan'))
+    towards, _ = directions_icrf(changing, unknown, [[320.0, 256.0]])
+    assert towards.tolist() == directions_icrf(made, unknown, [[320.0, 256.0]])[0].tolist()
+
+
+def test_a_field_beyond_a_gnomonic_projection_is_named(
+    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    wide = straight_camera(made.geometry.camera).replace(
+        fx=25.0, fy=25.0
+    )  # 87 degrees in a corner
+    seen = line_of_sight(wide, images[0].measured_px)
+    geometry = dataclasses.replace(made.geometry, camera=wide)
+    asked = Request(observations=[dataclasses.replace(images[0], direction_icrf=seen)])
+    with pytest.raises(ProductError, match='too wide for a gnomonic projection: use'):
+        export(dataclasses.replace(made, geometry=geometry), 'wcs', tmp_path, asked)
 
 
 def test_stars_of_another_catalog_are_named(
