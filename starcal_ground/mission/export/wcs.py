@@ -32,6 +32,7 @@ from starcal_ros.assessment.lookup import line_of_sight_sigma_arcsec
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import needing, ProductError
+from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.sky.astrometry import julian_year
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
@@ -59,7 +60,10 @@ def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
     with needing('mission', ProductError, '--to wcs'):
         from astropy.io import fits
     stated = json.loads(calibration.provenance.get('options', '{}')).get('catalog', '')
-    catalog = load_catalog(asked.catalog or (Path(stated) if stated else None))
+    file = asked.catalog or (Path(stated) if stated else None)
+    if file is not None and not file.exists():
+        raise ProductError(f'--to wcs: {file}: no such catalog; --catalog FILE states where it is')
+    catalog = load_catalog(file)
     files: dict[str, bytes] = {}
     worst_px = 0.0
     for number, image in enumerate(asked.observations, 1):
@@ -68,7 +72,8 @@ def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
             continue
         system = _system(calibration, image, attitude[0], catalog)
         header = fits.Header(system.cards())
-        header['DATE-OBS'] = utc_text(image.time_ns).removesuffix(' UTC').replace(' ', 'T')
+        if TIMES not in calibration.provenance:  # else the stamps are no times of exposure
+            header['DATE-OBS'] = utc_text(image.time_ns).removesuffix(' UTC').replace(' ', 'T')
         for line in exported.origin(calibration):
             header['COMMENT'] = exported.ascii_line(line)
         memory = io.BytesIO()

@@ -24,6 +24,7 @@ from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_calibration
+from starcal_ros.pipeline.solve import TIMES
 from starcal_ros.records import Calibration, StarObservations, TemperatureTerms
 from starcal_ros.sky.catalog import load_catalog
 
@@ -125,3 +126,18 @@ def test_stars_of_another_catalog_are_named(
         export(made, 'wcs', tmp_path, Request(observations=[strange]))
     with pytest.raises(ProductError, match='no image with stars'):
         export(made, 'wcs', tmp_path, Request())
+    asked = Request(observations=images, catalog=tmp_path / 'gone.npz')
+    with pytest.raises(ProductError, match='gone.npz: no such catalog; --catalog FILE'):
+        export(made, 'wcs', tmp_path, asked)
+
+
+def test_images_without_a_time_have_no_date(
+    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    undated = dataclasses.replace(made, provenance={**made.provenance, TIMES: 'of the file'})
+    dates = []
+    for one, folder in ((made, tmp_path / 'a'), (undated, tmp_path / 'b')):
+        folder.mkdir()
+        export(one, 'wcs', folder, Request(observations=images[:1]))
+        dates.append('DATE-OBS' in fits.getheader(folder / 'image0001.wcs'))
+    assert dates == [True, False]
