@@ -92,7 +92,7 @@ def main() -> None:
         copies: Queue[Path] = Queue()
         for k in range(os.cpu_count() or 1):
             copies.put(_copy(Path(folder, str(k))))
-        tests = _tests(given.contexts or _contexts(copies.queue[0]), Path(folder, '0'))
+        tests = _tests(given.contexts or _contexts(copies.queue[0]))
         lines = given.output.read_text().splitlines() if given.output.exists() else []
         killed_by = {row['mutant']: row['killed_by'] for row in map(json.loads, lines)}
         todo = [mutant for mutant in drawn if str(mutant) not in killed_by]
@@ -148,17 +148,17 @@ def _contexts(copy: Path) -> Path:
     return data
 
 
-def _tests(contexts: Path, copy: Path) -> Tests:
+def _tests(contexts: Path) -> Tests:
     """Tests that ran each line, by ``path:line``: those first that ran the fewest lines."""
     data = coverage.CoverageData(str(contexts))
     data.read()
     by_line: dict[str, set[str]] = {}
     sizes: dict[str, int] = {}
     for measured in data.measured_files():
-        path = 'starcal_ros' + measured.split('starcal_ros', 1)[1]
-        for line, names in data.contexts_by_lineno(measured).items():
+        _, package, path = measured.rpartition('starcal_ros/')
+        for line, names in data.contexts_by_lineno(measured).items() if package else ():
             ran = {name.split('|')[0] for name in names if name}
-            by_line[f'{path}:{line}'] = ran
+            by_line[f'{package}{path}:{line}'] = ran
             for test in ran:
                 sizes[test] = sizes.get(test, 0) + 1
     return {line: sorted(ran, key=sizes.__getitem__) for line, ran in by_line.items()}
