@@ -8,16 +8,19 @@ notebook are copied into docs/generated/, and links between documents are led to
 
 from __future__ import annotations
 
+from html.parser import HTMLParser
 import json
 import os
 from pathlib import Path
 import re
 import shutil
 from typing import TYPE_CHECKING
+from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 
 from docutils import nodes
 from latex2mathml.converter import convert
+from sphinx.errors import SphinxError
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -56,6 +59,9 @@ highlight_language = 'none'  # a fence without a name is output of the tool
 default_role = 'py:obj'
 
 autosummary_generate = True
+# True, the default, makes the pages of sources link back to names of starcal_ground that the pages
+# of modules do not have.
+viewcode_follow_imported_members = False
 templates_path = ['templates']
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'  # the signature is enough: numpydoc's sections have shapes and units
@@ -136,9 +142,52 @@ def write_equation(translator: HTML5Translator, node: nodes.Element) -> None:
     raise nodes.SkipNode
 
 
+class Page(HTMLParser):
+    """Links of an HTML page, and the anchors that links may lead to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links: set[str] = set()
+        self.anchors = {''}
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Take the links and the anchor of a tag."""
+        values = dict(attrs)
+        self.links |= {values.get('href') or '', values.get('src') or ''} - {''}
+        self.anchors.add(values.get('id') or '')
+
+
+def broken_links(folder: Path) -> list[str]:
+    """Links of the pages of a site to files or anchors of the site that do not exist."""
+    root = str(folder.resolve())
+    files = {str(path) for path in Path(root).rglob('*')}
+    pages = {path: Page(Path(path).read_text()) for path in files if path.endswith('.html')}
+    broken = []
+    for path, page in pages.items():
+        for link in sorted(page.links):
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            name, anchor = unquote(parts.path), unquote(parts.fragment)
+            target = os.path.normpath(os.path.join(os.path.dirname(path), name)) if name else path
+            anchors = pages[target].anchors if target in pages else {anchor}
+            if target not in files or anchor not in anchors:
+                broken.append(f'{os.path.relpath(path, root)}: {link}')
+    return broken
+
+
+def check_links(app: Sphinx, error: Exception | None) -> None:
+    """Fail if a link within the site is broken: Sphinx checks those of the documents only."""
+    broken = [] if error else broken_links(Path(app.outdir))
+    if broken:
+        raise SphinxError(f'{len(broken)} broken links, such as\n' + '\n'.join(broken[:10]))
+
+
 def setup(app: Sphinx) -> None:
     """Sphinx calls this."""
     app.add_html_math_renderer('mathml', (write_equation, None), (write_equation, None))
     app.connect('autodoc-process-docstring', show_examples)
     app.connect('builder-inited', write_copies, priority=100)  # before autosummary looks for files
     app.connect('source-read', lead_links)
+    app.connect('build-finished', check_links)

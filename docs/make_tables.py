@@ -77,17 +77,20 @@ def fact_table() -> str:
 
 
 TABLES = {
-    'icd.md': {
-        'needed fields of observations': needed_fields(),
+    'nodes.md': {'needed fields of observations': needed_fields()},
+    'parameters.md': {
         'basic parameters': parameter_table(*OPTION_CLASSES, *NODE_OPTION_CLASSES, basic=True),
         'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
         'parameters of star_observer': parameter_table(ObserverOptions),
         'parameters of calibrator': parameter_table(CalibratorOptions),
         'parameters of bag_player': parameter_table(PlayerOptions),
+    },
+    'diagnostics.md': {
         'reasons to refuse an image': reason_table(IMAGE_REFUSALS),
         'reasons to leave out a star': reason_table(STAR_REFUSALS),
     },
-    'mission.md': {'export formats': format_table(), 'facts of FITS headers': fact_table()},
+    'mission_import.md': {'facts of FITS headers': fact_table()},
+    'mission_export.md': {'export formats': format_table()},
 }
 
 

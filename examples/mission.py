@@ -10,38 +10,41 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 from pathlib import Path
+import shutil
+import subprocess
 import sys
+from typing import Any
 
 from astropy.io import fits
+from mcap_ros2.reader import read_ros2_messages
 import numpy as np
 import spiceypy
 import yaml
 
 import starcal_ground
-from starcal_ground.bags import reader
-from starcal_ground.cli.main import main as starcal
-from starcal_ros.records import Image
 
 
-def utc(time_ns: int) -> str:
-    """Date and time to the nanosecond."""
-    seconds, rest_ns = divmod(time_ns, 10**9)
-    return f'{datetime.fromtimestamp(seconds, timezone.utc):%Y-%m-%dT%H:%M:%S}.{rest_ns:09d}'
+def utc(stamp: Any) -> str:
+    """Date and time of a ROS stamp, to the nanosecond."""
+    seconds = datetime.fromtimestamp(stamp.sec, timezone.utc)
+    return f'{seconds:%Y-%m-%dT%H:%M:%S}.{stamp.nanosec:09d}'
 
 
 def write_mission_files(bag: Path, folder: Path) -> None:
     """Write the images of a bag as FITS files and its attitudes as an AEM."""
-    for number, image in enumerate(reader.read_images([bag], '/opnav/image_raw')):
-        assert isinstance(image, Image)
-        hdu = fits.PrimaryHDU(image.pixels)
-        hdu.header['DATE-AVG'] = utc(image.time_ns)
-        hdu.writeto(folder / f'{number:03d}.fits', overwrite=True)
     samples = []
-    for raw in reader.read_raw([bag], ['/star_tracker/attitude']):
-        message = reader.decode(raw)
-        stamp, q = message.header.stamp, message.quaternion
-        date = utc(stamp.sec * 10**9 + stamp.nanosec)
-        samples.append((date, f'{date} {q.x!r} {q.y!r} {q.z!r} {q.w!r}'))
+    (file,) = bag.glob('*.mcap')
+    for message in read_ros2_messages(file):
+        ros = message.ros_msg
+        if message.channel.topic == '/opnav/image_raw':
+            order = '>' if ros.is_bigendian else '<'
+            pixels = np.frombuffer(ros.data, f'{order}u2').reshape(ros.height, ros.width)
+            hdu = fits.PrimaryHDU(pixels)
+            hdu.header['DATE-AVG'] = utc(ros.header.stamp)
+            hdu.writeto(folder / f'{ros.header.stamp.sec}.fits', overwrite=True)
+        elif message.channel.topic == '/star_tracker/attitude':
+            q, date = ros.quaternion, utc(ros.header.stamp)
+            samples.append((date, f'{date} {q.x!r} {q.y!r} {q.z!r} {q.w!r}'))
     header = f"""CCSDS_AEM_VERS = 1.0
 CREATION_DATE = {samples[0][0]}
 ORIGINATOR = EXAMPLE
@@ -65,8 +68,9 @@ DATA_START
 
 
 def run(*words: object) -> None:
-    """One command of the tool; ends the script if it fails."""
-    if starcal([str(word) for word in words]):
+    """One command of the tool, beside this Python or on the path; ends the script if it fails."""
+    tool = shutil.which('starcal', path=Path(sys.executable).parent) or 'starcal'
+    if subprocess.run([tool, *map(str, words)]).returncode:
         sys.exit(1)
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Diagnostics of the running nodes: keys and levels as in docs/icd.md."""
+"""Diagnostics of the running nodes: keys and levels as in docs/diagnostics.md."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from starcal_ros.sky.astrometry import earth_velocity_c
 
 pytestmark = pytest.mark.nodes
 
-ICD = Path(__file__).parents[2] / 'docs' / 'icd.md'
+DOCUMENT = Path(__file__).parents[2] / 'docs' / 'diagnostics.md'
 
 
 def documented(*tables: str) -> set[str]:
@@ -45,7 +45,7 @@ def documented(*tables: str) -> set[str]:
     keys: set[str] = set()
     for table in ('both nodes', *tables):
         marks = f'<!-- diagnostics of {table} -->\n(.*?)<!-- end -->'
-        found = re.search(marks, ICD.read_text(), re.DOTALL)
+        found = re.search(marks, DOCUMENT.read_text(), re.DOTALL)
         assert found, table
         keys |= set(re.findall(r'^\| `(.*?)`', found[1], re.MULTILINE))
     if 'refused_…' in keys:

@@ -93,7 +93,9 @@ def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path: Path) -> 
 
 
 def test_the_recorder_and_the_aggregator_know_the_names_of_the_interface_document() -> None:
-    interface = (ROOT / 'docs/icd.md').read_text()
+    interface, names = (
+        ROOT.joinpath('docs', name).read_text() for name in ('nodes.md', 'diagnostics.md')
+    )
     record, diagnostics = (
         yaml.safe_load((CONFIG / name).read_text())['/**']['ros__parameters']
         for name in ('record.yaml', 'diagnostics.yaml')
@@ -101,4 +103,4 @@ def test_the_recorder_and_the_aggregator_know_the_names_of_the_interface_documen
     published = re.findall(r'^\| pub \| `/?([^`]+)` \|', interface, re.MULTILINE)
     assert {name.lstrip('/') for name in record['record']['topics']} <= set(published)
     assert all(name[0] == '/' for name in record['record']['topics'])  # rosbag2 expands none
-    assert f'Its `name` is `{diagnostics["starcal"]["startswith"][0]}` and' in interface
+    assert f'Its `name` is `{diagnostics["starcal"]["startswith"][0]}` and' in names

@@ -104,6 +104,7 @@ OTHERS = {
     'export',
     'kill',
     'sqlite3',
+    'chromium',
 }
 
 
@@ -193,7 +194,7 @@ def test_tables_are_as_the_code_has_them() -> None:
 
 
 def test_every_parameter_is_in_the_interface_document_and_none_else() -> None:
-    text = (ROOT / 'docs' / 'icd.md').read_text()
+    text = (ROOT / 'docs' / 'parameters.md').read_text()
     rows = re.findall(r'^\| `(\w+)` \| `[^|]*` \|', text, re.MULTILINE)
     assert sorted(rows) == sorted(names_of(*OPTIONS))
 
@@ -221,7 +222,7 @@ def test_named_functions_exist(document: Path) -> None:
 
 
 def test_topics_and_services_are_names_that_the_nodes_use() -> None:
-    text = (ROOT / 'docs' / 'icd.md').read_text()
+    text = (ROOT / 'docs' / 'nodes.md').read_text()
     documented = re.findall(r'^\| (?:sub|pub|srv) \| `([^`]+)` \|', text, re.MULTILINE)
     assert len(documented) >= 15
     rooms = (ROOT / 'starcal_ros' / 'ros', ROOT / 'starcal_ground' / 'ros')
@@ -252,6 +253,7 @@ def test_the_tool_takes_the_line(line: Line) -> None:
     assert args.command in main.COMMANDS
 
 
+PRODUCTS = ('calibration.json', 'camera_info.yaml', 'observations.mcap', 'report.html')
 RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
 
 
@@ -261,24 +263,28 @@ RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
 def test_the_commands_of_a_document_run(
     document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The commands of a document run in order."""
+    """The commands of a document run in order, and write what they name."""
     shutil.copytree(ROOT / 'bags' / 'tiny', tmp_path / 'bags' / 'tiny')
     monkeypatch.chdir(tmp_path)
     for line in TOOL_LINES:
         if line.document == document and line.runs:
             assert main.main(line.words[1:]) == 0, line.words
-    for name in ('calibration.json', 'camera_info.yaml', 'observations.mcap', 'report.html'):
-        assert (tmp_path / 'out' / name).is_file()
+            options = dict(itertools.pairwise(line.words))
+            if '-o' in options:
+                assert (tmp_path / options['-o']).exists(), line.words
+            if line.words[1] == 'calibrate':
+                for name in PRODUCTS:
+                    assert (tmp_path / options['-o'] / name).is_file(), line.words
 
 
 def test_readme_and_tutorial_run() -> None:
-    assert {path.name for path in RUNNING} >= {'README.md', 'tutorial.md'}
+    assert {path.name for path in RUNNING} >= {'README.md', 'tutorial.md', 'commands.md'}
     ran = {line.words[1] for line in TOOL_LINES if line.runs}
     assert ran >= {'diagnose', 'calibrate', 'compare'}
 
 
 def test_subcommands_in_the_interface_document_are_those_of_the_tool() -> None:
-    text = (ROOT / 'docs' / 'icd.md').read_text()
+    text = (ROOT / 'docs' / 'commands.md').read_text()
     documented = set(re.findall(r'^\| `starcal (\w+)', text, re.MULTILINE))
     assert documented == set(main.COMMANDS)
 
@@ -408,7 +414,7 @@ def test_scripts_that_are_named_exist() -> None:
 
 def interface(directions: str) -> dict[str, str]:
     """Types of topics or services by name, from the tables of the interface document."""
-    text = (ROOT / 'docs' / 'icd.md').read_text()
+    text = (ROOT / 'docs' / 'nodes.md').read_text()
     rows = re.findall(rf'^\| (?:{directions}) \| `([^`]+)` \| \[?(\w+/\w+)', text, re.MULTILINE)
     return dict(rows)
 
@@ -446,7 +452,7 @@ def test_what_a_ros2_line_names_is_there(line: Line) -> None:
         check_ros_arguments(tuple(rest))
     elif verb == 'service':
         assert rest[0] == 'call'
-        _, node, service = rest[1].split('/')
+        *_, node, service = rest[1].split('/')  # a namespace may precede them
         services = interface('srv')
         kind = services[f'~/{service}']
         assert node == 'calibrator' and rest[2] == kind.replace('/', '/srv/')

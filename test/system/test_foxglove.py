@@ -28,7 +28,7 @@ KINDS = {
 
 def published() -> dict[str, str]:
     """Types of topics by name, from the table of the interface document."""
-    text = (ROOT / 'docs' / 'icd.md').read_text()
+    text = (ROOT / 'docs' / 'nodes.md').read_text()
     rows = re.findall(r'^\| pub \| `([^`]+)` \| \[?(\w+)/(\w+)', text, re.MULTILINE)
     return {'/' + name.lstrip('/'): f'{package}/msg/{kind}' for name, package, kind in rows}
 

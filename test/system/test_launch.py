@@ -116,7 +116,7 @@ def test_topics_are_inputs_of_the_star_observer() -> None:
         and isinstance(node.targets[0], ast.Name)
         and node.targets[0].id == 'TOPICS'
     )
-    source = (ROOT / 'docs' / 'icd.md').read_text().partition('### calibrator')[0]
+    source = (ROOT / 'docs' / 'nodes.md').read_text().partition('## calibrator')[0]
     for topic in constants(topics):
         assert f'| sub | `{topic}` |' in source
 

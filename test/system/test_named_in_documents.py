@@ -52,7 +52,7 @@ ELSEWHERE = {
     *('Calibration.id_stars', 'estimate_geometric_calibration', 'estimate_attitude'),
     *('estimate_static_alignment', 'estimate_temperature_dependent_alignment'),
     *('kalibr_calibrate_imu_camera', 'camchain.yaml', 'timeshift_cam_imu', 'target.yaml'),
-    'report.pdf',
+    *('report.pdf', 'ros_base', '--velocity-topic T'),
     *('--scale-low', '--scale-high'),
 }
 # Hypothetical files of a user, and modules that were rejected.

@@ -42,7 +42,7 @@ def test_every_picture_has_its_command() -> None:
 
 def test_the_graph_of_the_nodes_is_the_drawn_one_and_names_their_topics() -> None:
     assert (IMAGES / 'nodes.svg').read_text() == make_nodes.nodes().document()
-    interface = (ROOT / 'docs' / 'icd.md').read_text()
+    interface = (ROOT / 'docs' / 'nodes.md').read_text()
     labels = [*(label for *_, labels in make_nodes.TOPICS for label in labels),
               *make_nodes.SERVICES]  # fmt: skip
     for name in ' '.join(labels).replace(',', '').split():

@@ -45,7 +45,7 @@ class Format:
     """
     A row of `FORMATS`.
 
-    ``what`` is its line of help, ``files`` and ``left_out`` its cells in docs/mission.md.
+    ``what`` is its line of help, ``files`` and ``left_out`` its cells in docs/mission_export.md.
     """
 
     name: str

@@ -251,7 +251,7 @@ def test_bad_parameter_files(run: Run, tmp_path: Path, text: str, words: list[st
 @pytest.fixture(scope='module')
 def lookup_columns() -> list[str]:
     """Columns of a table of lines of sight, as the interface document has them."""
-    text = (Path(__file__).parents[3] / 'docs' / 'icd.md').read_text()
+    text = (Path(__file__).parents[3] / 'docs' / 'commands.md').read_text()
     (row,) = (line for line in text.splitlines() if line.startswith('| `starcal lookup '))
     return re.findall(r'`(\w+)`', row.split('|', 2)[2])
 

@@ -26,7 +26,7 @@ def test_names_ascend_with_their_codes() -> None:
 
 
 def test_names_are_those_of_0_1() -> None:
-    """The names are published in docs/icd.md, and recordings hold them."""
+    """The names are published in docs/diagnostics.md, and recordings hold them."""
     assert set(STAR_REFUSALS) == {
         'not_detected',
         'border',

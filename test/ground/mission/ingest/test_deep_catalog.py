@@ -220,7 +220,7 @@ def test_places_of_other_coordinates_are_refused(tmp_path: Path, from_icrs: Any)
 
 
 def test_the_document_names_the_columns_of_each_source() -> None:
-    text = (Path(__file__).parents[4] / 'docs' / 'mission.md').read_text()
+    text = (Path(__file__).parents[4] / 'docs' / 'mission_calibrate.md').read_text()
     rows = dict(
         re.findall(r'^\| ([^|]+) \| ((?:`[^|]+`(?:, )?)+) \| .*20\d\d', text, re.MULTILINE)
     )

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The example for Kubernetes in docs/mission.md, as far as it runs without a cluster."""
+"""The example for Kubernetes in docs/mission_trend.md, as far as it runs without a cluster."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import yaml
 
 pytestmark = pytest.mark.slow
 
-_DOCUMENT = (Path(__file__).parents[4] / 'docs/mission.md').read_text()
+_DOCUMENT = (Path(__file__).parents[4] / 'docs/mission_trend.md').read_text()
 _PLACE = Path(sys.executable).parent
 _START_S = 240.0
 
