@@ -30,7 +30,8 @@ from starcal_ground.bags.topics import (
     without_attitudes,
 )
 from starcal_ground.campaign import Source, ThroughAir
-from starcal_ground.images.photographs import image_paths
+from starcal_ground.images.image_series import FileFacts
+from starcal_ground.images.photographs import image_paths, NOT_STATED
 from starcal_ground.products import make_folder, write_camera_info
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
@@ -51,7 +52,8 @@ class Given:
     Bags or images, and what is stated of them.
 
     ``options`` are those of a parameter file ``params`` and of ``--set``, ``settings`` the names
-    of the latter; ``lens`` is the focal length (mm) and the pixel size (um), 0 where not stated.
+    of the latter; ``lens`` is the focal length (mm) and the pixel size (um), 0 where not stated,
+    ``facts`` what else is stated of image files.
     """
 
     paths: Sequence[Path]
@@ -61,6 +63,7 @@ class Given:
     settings: Sequence[str] = ()
     camera_alone: bool = False
     lens: tuple[float, float] = (0.0, 0.0)
+    facts: FileFacts = NOT_STATED
 
     @property
     def states_camera(self) -> bool:
@@ -110,6 +113,8 @@ class Given:
                 if self.states_camera
                 else '--focal-length-mm, --pixel-size-um: bags need both'
             )
+        if self.facts != NOT_STATED and not self.photographs:
+            raise OptionError('--times, --flip: only of image files, which bags are made of')
         with self.with_place():
             if self.is_by_stars or not self.states_camera:
                 frames = option_groups(self.options)['frames']
@@ -226,7 +231,7 @@ def source_of(
             of_bags = given.paths, given.topics, given.options, bag_folder, given.lens
             source = night_sky.from_bags(*of_bags)
             return dataclasses.replace(source, files=(*reader.mcap_files(given.paths), *stated))
-        photographs, notes = night_sky.photographs_of(given.photographs, *given.lens)
+        photographs, notes = night_sky.photographs_of(given.photographs, *given.lens, given.facts)
         on_notes(notes)
         source = night_sky.from_photographs(photographs, given.options, bag_folder)
         files = (*(one.path for one in photographs), *stated)

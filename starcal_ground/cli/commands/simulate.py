@@ -46,8 +46,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--stars-per-image', type=number(int, 1), metavar='N', help=what)
     add = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"').add_argument
     what = 'mirror the images (default where no side is given: left-right)'
-    sides = ('left-right', 'top-bottom')
-    add('--flip', nargs='?', default='', const=sides[0], choices=sides, help=what)
+    flips = arguments.FLIPS
+    add('--flip', nargs='?', default='', const=flips[0], choices=flips, help=what)
     what = 'angle of a counterclockwise rotation of the images, degrees'
     angles = (0, 90, 180, 270)
     add('--rotate', dest='rotate_deg', type=int, choices=angles, default=0, help=what)
