@@ -15,6 +15,7 @@ import io
 import json
 import os
 from pathlib import Path
+from types import MappingProxyType
 import zipfile
 
 import numpy as np
@@ -117,11 +118,12 @@ def write_observations(
     folder: Path,
     frame_id: str,
     has_tracker: bool = True,
+    origin: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """
     Write the observations of a calibration with the frame of its camera; raises BagError.
 
-    Without a star tracker, the attitudes are those of the stars.
+    Without a star tracker, the attitudes are those of the stars.  ``origin`` is `Setup.origin`.
     Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
     """
     path = folder / OBSERVATIONS_FILE
@@ -133,7 +135,7 @@ def write_observations(
         return
     from starcal_ground.bag_writer import BagWriter  # mcap is not needed for more
 
-    with BagWriter(path) as writer:
+    with BagWriter(path, origin) as writer:
         for record in observations:
             if not has_tracker:
                 record = replace(record, star_tracker=OF_THE_STARS)

@@ -223,6 +223,7 @@ def source_of(
     with given.with_place():
         if not given.is_by_stars:
             setup, found = (setup, ()) if setup else _of_attitudes(given, folder)
+            setup = _of_origin(setup, given.paths)
             files = (*reader.mcap_files(given.paths), *stated)
             return Source(tuple(given.paths), given.topics, setup, air_of(setup), found, files)
         from starcal_ground.images import night_sky  # the search of the sky is slow to load
@@ -230,12 +231,20 @@ def source_of(
         if not given.photographs:
             of_bags = given.paths, given.topics, given.options, bag_folder, given.lens
             source = night_sky.from_bags(*of_bags)
-            return dataclasses.replace(source, files=(*reader.mcap_files(given.paths), *stated))
+            files = (*reader.mcap_files(given.paths), *stated)
+            setup = _of_origin(source.setup, given.paths)
+            return dataclasses.replace(source, setup=setup, files=files)
         photographs, notes = night_sky.photographs_of(given.photographs, *given.lens, given.facts)
         on_notes(notes)
         source = night_sky.from_photographs(photographs, given.options, bag_folder)
         files = (*(one.path for one in photographs), *stated)
         return dataclasses.replace(source, files=files)
+
+
+def _of_origin(setup: Setup, bags: Sequence[Path]) -> Setup:
+    """A setup of bags with what they state of the files that they were made from."""
+    pixels_of, originals = reader.origin_of(bags)
+    return dataclasses.replace(setup, pixels_of=pixels_of, originals=originals)
 
 
 def air_of(setup: Setup) -> ThroughAir | None:

@@ -41,7 +41,6 @@ from starcal_ros.records import (
     Ensemble,
     EnsembleStatus,
     factored_field,
-    PIXELS_OF,
     StarObservations,
 )
 from starcal_ros.untrusted import regular_file
@@ -345,7 +344,7 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': _digest(ensemble),
         **({TIMES: setup.times_of} if setup.times_of else {}),
-        **({PIXELS_OF: setup.pixels_of} if setup.pixels_of else {}),
+        **setup.origin,
         **{f'input {name}': value for name, value in inputs.items()},
     }
 

@@ -69,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.image_series import ImageOptions
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ros.formats.products.camera_yaml import read_camera_info
+    from starcal_ros.pipeline.solve import inputs_of
 
     needed = 4 * (1 + len(args.more_star_trackers))
     given = len(args.alignment)
@@ -102,8 +103,18 @@ def run(args: argparse.Namespace) -> int:
             _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
         )
         prior = args.camera and recording.Prior(args.camera, tuple(args.alignment) or (0.0,) * 4)
+        given_files = [*paths, *args.attitude, *(args.velocity or ()), *filter(None, [args.times])]
         made = recording.write_bag(
-            args.output, files, options, guard, attitudes, velocities, prior, advance, further
+            args.output,
+            files,
+            options,
+            guard,
+            attitudes,
+            velocities,
+            prior,
+            advance,
+            further,
+            inputs_of(given_files),
         )
     print_text(f'bag {made.bag}: {counted(len(files), "image")}')
     for note in made.notes:
