@@ -174,6 +174,7 @@ def from_photographs(
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated, words_of_site = _at_unknown_time(stated)
+        words_of_site += ': state it (--times)' * bool(words_of_site)
     pixels_of = [*dict.fromkeys(one.pixels_of for one in photographs)]
     if flip:
         shown = 'that the rows of the files are last to first' if by_rows else 'a mirror image'

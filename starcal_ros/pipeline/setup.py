@@ -358,7 +358,7 @@ def _check_there(files: Mapping[str, Path]) -> None:
     """Raise OptionError for a path without a file."""
     for name, path in files.items():
         if not os.path.lexists(path):
-            folder = f' in {Path.cwd()}, the working folder; give the absolute path'
+            folder = f' in {Path.cwd()}; in a parameter file, paths are relative to that file'
             raise OptionError(
                 f'{name}: {path}: no such file{"" if path.is_absolute() else folder}'
             )

@@ -141,7 +141,7 @@ def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air
     given = [str(TINY), '--params', str(TINY / 'params.yaml'), '--set', 'observer=ground']
     for command in (['diagnose'], ['calibrate', '-o', str(tmp_path), '--no-report']):
         assert main([*command, *given]) == 0
-        assert 'observer: ground or space: the stars do not tell' in capsys.readouterr().err
+        assert 'observer: ground: the stars do not show its air' in capsys.readouterr().err
     calibration = read_calibration(tmp_path / 'calibration.json')
     truth = json.loads((TINY / 'truth.json').read_text())['k_true'][0]
     focal_px, sigma_px = calibration.geometry.camera.parameters[0], calibration.sigma[0]

@@ -535,7 +535,8 @@ def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_sta
         assert isinstance(air, functools.partial)
         is_located = air.args[-1]
         assert (site.observer, site.is_known, is_located) == ('ground', is_known, is_known)
-        is_named = 'the site is not used: the images have no date' in source.notes
+        words = 'the site is not used: the images have no date: state it (--times)'
+        is_named = words in source.notes
         assert is_named == (of_files == {'dated': False})
 
 
