@@ -34,6 +34,7 @@ from starcal_ros.records import (
     Calibration,
     CameraGeometry,
     check_drawable,
+    FOUND,
     OF_THE_STARS,
     PIXELS_OF,
     StarObservations,
@@ -217,12 +218,7 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
 
 def has_stated_prior(calibration: Calibration) -> bool:
     """False where nobody stated a camera: the prior is a first solution from the same images."""
-    try:
-        options = untrusted.json_value(calibration.provenance['options'])
-    except (KeyError, ValueError):
-        return True
-    is_stated = not isinstance(options, dict) or options.get('camera_info_url') != ''
-    return calibration.has_alignment or is_stated
+    return 'camera' not in calibration.provenance.get(FOUND, '')
 
 
 def prior_of(calibration: Calibration) -> CameraGeometry | None:

@@ -277,7 +277,10 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     options['camera_info_url'] = str(folder / CAMERA_FILE)
     words = f'images of {topic}: {stars.in_a_sentence()}'
     ways = [options['attitude_direction']] if 'attitude_direction' in options else _DIRECTIONS
-    setups = [load_setup({**options, 'attitude_direction': way}) for way in ways]
+    setups = [
+        dataclasses.replace(load_setup({**options, 'attitude_direction': way}), found=('camera',))
+        for way in ways
+    ]
     for setup in setups:
         if setup.is_aligned:  # stated; a wrong direction is named where no image matches
             return setup, (words,)

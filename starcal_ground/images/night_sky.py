@@ -382,6 +382,7 @@ def _set_up(
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **by_stars.options_of(values)}, prior=prior)
+    setup = dataclasses.replace(setup, found=('camera',))
     notes = [*notes, stars.in_a_sentence()]
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')

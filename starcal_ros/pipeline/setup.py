@@ -197,7 +197,8 @@ class Setup:
     Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
     alignment is determined.  ``times_of`` says where stamps are from that are not of the images,
     ``pixels_of`` which pixels of image files the images are, if they are not all, in order.
-    ``originals`` has the SHA-256 of the files that the bags were made from, by their names.
+    ``found`` names the parts of the prior, camera or alignment, that are a first solution of the
+    images.  ``originals`` has the SHA-256 of the files that the bags were made from, by name.
     """
 
     frames: SetupOptions
@@ -216,6 +217,7 @@ class Setup:
     mountings: tuple[Mounting, ...] = ()
     times_of: str = ''
     pixels_of: str = ''
+    found: tuple[str, ...] = ()
     originals: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -420,7 +422,7 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
 def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
     """A copy of a setup with the prior alignment found from the images."""
     prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
-    return replace(setup, prior=prior, is_aligned=True)
+    return replace(setup, prior=prior, is_aligned=True, found=(*setup.found, 'alignment'))
 
 
 def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:

@@ -42,6 +42,7 @@ from starcal_ros.records import (
     Ensemble,
     EnsembleStatus,
     factored_field,
+    FOUND,
     StarObservations,
     Statement,
 )
@@ -359,6 +360,7 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': _digest(ensemble),
         **({TIMES: setup.times_of} if setup.times_of else {}),
+        **({FOUND: ', '.join(setup.found)} if setup.found else {}),
         **setup.origin,
         **{f'input {name}': value for name, value in inputs.items()},
     }

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 TOTAL = 'total'
 PIXELS_OF = 'image pixels'
 """Key of the provenance: which pixels of image files are those of the camera, if not all."""
+FOUND = 'found by the stars'
+"""Key of the provenance: parts of the prior, camera or alignment, that nobody has stated."""
 ORIGINAL = 'original '
 """Start of the keys of the provenance with the SHA-256 of files that a bag was made from."""
 ORIGIN = 'starcal_origin'

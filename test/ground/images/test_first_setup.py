@@ -59,6 +59,8 @@ def test_a_bag_of_which_nothing_is_stated(
     *_, last = text.split('\n\n')
     assert last.startswith('accepted by the gate\n') and 'Next: ' in last
     assert '"' not in text and ' arcsec' not in text  # one sign
+    assert 'from prior' not in text  # a first solution of the same images
+    assert 'id="figure-change"' not in (out / 'report.html').read_text()
     assert max(map(len, text.splitlines())) <= COLUMNS
     setup = read_setup(out / 'params.yaml')
     assert setup.attitude.attitude_direction == direction
