@@ -19,12 +19,11 @@ from scipy.spatial.transform import Rotation
 from bench.table import Table
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
-from starcal_ground.mission.trend.series import SECONDS_PER_YEAR
 from starcal_ground.mission.trend.trend_table import RECORDED, Row
 from starcal_ground.mission.trend.trend_table import Table as Rows
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SECONDS_PER_YEAR
 from starcal_ros.records import Calibration, CameraGeometry
 
 MOST_MB, MOST_S = 300.0, 20.0  # at 100,000 rows; over 10,000

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 import contextlib
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from starcal_ros.formats.bag import typestore as bag_types
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.record_messages import observations_to_message
-from starcal_ros.records import Image, StarObservations
+from starcal_ros.records import Image, ORIGIN, StarObservations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -34,10 +35,13 @@ class BagWriter:
     Use it in a ``with`` statement: its end replaces the file whole.  After an exception in the
     block the file that was there before is unchanged.  A folder gets a ``metadata.yaml``, a single
     file none: the one beside it may belong to another bag.  Missing folders are created.
+
+    ``origin`` is the metadata `ORIGIN` of the bag, as ``bags.reader.origin_of`` reads it.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, origin: Mapping[str, str] = MappingProxyType({})) -> None:
         path = Path(path)
+        self._origin = dict(origin)
         is_file = path.suffix == '.mcap'
         self.file = path if is_file else path / f'{path.name}_0.mcap'
         self._metadata_file = None if is_file else path / 'metadata.yaml'
@@ -53,6 +57,8 @@ class BagWriter:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self._replacing = replacing(self.file)
             self._writer = bag_types.started(self._replacing.__enter__())
+            if self._origin:  # before the messages: it is read without them
+                self._writer.add_metadata(ORIGIN, self._origin)
         return self
 
     def __exit__(

@@ -15,6 +15,7 @@ import io
 import json
 import os
 from pathlib import Path
+from types import MappingProxyType
 import zipfile
 
 import numpy as np
@@ -33,6 +34,7 @@ from starcal_ros.records import (
     Calibration,
     CameraGeometry,
     check_drawable,
+    FOUND,
     OF_THE_STARS,
     PIXELS_OF,
     StarObservations,
@@ -117,11 +119,12 @@ def write_observations(
     folder: Path,
     frame_id: str,
     has_tracker: bool = True,
+    origin: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """
     Write the observations of a calibration with the frame of its camera; raises BagError.
 
-    Without a star tracker, the attitudes are those of the stars.
+    Without a star tracker, the attitudes are those of the stars.  ``origin`` is `Setup.origin`.
     Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
     """
     path = folder / OBSERVATIONS_FILE
@@ -133,7 +136,7 @@ def write_observations(
         return
     from starcal_ground.bag_writer import BagWriter  # mcap is not needed for more
 
-    with BagWriter(path) as writer:
+    with BagWriter(path, origin) as writer:
         for record in observations:
             if not has_tracker:
                 record = replace(record, star_tracker=OF_THE_STARS)
@@ -215,12 +218,7 @@ def read_not_calibrated(folder: Path) -> NotCalibrated | None:
 
 def has_stated_prior(calibration: Calibration) -> bool:
     """False where nobody stated a camera: the prior is a first solution from the same images."""
-    try:
-        options = untrusted.json_value(calibration.provenance['options'])
-    except (KeyError, ValueError):
-        return True
-    is_stated = not isinstance(options, dict) or options.get('camera_info_url') != ''
-    return calibration.has_alignment or is_stated
+    return 'camera' not in calibration.provenance.get(FOUND, '')
 
 
 def prior_of(calibration: Calibration) -> CameraGeometry | None:

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from starcal_ros.arrays import Singles
 from starcal_ros.camera import CameraModel, line_of_sight, project
@@ -22,11 +24,18 @@ from starcal_ros.formats.image_files import content_of, decoded, is_fits, read_f
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import Calibration, PIXELS_OF
 
-BY_ROWS, BY_COLUMNS = 'mirrored top to bottom', 'mirrored left to right'
-"""Words of the provenance of a calibration whose pixels are those of mirrored image files."""
+MIRRORED = {'left-right': 'mirrored left to right', 'top-bottom': 'mirrored top to bottom'}
+"""Words, by the name of a flip, of the provenance of a calibration of mirrored image files."""
 _ROWS = 128  # rows of a map made at once: those of 5 megapixels together take a gigabyte
 _OUTSIDE_PX = -1e4  # cv2.remap gives such a pixel no light; it does not define that of NaN
 _ENDINGS = ('.png', '.tif', '.tiff', '.jpg', '.jpeg')  # kinds of files that keep their kind
+
+
+def mirrored(values: NDArray[Any], flip: str) -> NDArray[Any]:
+    """Values (height, width, ...) of an image after a flip of `MIRRORED`; '': as they are."""
+    if flip == 'top-bottom':
+        return values[::-1]
+    return values[:, ::-1] if flip else values
 
 
 def straight_camera(camera: CameraModel) -> CameraModel:
@@ -95,10 +104,8 @@ def undistort_file(
     else:
         values = decoded(path, content_of(path))
     pixels_of = calibration.provenance.get(PIXELS_OF, '')
-    if BY_ROWS in pixels_of:
-        values = values[::-1]
-    elif BY_COLUMNS in pixels_of:
-        values = values[:, ::-1]
+    for flip, words in MIRRORED.items():
+        values = mirrored(values, flip * (words in pixels_of))
     height, width = maps[0].shape
     if values.shape[:2] != (height, width):
         size = f'{values.shape[1]} x {values.shape[0]}'

@@ -13,6 +13,7 @@ FASTEST_M_S = 300e3
 SPEED_OF_LIGHT_M_S = 299792458.0  # SI, exact
 AU_M = 149597870700.0  # IAU 2012 Resolution B2, exact
 NANOSECONDS_PER_SECOND = 1_000_000_000
+SECONDS_PER_YEAR = 365.25 * 86400.0  # Julian year, IAU
 CLOCKS_SET_NS = 631_152_000_000_000_000  # 1990-01-01: clocks that were never set are before it
 
 

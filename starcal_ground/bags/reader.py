@@ -44,7 +44,7 @@ from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of, view_image
-from starcal_ros.records import Image, refused_image, StarObservations
+from starcal_ros.records import Image, ORIGIN, ORIGINAL, PIXELS_OF, refused_image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import (
     ARCHIVE_BYTES,
@@ -59,7 +59,16 @@ if not rosbag2.READS_BAGS:
     from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
     from mcap.opcode import Opcode
     from mcap.reader import make_reader
-    from mcap.records import Channel, Chunk, DataEnd, McapRecord, MessageIndex, Schema
+    from mcap.records import (
+        Channel,
+        Chunk,
+        DataEnd,
+        Header,
+        McapRecord,
+        MessageIndex,
+        Metadata,
+        Schema,
+    )
     from mcap.records import Message as McapMessage
     from mcap.stream_reader import get_chunk_data_stream, StreamReader
     from mcap.summary import Summary
@@ -106,6 +115,42 @@ def read_summary(file: Path) -> Summary | None:
             return make_reader(stream).get_summary() or Summary()
         except Exception:
             return None
+
+
+def origin_of(paths: Iterable[Path | str]) -> tuple[str, dict[str, str]]:
+    """
+    Pixels of image files that bags were made of, and the SHA-256 of their files by name.
+
+    Both are empty for a bag that does not state them, as a recorded one.  Raises BagError as
+    `mcap_files`.
+    """
+    pixels_of: dict[str, None] = {}
+    originals: dict[str, str] = {}
+    for file in mcap_files(paths):
+        for key, value in _stated_origin(file).items():
+            name, text = printable(key), printable(value)
+            if name == PIXELS_OF:
+                pixels_of[text] = None
+            elif name.startswith(ORIGINAL):
+                name = name.removeprefix(ORIGINAL)
+                while originals.setdefault(name, text) != text:
+                    name += ' (of another bag)'
+    return '; '.join(pixels_of), originals
+
+
+def _stated_origin(file: Path) -> dict[str, str]:
+    """Metadata `ORIGIN` of a file, which is before its messages; empty without one."""
+    if rosbag2.READS_BAGS:
+        return {}
+    # Damage is reported where the messages are read.
+    with regular_file(file) as stream, contextlib.suppress(*_DAMAGE_ERRORS):
+        reader = StreamReader(stream, emit_chunks=True, record_size_limit=METADATA_BYTES)
+        for record in reader.records:
+            if isinstance(record, Metadata) and record.name == ORIGIN:
+                return record.metadata
+            if not isinstance(record, (Header, Metadata)):
+                break
+    return {}
 
 
 def _lacks_checksum(stream: IO[bytes]) -> bool:

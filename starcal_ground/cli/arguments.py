@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
     from starcal_ground.bags.topics import Topics
     from starcal_ground.images.first_setup import Given
+    from starcal_ground.images.image_series import FileFacts
 
 Record = TypeVar('Record', bound='DataclassInstance')
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
+FLIPS = ('left-right', 'top-bottom')
 BAGS = 'an .mcap file or a bag folder'
 _BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
 _TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
@@ -121,7 +123,30 @@ def add_inputs(command: argparse.ArgumentParser) -> None:
     command.add_argument('--focal-length-mm', type=positive, default=0.0, metavar='MM', help=what)
     what = 'size of a pixel of the images, micrometres'
     command.add_argument('--pixel-size-um', type=positive, default=0.0, metavar='UM', help=what)
+    add_file_facts(command)
     add_topics(command)
+
+
+def add_file_facts(command: argparse.ArgumentParser) -> None:
+    """Add the options that state facts of image files, for `file_facts`."""
+    what = (
+        'middle of the exposure of each image file: CSV with columns file and time_utc (or'
+        ' time_tai, time_tdb, time_gps, time_ns)'
+    )
+    command.add_argument('--times', type=path, metavar='FILE', help=what)
+    what = 'the image files are mirrored: mirror them back'
+    command.add_argument('--flip', choices=FLIPS, default='', help=what)
+
+
+def file_facts(args: argparse.Namespace) -> FileFacts:
+    """Facts that `add_file_facts` asked for; raises IngestError for a bad table of times."""
+    from starcal_ground.images.image_series import FileFacts
+    from starcal_ground.mission.ingest.mission_records import Guard, read_times
+
+    if not args.times:
+        return FileFacts(None, args.flip)
+    with Guard() as guard:
+        return FileFacts(guard.call(args.times, read_times, args.times), args.flip)
 
 
 def given(args: argparse.Namespace, **options: object) -> Given:
@@ -140,6 +165,7 @@ def given(args: argparse.Namespace, **options: object) -> Given:
         tuple(dict(args.set)),
         args.camera_alone,
         lens,
+        file_facts(args),
     )
 
 

@@ -145,7 +145,7 @@ def _write_observations(
     observations: Sequence[StarObservations], folder: Path, setup: Setup
 ) -> None:
     frame = setup.frames.camera_frame
-    products.write_observations(observations, folder, frame, setup.has_tracker)
+    products.write_observations(observations, folder, frame, setup.has_tracker, setup.origin)
 
 
 def _load_report() -> None:

@@ -30,7 +30,8 @@ from starcal_ground.bags.topics import (
     without_attitudes,
 )
 from starcal_ground.campaign import Source, ThroughAir
-from starcal_ground.images.photographs import image_paths
+from starcal_ground.images.image_series import FileFacts
+from starcal_ground.images.photographs import image_paths, NOT_STATED
 from starcal_ground.products import make_folder, write_camera_info
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
@@ -51,7 +52,8 @@ class Given:
     Bags or images, and what is stated of them.
 
     ``options`` are those of a parameter file ``params`` and of ``--set``, ``settings`` the names
-    of the latter; ``lens`` is the focal length (mm) and the pixel size (um), 0 where not stated.
+    of the latter; ``lens`` is the focal length (mm) and the pixel size (um), 0 where not stated,
+    ``facts`` what else is stated of image files.
     """
 
     paths: Sequence[Path]
@@ -61,6 +63,7 @@ class Given:
     settings: Sequence[str] = ()
     camera_alone: bool = False
     lens: tuple[float, float] = (0.0, 0.0)
+    facts: FileFacts = NOT_STATED
 
     @property
     def states_camera(self) -> bool:
@@ -110,6 +113,8 @@ class Given:
                 if self.states_camera
                 else '--focal-length-mm, --pixel-size-um: bags need both'
             )
+        if self.facts != NOT_STATED and not self.photographs:
+            raise OptionError('--times, --flip: only of image files, which bags are made of')
         with self.with_place():
             if self.is_by_stars or not self.states_camera:
                 frames = option_groups(self.options)['frames']
@@ -218,6 +223,7 @@ def source_of(
     with given.with_place():
         if not given.is_by_stars:
             setup, found = (setup, ()) if setup else _of_attitudes(given, folder)
+            setup = _of_origin(setup, given.paths)
             files = (*reader.mcap_files(given.paths), *stated)
             return Source(tuple(given.paths), given.topics, setup, air_of(setup), found, files)
         from starcal_ground.images import night_sky  # the search of the sky is slow to load
@@ -225,12 +231,20 @@ def source_of(
         if not given.photographs:
             of_bags = given.paths, given.topics, given.options, bag_folder, given.lens
             source = night_sky.from_bags(*of_bags)
-            return dataclasses.replace(source, files=(*reader.mcap_files(given.paths), *stated))
-        photographs, notes = night_sky.photographs_of(given.photographs, *given.lens)
+            files = (*reader.mcap_files(given.paths), *stated)
+            setup = _of_origin(source.setup, given.paths)
+            return dataclasses.replace(source, setup=setup, files=files)
+        photographs, notes = night_sky.photographs_of(given.photographs, *given.lens, given.facts)
         on_notes(notes)
         source = night_sky.from_photographs(photographs, given.options, bag_folder)
         files = (*(one.path for one in photographs), *stated)
         return dataclasses.replace(source, files=files)
+
+
+def _of_origin(setup: Setup, bags: Sequence[Path]) -> Setup:
+    """A setup of bags with what they state of the files that they were made from."""
+    pixels_of, originals = reader.origin_of(bags)
+    return dataclasses.replace(setup, pixels_of=pixels_of, originals=originals)
 
 
 def air_of(setup: Setup) -> ThroughAir | None:
@@ -263,7 +277,10 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     options['camera_info_url'] = str(folder / CAMERA_FILE)
     words = f'images of {topic}: {stars.in_a_sentence()}'
     ways = [options['attitude_direction']] if 'attitude_direction' in options else _DIRECTIONS
-    setups = [load_setup({**options, 'attitude_direction': way}) for way in ways]
+    setups = [
+        dataclasses.replace(load_setup({**options, 'attitude_direction': way}), found=('camera',))
+        for way in ways
+    ]
     for setup in setups:
         if setup.is_aligned:  # stated; a wrong direction is named where no image matches
             return setup, (words,)

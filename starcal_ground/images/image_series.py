@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import number_of
+from starcal_ground.undistortion import MIRRORED, mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.fits_keywords import Card, value_of
@@ -30,18 +31,43 @@ _FULL = 65000  # largest 16-bit value written: the end of the range means satura
 
 
 @dataclass(frozen=True)
-class ImageOptions:
+class FileFacts:
+    """
+    Facts of image files that their user states.
+
+    ``times`` holds stamps of the middle of the exposure by file name, which replace those of the
+    files; ``flip`` is a key of `MIRRORED` if the files are mirrored images, else empty.
+    """
+
+    times: Mapping[str, int] | None = None
+    flip: str = ''
+
+    @property
+    def pixels_of(self) -> str:
+        """Words of the provenance on the flip; empty without one."""
+        return f'{MIRRORED[self.flip]} (--flip)' if self.flip else ''
+
+    def time_ns(self, path: Path) -> int | None:
+        """Stamp of a file, None if no times are stated; raises IngestError if its own is not."""
+        if self.times is None:
+            return None
+        if path.name not in self.times:
+            raise IngestError(f'{path}: not in the table of --times')
+        return self.times[path.name]
+
+
+@dataclass(frozen=True)
+class ImageOptions(FileFacts):
     """
     How the files are read.
 
-    ``time_key`` is the FITS keyword of the middle of the exposure (empty: the standard keywords);
-    ``times`` holds stamps by file name, which replace it.  ``hdu`` is the number or name of a FITS
-    extension (empty: the first image), ``channel`` red, green or blue of a colour image, ``bayer``
-    the pattern of a mosaic, ``value_range`` the range mapped to 16 bit (None: that of the images).
+    ``time_key`` is the FITS keyword of the middle of the exposure (empty: the standard keywords),
+    ``hdu`` the number or name of a FITS extension (empty: the first image), ``channel`` red, green
+    or blue of a colour image, ``bayer`` the pattern of a mosaic, ``value_range`` the range mapped
+    to 16 bit (None: that of the images).
     """
 
     time_key: str = ''
-    times: Mapping[str, int] | None = None
     hdu: str = ''
     channel: str = ''
     bayer: str = ''
@@ -174,22 +200,21 @@ def check_alike(files: Sequence[ImageFile]) -> None:
 
 def _of_options(path: Path, options: ImageOptions) -> FileImage:
     image = read_image(path, options.hdu, options.channel, options.bayer)
-    if not (image.mosaic and not options.bayer):
-        return image
-    if not options.channel:
-        raise IngestError(
-            f'{path}: a mosaic, {image.mosaic.upper()} by its header: choose --channel red, green'
-            ' or blue'
-        )
-    values = of_mosaic(image.values, image.mosaic, options.channel)
-    return image._replace(values=values)
+    values = image.values
+    if image.mosaic and not options.bayer:
+        if not options.channel:
+            raise IngestError(
+                f'{path}: a mosaic, {image.mosaic.upper()} by its header: choose --channel red,'
+                ' green or blue'
+            )
+        values = of_mosaic(values, image.mosaic, options.channel)
+    pixels_of = '; '.join(filter(None, [image.pixels_of, options.pixels_of]))
+    return image._replace(values=mirrored(values, options.flip), pixels_of=pixels_of)
 
 
 def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
-    if options.times is not None:
-        if path.name not in options.times:
-            raise IngestError(f'{path}: not in the table of --times')
-        return options.times[path.name]
+    if (time_ns := options.time_ns(path)) is not None:
+        return time_ns
     if not header:
         raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
     try:

@@ -28,8 +28,9 @@ from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.images import from_stars as by_stars
 from starcal_ground.images import photographs as image_files
 from starcal_ground.images import stated as stated_facts
+from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
-from starcal_ground.undistortion import BY_COLUMNS, BY_ROWS
+from starcal_ground.undistortion import MIRRORED, mirrored
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars
@@ -85,18 +86,22 @@ def _in_words_of_stars(stars: by_stars.FromStars, one: StarObservations) -> Star
 
 
 def photographs_of(
-    paths: Sequence[Path], focal_length_mm: float = 0.0, pixel_um: float = 0.0
+    paths: Sequence[Path],
+    focal_length_mm: float = 0.0,
+    pixel_um: float = 0.0,
+    facts: FileFacts = image_files.NOT_STATED,
 ) -> tuple[list[image_files.Photograph], list[str]]:
     """
     Photographs of one camera in order of time, and notes on the omitted files.
 
+    The length, the size of a pixel and ``facts`` are those that the user states of all files.
     Raises NotFromStars when no file can be read.
     """
     looked: list[image_files.Photograph] = []
     refusals = image_files.Refusals()
     for path in image_files.image_paths(paths):
         with refusals.of(path):
-            looked.append(image_files.look_at(path, focal_length_mm, pixel_um))
+            looked.append(image_files.look_at(path, focal_length_mm, pixel_um, facts))
     groups = image_files.by_camera(looked)
     if not groups:
         raise NotFromStars('; '.join(['no image can be read', *refusals.lines()]))
@@ -147,16 +152,20 @@ def from_photographs(
         stars = _found(_images(photographs, damaged, channel), values, catalog, hints, places)
     except NotFromStars as error:
         raise NotFromStars('; '.join([str(error), *damaged.lines()])) from error
+    if stars.mirrored and (stated_flip := photographs[0].flip):
+        raise NotFromStars(
+            f'--flip {stated_flip}: the stars show a mirror image with it: leave it out'
+        )
     is_rendered, curve = _tone_curve(photographs, stars, catalog, channel)
     # A FITS file whose rows have no stated order is mirrored by that order.
     by_rows = stars.mirrored and not any(one.is_upright for one in photographs)
     stars = _half_turned(stars) if by_rows else stars
+    flip = ('top-bottom' if by_rows else 'left-right') if stars.mirrored else ''
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
         for image in _images(photographs, image_files.Refusals(), channel, is_rendered):
-            if stars.mirrored:
-                side = image.pixels[::-1] if by_rows else image.pixels[:, ::-1]
-                image = Image(image.time_ns, side.copy())
+            if flip:
+                image = Image(image.time_ns, mirrored(image.pixels, flip).copy())
             writer.write_image('/camera/image_raw', image, 'camera')
     site, words_of_site = (
         ({}, '') if 'observer' in values else stated_facts.site_of(photographs, stars)
@@ -165,12 +174,11 @@ def from_photographs(
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
         stated, words_of_site = _at_unknown_time(stated)
-    mirrored = (
-        f'{BY_ROWS}: the stars show that the rows of the files are last to first'
-        if by_rows
-        else f'{BY_COLUMNS}: the stars show a mirror image'
-    )
-    pixels_of = [*dict.fromkeys(one.pixels_of for one in photographs), mirrored * stars.mirrored]
+        words_of_site += ': state it (--times)' * bool(words_of_site)
+    pixels_of = [*dict.fromkeys(one.pixels_of for one in photographs)]
+    if flip:
+        shown = 'that the rows of the files are last to first' if by_rows else 'a mirror image'
+        pixels_of.append(f'{MIRRORED[flip]}: the stars show {shown}')
     notes = [
         *damaged.lines(),
         words_of_site,
@@ -210,7 +218,7 @@ def _images(
     """Images of the files that can be decoded, mirrored back if they are mirrored."""
     for one in photographs:
         with refusals.of(one.path):
-            pixels = image_files.pixels_of_photograph(one.path, channel, is_rendered)
+            pixels = image_files.pixels_of_photograph(one.path, channel, is_rendered, one.flip)
             yield Image(one.time_ns, pixels[:, ::-1].copy() if is_mirrored else pixels)
 
 
@@ -374,6 +382,7 @@ def _set_up(
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **by_stars.options_of(values)}, prior=prior)
+    setup = dataclasses.replace(setup, found=('camera',))
     notes = [*notes, stars.in_a_sentence()]
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')

@@ -34,7 +34,8 @@ from starcal_ground.file_kinds import (
 )
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import FocalLength, Moment, number_of
-from starcal_ground.images.image_series import scale_of
+from starcal_ground.images.image_series import FileFacts, scale_of
+from starcal_ground.undistortion import mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
@@ -63,6 +64,7 @@ _FIRST_NS, _LAST_NS = (round(date.timestamp()) * NANOSECONDS_PER_SECOND for date
 _NAMES_SHOWN, _MOST_REASONS = 3, 8
 _LONGEST_EXPOSURE_S = 86400.0
 GIVEN = '--focal-length-mm and --pixel-size-um'
+NOT_STATED = FileFacts()
 # Focal length over the diagonal: fields of 160 degrees to 0.1 degrees.
 _SHORTEST, _LONGEST = 0.08, 600.0
 # Tags before the pixels: Pillow would look through all of a damaged file for them, byte by byte.
@@ -80,7 +82,8 @@ class Photograph:
     ``pointing`` right ascension and declination (degrees), or None.  ``camera`` names camera, lens
     and focal length, empty where the file does not; ``bits`` is the depth of a pixel.
     ``pixels_of`` and ``doubt`` say which pixels of the file are the image, and why a time is in
-    doubt; ``is_upright`` is True if the file states the order of its rows.
+    doubt; ``is_upright`` is True if the file states the order of its rows, and ``flip`` is that of
+    `FileFacts`.
     """
 
     path: Path
@@ -98,6 +101,7 @@ class Photograph:
     pixels_of: str = ''
     doubt: str = ''
     is_upright: bool = True
+    flip: str = ''
 
     @property
     def focal_px(self) -> float:
@@ -189,8 +193,13 @@ def _readable(path: Path) -> FileKind:
     return kind
 
 
-def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
-    """Facts of a file; a given length or pixel size replaces its own.  Raises IngestError."""
+def look_at(
+    path: Path,
+    focal_length_mm: float = 0.0,
+    pixel_um: float = 0.0,
+    facts: FileFacts = NOT_STATED,
+) -> Photograph:
+    """Facts of a file; what the user states of it replaces its own.  Raises IngestError."""
     kind = _readable(path)
     if kind is FITS:
         stated, stated_mm, stated_um = _of_fits(path, read_fits(path))
@@ -200,6 +209,10 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
         )
         stated = _of_tags(path, tags, gps, width, height)
         stated_mm, stated_um = _real(tags.get('FocalLength')), _pixel_um(tags, width)
+    if (time_ns := facts.time_ns(path)) is not None:
+        stated = replace(stated, time_ns=time_ns, dated=True, utc=True, doubt='')
+    pixels_of = '; '.join(filter(None, [stated.pixels_of, facts.pixels_of]))
+    stated = replace(stated, pixels_of=pixels_of, flip=facts.flip)
     diagonal_px = math.hypot(stated.width, stated.height)
     if focal_length_mm or pixel_um:
         focal_mm, size_um = focal_length_mm or stated_mm, pixel_um or stated_um
@@ -263,10 +276,13 @@ def by_camera(photographs: Sequence[Photograph], fewest: int = 3) -> dict[str, l
     return dict(sorted(groups.items(), key=rank))
 
 
-def pixels_of_photograph(path: Path, channel: str = '', is_rendered: bool | None = None) -> Pixels:
+def pixels_of_photograph(
+    path: Path, channel: str = '', is_rendered: bool | None = None, flip: str = ''
+) -> Pixels:
     """
     Light of each pixel (height, width), as the sensor has it: not turned by the EXIF orientation.
 
+    ``flip`` is that of `FileFacts`.
     A channel of a colour image, by default green, interpolated in a mosaic.  Of 8-bit images that
     are rendered, the sRGB curve is undone into 16 bit; None: those in colour are.
     """
@@ -284,6 +300,7 @@ def pixels_of_photograph(path: Path, channel: str = '', is_rendered: bool | None
             if kind is JPEG:
                 _check_whole(path, content)
             values = in_rgb(decoded(path, content))  # the EXIF orientation is not applied
+    values = mirrored(values, flip)
     if values.ndim == 3:
         values = np.ascontiguousarray(values[:, :, CHANNELS.index(channel)])
         is_rendered = True if is_rendered is None else is_rendered

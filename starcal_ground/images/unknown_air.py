@@ -121,8 +121,11 @@ def with_air(
         # A zenith found by chance would be trusted: only the change of the focal length is left.
         zenith = np.array([one.boresight for one in images])
         text = (
-            'observer: ground or space: the stars do not tell; state it: --set observer=space, or'
-            ' --set observer=ground, best with the site'
+            'observer: ground: the stars do not show its air: half of the usual refraction is'
+            ' taken, with that as its 1-sigma; of a camera in space state observer: space'
+            if is_ground
+            else 'observer: ground or space: the stars do not tell; state it: --set'
+            ' observer=space, or --set observer=ground, best with the site'
         )
     speed_m_s = _speed_m_s(images)
     if not is_air and speed_m_s > _FASTEST_M_S:

@@ -213,9 +213,15 @@ def parameter_rows(
 def alignment_rows(
     calibration: records.Calibration, prior: records.CameraGeometry | None
 ) -> list[Row]:
-    """Change and sigma of the alignment about each axis, arcsec; none of the camera alone."""
+    """
+    Change and sigma of the alignment about each axis, arcsec; none of the camera alone.
+
+    A prior alignment that was found by the same images is not one to compare with.
+    """
     if not calibration.has_alignment:
         return []
+    if 'alignment' in calibration.provenance.get(records.FOUND, ''):
+        prior = None
     sigma = calibration.sigma[-3:] / ARCSECOND_RAD
     changes = (
         alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD

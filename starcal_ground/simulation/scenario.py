@@ -13,7 +13,7 @@ or one of each sample.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 import math
 from typing import Any
@@ -27,7 +27,7 @@ from starcal_ground.simulation.deep_sky import archive_table, deep_sky
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.camera.lens import fold_radius2, ideal_points
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SECONDS_PER_YEAR
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -254,6 +254,28 @@ def scenario(name: str, seed: int = 1) -> Scenario:
         start_ns=_HERCULES_NS + round(given.pop('start_s') * NANOSECONDS_PER_SECOND),
         **given,
     )
+
+
+def at_date(
+    made: Scenario,
+    start_ns: int,
+    focal_ppm_per_year: float = 0.0,
+    alignment_arcsec_per_year: float = 0.0,
+) -> Scenario:
+    """
+    A scenario whose first image is of another time, and whose camera has drifted until then.
+
+    The drift is linear from the date of the scenario on: of both focal lengths, and of the
+    alignment about the x axis of the camera.  It is neglected within the campaign.
+    """
+    years = (start_ns - made.start_ns) / (NANOSECONDS_PER_SECOND * SECONDS_PER_YEAR)
+    grown = 1.0 + 1e-6 * focal_ppm_per_year * years
+    fx, _, fy = made.truth.camera.intrinsics[:3].tolist()
+    turn = Rotation.from_euler('x', alignment_arcsec_per_year * years * ARCSECOND_RAD)
+    alignment = made.truth.star_tracker_from_camera * turn
+    camera = made.truth.camera.replace(fx=grown * fx, fy=grown * fy)
+    truth = CameraGeometry(camera, alignment.as_quat())
+    return replace(made, truth=truth, start_ns=start_ns)
 
 
 @functools.cache

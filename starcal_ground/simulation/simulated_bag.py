@@ -23,6 +23,7 @@ from starcal_ground.comparison import truth_like
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
+from starcal_ground.undistortion import mirrored
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -77,8 +78,7 @@ class Mistakes:
             curved = 0.05 * full + 0.9 * full * light ** (1 / self.gamma)
             pixels = _as_before(curved, pixels, full)
         turned: Pixels = np.rot90(pixels, self.rotate_deg // 90)  # type: ignore[assignment]
-        if self.flip:
-            turned = turned[:, ::-1] if self.flip == 'left-right' else turned[::-1]
+        turned = mirrored(turned, self.flip)
         late_ns = round(self.clock_error_s * NANOSECONDS_PER_SECOND)
         # A copy without gaps, of the same type.
         return Image(image.time_ns + late_ns, turned.copy())

@@ -31,7 +31,7 @@ class LineOfSightTable(Record):
     pixels : (n, 2)
         (u, v).
     direction_camera : (n, 3)
-        Unit vectors in the camera frame; NaN where the camera has none.
+        Unit vectors in the camera frame; NaN as of `detector_sight`.
     shape_sigma_arcsec : (n,)
         1-sigma of the direction, the rotation common to the detector removed: the root of the
         trace of its covariance.
@@ -101,8 +101,8 @@ class Derivatives:
 
     @classmethod
     def at(cls, camera: CameraModel, pixels: Floats) -> Derivatives:
-        """Return those of pixels (n, 2)."""
-        directions = line_of_sight(camera, pixels)
+        """Return those of pixels (n, 2); NaN as of `detector_sight`."""
+        directions = detector_sight(camera, pixels)
         _, J_parameters, J_rotation = project_jacobians(camera, directions)
         # A rotation about the line of sight itself moves nothing: the pseudo-inverse leaves it
         # out.
@@ -220,7 +220,8 @@ def lines_of_sight(
     Returns
     -------
     (..., 3)
-        NaN where the distortion model has no inverse.
+        NaN beyond the detector, whose edge is half a pixel beyond the centres of its outermost
+        pixels, and where the distortion model has no inverse.
 
     Raises
     ------
@@ -238,8 +239,19 @@ def lines_of_sight(
     [0.0279, 0.0955, 0.995]
     """
     camera, frame_from_camera = _in_frame(calibration, frame)
-    in_camera = line_of_sight(camera, np.asarray(pixels_px, np.float64))
+    in_camera = detector_sight(camera, np.asarray(pixels_px, np.float64))
     return np.asarray(in_camera @ frame_from_camera.T)
+
+
+def detector_sight(camera: CameraModel, pixels: Floats) -> Floats:
+    """
+    Unit directions (..., 3) in the camera frame of pixels (..., 2) of the detector, else NaN.
+
+    No star was measured beyond the detector: a direction there would be an extrapolation, with a
+    sigma that does not cover its error.  The exported C returns STARCAL_OUTSIDE.
+    """
+    seen = camera.on_detector(pixels)[..., None]
+    return np.where(seen, line_of_sight(camera, pixels), np.nan)
 
 
 def project(
@@ -285,7 +297,7 @@ def line_of_sight_covariance(
     calibration: Calibration, pixels_px: ArrayLike, frame: Frame = 'camera'
 ) -> Floats:
     """
-    Covariance (..., 3, 3) of the unit vectors of `lines_of_sight`, rad^2.
+    Covariance (..., 3, 3) of the unit vectors of `lines_of_sight`, rad^2; NaN where these are.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera.detector_field import DetectorField
 import starcal_ros.camera.lens as lens  # its package imports this module
 from starcal_ros.record_fields import Record
@@ -159,6 +159,13 @@ class CameraModel(Record):
     def opencv_coefficients(self) -> Floats:
         """Distortion (c,) in OpenCV's order: for cv2, or cv2.fisheye if ``equidistant``."""
         return lens.ros_distortion(self.model, self.distortion)[1]
+
+    def on_detector(self, pixels: Floats) -> Mask:
+        """Mask (...) of the pixels (..., 2) within the outer edges of the outermost pixels."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        # Pixel centres are integers: the edge is half a pixel beyond the outermost ones.
+        along_u = (u >= -0.5) & (u <= self.width - 0.5)
+        return np.asarray(along_u & (v >= -0.5) & (v <= self.height - 0.5))
 
     def replace(self, **parameters: float) -> CameraModel:
         """Return the camera with some named parameters changed; ValueError for other names."""

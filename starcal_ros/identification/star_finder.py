@@ -36,7 +36,14 @@ from starcal_ros.identification.prediction import (
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
-from starcal_ros.sky.astrometry import air_above, EARTH, julian_year, SiteOptions, Velocity
+from starcal_ros.sky.astrometry import (
+    air_above,
+    EARTH,
+    julian_year,
+    MIN_ELEVATION_DEG,
+    SiteOptions,
+    Velocity,
+)
 from starcal_ros.sky.catalog import sky_circle, StarCatalog
 from starcal_ros.stars import detection
 from starcal_ros.stars.centroiding import (
@@ -344,7 +351,8 @@ def _check_catalog(
     """
     Refuse an image where the catalog has too few stars for it.
 
-    Raises ImageRefused ``not_in_catalog``, whose detail is the sky that the catalog must cover.
+    Raises ImageRefused ``not_in_catalog``, whose detail is the sky that the catalog must cover, or
+    ``no_match`` for an image below the horizon of its site, where no star is predicted.
     """
     camera, count = geometry.camera, len(prediction.catalog_index)
     reach_px = search.reach_rad(camera)[0] * float(camera.parameters[0])
@@ -352,7 +360,15 @@ def _check_catalog(
     if in_field >= _FEWEST_IN_FIELD or count > _NEAREST:
         return
     attitude = geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
-    sky = sky_circle(attitude.apply([[0.0, 0.0, 1.0]]), field_radius_rad(camera, reach_px))
+    boresight = attitude.apply([[0.0, 0.0, 1.0]])
+    zenith, _ = air_above(exposure.image.time_ns, exposure.site)
+    if (boresight @ zenith < math.sin(math.radians(MIN_ELEVATION_DEG))).any():
+        raise ImageRefused(
+            'no_match',
+            f'its attitude is below {MIN_ELEVATION_DEG:g} degrees of elevation at the site: check'
+            ' latitude_deg, longitude_deg and the clock',
+        )
+    sky = sky_circle(boresight, field_radius_rad(camera, reach_px))
     limit = search.identification.magnitude_limit
     raise ImageRefused(
         'not_in_catalog',

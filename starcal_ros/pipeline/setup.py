@@ -14,7 +14,7 @@ tool, and the tool must distinguish a parameter of a node from a misspelt name.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 import os
 from pathlib import Path
@@ -43,7 +43,7 @@ from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.options import option
 from starcal_ros.pipeline.detector_frames import DetectorFrames, NO_FRAMES, read_detector_frames
-from starcal_ros.records import CameraGeometry
+from starcal_ros.records import CameraGeometry, ORIGINAL, PIXELS_OF
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions, Mounting
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog, StarCatalog
@@ -197,6 +197,8 @@ class Setup:
     Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
     alignment is determined.  ``times_of`` says where stamps are from that are not of the images,
     ``pixels_of`` which pixels of image files the images are, if they are not all, in order.
+    ``found`` names the parts of the prior, camera or alignment, that are a first solution of the
+    images.  ``originals`` has the SHA-256 of the files that the bags were made from, by name.
     """
 
     frames: SetupOptions
@@ -215,6 +217,14 @@ class Setup:
     mountings: tuple[Mounting, ...] = ()
     times_of: str = ''
     pixels_of: str = ''
+    found: tuple[str, ...] = ()
+    originals: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """Entries of the provenance on the files that the images were made from."""
+        words = {PIXELS_OF: self.pixels_of} if self.pixels_of else {}
+        return words | {f'{ORIGINAL}{name}': value for name, value in self.originals.items()}
 
     @property
     def has_tracker(self) -> bool:
@@ -350,7 +360,7 @@ def _check_there(files: Mapping[str, Path]) -> None:
     """Raise OptionError for a path without a file."""
     for name, path in files.items():
         if not os.path.lexists(path):
-            folder = f' in {Path.cwd()}, the working folder; give the absolute path'
+            folder = f' in {Path.cwd()}; in a parameter file, paths are relative to that file'
             raise OptionError(
                 f'{name}: {path}: no such file{"" if path.is_absolute() else folder}'
             )
@@ -412,7 +422,7 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
 def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
     """A copy of a setup with the prior alignment found from the images."""
     prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
-    return replace(setup, prior=prior, is_aligned=True)
+    return replace(setup, prior=prior, is_aligned=True, found=(*setup.found, 'alignment'))
 
 
 def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
@@ -423,9 +433,9 @@ def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
     """
     asked = {'method': method, 'estimate': tuple(estimate)}
     changed = {name: value for name, value in asked.items() if value}
-    for field in options.option_fields(CalibrationOptions):
-        if field.name in changed:
-            options.check_value(field, changed[field.name])
+    for known in options.option_fields(CalibrationOptions):
+        if known.name in changed:
+            options.check_value(known, changed[known.name])
     calibration = replace(setup.calibration, **changed)  # type: ignore[arg-type]
     return replace(setup, calibration=calibration)
 

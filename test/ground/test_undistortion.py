@@ -15,13 +15,7 @@ import pytest
 from starcal_ground.cli import main
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
-from starcal_ground.undistortion import (
-    BY_COLUMNS,
-    BY_ROWS,
-    straight_camera,
-    undistort_file,
-    undistort_maps,
-)
+from starcal_ground.undistortion import MIRRORED, straight_camera, undistort_file, undistort_maps
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -115,15 +109,17 @@ def test_images_of_any_kind_are_straightened(
     )
 
 
-@pytest.mark.parametrize(('words', 'read'), [(BY_ROWS, np.s_[::-1]), (BY_COLUMNS, np.s_[:, ::-1])])
+@pytest.mark.parametrize(
+    ('flip', 'read'), [('top-bottom', np.s_[::-1]), ('left-right', np.s_[:, ::-1])]
+)
 def test_mirrored_files_are_mirrored_back(
-    made: Calibration, tmp_path: Path, words: str, read: Any
+    made: Calibration, tmp_path: Path, flip: str, read: Any
 ) -> None:
     """As `starcal calibrate` did, which found that their stars are mirrored."""
     plain = np.random.default_rng(1).integers(0, 255, (512, 640), np.uint8)
     cv2.imwrite(str(tmp_path / 'plain.png'), plain)
     cv2.imwrite(str(tmp_path / 'mirrored.png'), plain[read])
-    provenance = {**made.provenance, PIXELS_OF: f'{words}: as the stars show'}
+    provenance = {**made.provenance, PIXELS_OF: f'{MIRRORED[flip]}: as the stars show'}
     mirrored = dataclasses.replace(made, provenance=provenance)
     maps = undistort_maps(made)
     undistort_file(tmp_path / 'plain.png', made, maps, tmp_path / 'a.png')

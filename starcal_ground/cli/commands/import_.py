@@ -44,8 +44,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--spacecraft', default='', metavar='BODY', help=what)
     what = 'FITS keyword of the middle of the exposure (default: by the standard keywords)'
     add('--time-key', default='', metavar='KEY', help=what)
-    what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
-    add('--times', type=Path, metavar='FILE', help=what)
+    arguments.add_file_facts(command)
     what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
     add('--temperature-key', default='', metavar='KEY', help=what)
     what = 'FITS extension by number or name (default: the largest image)'
@@ -70,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.image_series import ImageOptions
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ros.formats.products.camera_yaml import read_camera_info
+    from starcal_ros.pipeline.solve import inputs_of
 
-    options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=None)
     needed = 4 * (1 + len(args.more_star_trackers))
     given = len(args.alignment)
     if args.camera and given != needed and (given or args.more_star_trackers):
@@ -84,10 +83,9 @@ def run(args: argparse.Namespace) -> int:
     paths = _expanded(args.images)
     inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
+    times = arguments.file_facts(args).times
+    options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=times)
     with mission_records.Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
-        if args.times:
-            times = guard.call(args.times, mission_records.read_times, args.times)
-            options = dataclasses.replace(options, times=times)
         files, problems = recording.look_at_all(paths, options, guard, advance)
         for problem in problems:
             arguments.complain(problem)
@@ -105,8 +103,18 @@ def run(args: argparse.Namespace) -> int:
             _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
         )
         prior = args.camera and recording.Prior(args.camera, tuple(args.alignment) or (0.0,) * 4)
+        given_files = [*paths, *args.attitude, *(args.velocity or ()), *filter(None, [args.times])]
         made = recording.write_bag(
-            args.output, files, options, guard, attitudes, velocities, prior, advance, further
+            args.output,
+            files,
+            options,
+            guard,
+            attitudes,
+            velocities,
+            prior,
+            advance,
+            further,
+            inputs_of(given_files),
         )
     print_text(f'bag {made.bag}: {counted(len(files), "image")}')
     for note in made.notes:

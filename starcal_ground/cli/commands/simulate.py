@@ -13,6 +13,9 @@ parameter file beside the bag.
   starcal simulate -o sim2 --scenario small --seed 2
   # the camera of sim with other noise, twelve stars in each image
   starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
+  # the camera of sim a year later, when it has drifted, for starcal trend
+  starcal simulate -o sim4 --scenario small --seed 4 --camera-seed 1 --date 2027-05-15T07:40 \
+      --focal-drift 100
   # a deliberate mistake, to practise the diagnosis
   starcal simulate -o mirrored --scenario tiny --flip
 """
@@ -24,6 +27,7 @@ import dataclasses
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ros.constants import CLOCKS_SET_NS, MAX_STAMP_NS
 from starcal_ros.errors import OptionError
 from starcal_ros.text import counted
 
@@ -44,10 +48,18 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--images', type=number(int, 1), metavar='N', help=what)
     what = 'draw only the N brightest stars of each image'
     add('--stars-per-image', type=number(int, 1), metavar='N', help=what)
+    what = 'time of the first image, UTC in ISO 8601 (default: a night of May 2026)'
+    add('--date', type=arguments.parse_time, metavar='T', help=what)
+    since = 'per year since the date of the scenario, to rehearse a trend'
+    what = f'growth of the focal length, parts per million {since}'
+    add('--focal-drift', type=number(float, -1e4, 1e4), default=0.0, metavar='PPM', help=what)
+    what = f'turn of the camera about its x axis, arcsec {since}'
+    drift = number(float, -1e4, 1e4)
+    add('--alignment-drift', type=drift, default=0.0, metavar='ARCSEC', help=what)
     add = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"').add_argument
     what = 'mirror the images (default where no side is given: left-right)'
-    sides = ('left-right', 'top-bottom')
-    add('--flip', nargs='?', default='', const=sides[0], choices=sides, help=what)
+    flips = arguments.FLIPS
+    add('--flip', nargs='?', default='', const=flips[0], choices=flips, help=what)
     what = 'angle of a counterclockwise rotation of the images, degrees'
     angles = (0, 90, 180, 270)
     add('--rotate', dest='rotate_deg', type=int, choices=angles, default=0, help=what)
@@ -82,6 +94,14 @@ def run(args: argparse.Namespace) -> int:
         image_count=args.images or scenario.image_count,
         stars_per_image=args.stars_per_image,
     )
+    drifts = args.focal_drift, args.alignment_drift
+    if args.date:
+        scenario = synthetic.at_date(scenario, args.date(scenario.start_ns), *drifts)
+        end_ns = scenario.time_ns(scenario.image_count)
+        if not CLOCKS_SET_NS < scenario.start_ns <= end_ns < MAX_STAMP_NS:
+            raise OptionError('--date: not within 1990 to 2037, the stamps that are read')
+    elif any(drifts):
+        raise OptionError('--focal-drift, --alignment-drift: need --date, until which they act')
     mistakes = arguments.record_of(simulated_bag.Mistakes, args)
     still_s = max(synthetic.ATTITUDE_OFFSETS_S)
     if 0 < abs(mistakes.clock_error_s) <= still_s:

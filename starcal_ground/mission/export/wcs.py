@@ -28,7 +28,7 @@ from starcal_ground.mission.export.image_attitude import (
     without_outliers,
 )
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import line_of_sight_sigma_arcsec
+from starcal_ros.assessment.lookup import detector_sight, line_of_sight_sigma_arcsec
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import needing, ProductError
@@ -103,7 +103,7 @@ def directions_icrf(
     Returns
     -------
     direction_icrf : (n, 3)
-        Unit vectors; NaN where the camera sees nothing.
+        Unit vectors; NaN as of `lines_of_sight`.
     sigma_arcsec : (n,)
         1-sigma, the root of the trace of the covariance: that of the camera, its common rotation
         removed, and that of the attitude by the stars, larger where they scatter more than stated.
@@ -127,7 +127,7 @@ def directions_icrf(
     if attitude is None:
         raise ValueError('image: fewer than three stars determine no attitude')
     camera = camera_of_image(calibration, image)
-    directions = attitude[0].apply(line_of_sight(camera, np.asarray(pixels_px, np.float64)))
+    directions = attitude[0].apply(detector_sight(camera, np.asarray(pixels_px, np.float64)))
     off = attitude[0].apply(line_of_sight(camera, image.measured_px)) - image.direction_icrf
     variance = image.covariance_px2[:, [0, 2]].mean(axis=1) / camera.parameters[0] ** 2
     # Squares of two components over their variance, whose median is that of chi^2.

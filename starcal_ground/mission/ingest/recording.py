@@ -24,7 +24,7 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.records import Image
+from starcal_ros.records import Image, ORIGINAL, PIXELS_OF
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.untrusted import PARAMETER_BYTES
 
@@ -127,11 +127,13 @@ def write_bag(
     prior: Prior | None = None,
     on_image: Callable[[], None] = lambda: None,
     others: Mapping[str, Attitudes] = MappingProxyType({}),
+    originals: Mapping[str, str] = MappingProxyType({}),
 ) -> Recorded:
     """
     Write a bag in order of time, ``import.json`` and, with a prior, ``params.yaml`` beside it.
 
-    ``others`` are the attitudes of further star trackers by `frame_name`.
+    ``others`` are the attitudes of further star trackers by `frame_name`, ``originals`` the
+    SHA-256 of all files by their names, which the bag carries to the provenance of a calibration.
 
     Raises IngestError when no image has attitudes about it. Raises BagError or ProductError when a
     file cannot be written or the prior camera cannot be read.
@@ -143,7 +145,8 @@ def write_bag(
     notes += _scale_notes(files, scale)
     pixels_of = list(dict.fromkeys(file.pixels_of for file in files if file.pixels_of))
     notes += [f'pixels of the images: {words}' for words in pixels_of]
-    writer = BagWriter(bag)
+    origin = {PIXELS_OF: '; '.join(pixels_of)} if pixels_of else {}
+    writer = BagWriter(bag, origin | {f'{ORIGINAL}{k}': v for k, v in originals.items()})
     record, params, copied = _files_beside(bag)
     content = {
         'bag': writer.file.name,

@@ -24,7 +24,7 @@ from starcal_ground.mission.trend.trend_table import COMPUTED, Row
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives, grid_lines_of_sight
 from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight, pixel_grid
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SECONDS_PER_YEAR
 from starcal_ros.records import Calibration
 
 FEWEST = 6  # measurements; with fewer, a step and a drift are one
@@ -32,7 +32,6 @@ MAX_P_VALUE = 1e-3  # with a dozen series on a page, one false finding in a hund
 STEP, DRIFT, TEMPERATURE = 'step', 'drift', 'temperature'
 _STEP_SIDE = 2  # measurements on each side of a step: one alone is an outlier
 _MOST_PLACES = 1000  # places of a step that are tested: 0.3 s for as many measurements
-SECONDS_PER_YEAR = 365.25 * 86400.0  # Julian year, IAU
 _GRID = (15, 12)  # columns and rows of pixels that changes are taken over
 _LEAST, _MOST = 1e-30, 1e15  # sigmas in use: their squares and inverses must stay finite
 

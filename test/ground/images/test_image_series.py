@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 import struct
@@ -21,6 +22,7 @@ from starcal_ground.images.image_series import (
     look,
     pixels_of,
 )
+from starcal_ground.undistortion import MIRRORED
 from starcal_ros.errors import IngestError
 
 IMAGE = images()[0]
@@ -89,6 +91,23 @@ def test_pictures_take_their_time_from_a_table(tmp_path: Path, ending: str) -> N
         look(path, PLAIN)
     with pytest.raises(IngestError, match='not in the table of --times'):
         look(path, ImageOptions(times={}))
+
+
+@pytest.mark.parametrize('flip', MIRRORED)
+@pytest.mark.parametrize('kind', ['one colour', 'a colour of three', 'a mosaic'])
+def test_a_flip_mirrors_the_pixels_that_are_written(tmp_path: Path, flip: str, kind: str) -> None:
+    path = tmp_path / 'a.png'
+    shape = (12, 10, 3) if kind == 'a colour of three' else (12, 10)
+    cv2.imwrite(str(path), np.random.default_rng(1).integers(0, 60000, shape, np.uint16))
+    options = ImageOptions(
+        {path.name: 1},
+        channel='' if kind == 'one colour' else 'green',
+        bayer='rggb' if kind == 'a mosaic' else '',
+    )
+    stated = dataclasses.replace(options, flip=flip)
+    plain = read(path, options)
+    assert (read(path, stated) == (plain[::-1] if flip == 'top-bottom' else plain[:, ::-1])).all()
+    assert look(path, stated).pixels_of == f'{MIRRORED[flip]} (--flip)'
 
 
 def test_a_colour_of_an_image_is_chosen(tmp_path: Path) -> None:

@@ -116,6 +116,39 @@ def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_cl
 
 
 @pytest.mark.slow
+def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, table, out = tmp_path / 'night', tmp_path / 'times.csv', tmp_path / 'out'
+    shown = tiny_images()[:6]
+    files = sorted(write_pngs(folder, [one.pixels[::-1] for one in shown]).iterdir())
+    rows = (f'{path.name},{one.time_ns}' for path, one in zip(files, shown, strict=True))
+    table.write_text('\n'.join(['file,time_ns', *rows]))
+    stated = ['calibrate', str(folder), *LENS, '-o', str(out), '--times', str(table), '--flip']
+    assert main([*stated, 'top-bottom']) in (0, 3)
+    calibration = read_calibration(out / 'calibration.json')
+    assert TIMES not in calibration.provenance
+    assert (calibration.first_image_ns, calibration.time_ns) == (
+        shown[0].time_ns,
+        shown[-1].time_ns,
+    )
+    assert calibration.provenance[PIXELS_OF] == 'mirrored top to bottom (--flip)'
+    truth = json.loads((TINY / 'truth.json').read_text())
+    off = calibration.geometry.camera.parameters[3:5] - truth['k_true'][3:5]
+    assert np.abs(off / calibration.sigma[3:5]).max() < 4.0  # one in 8,000 good ones is beyond
+    # A side that the stars contradict is refused.
+    for path, one in zip(files, shown, strict=True):
+        cv2.imwrite(str(path), one.pixels)
+    capsys.readouterr()
+    assert main([*stated, 'left-right']) == 2
+    said = capsys.readouterr().err
+    assert '--flip left-right: the stars show a mirror image with it: leave it out' in said
+    # A bag has the times and the pixels that it was made with.
+    assert main(['calibrate', str(TINY), '-o', str(out), '--flip', 'top-bottom']) == 2
+    assert 'starcal: --times, --flip: only of image files' in capsys.readouterr().err
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('kind', 'words'),
     [
@@ -502,7 +535,8 @@ def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_sta
         assert isinstance(air, functools.partial)
         is_located = air.args[-1]
         assert (site.observer, site.is_known, is_located) == ('ground', is_known, is_known)
-        is_named = 'the site is not used: the images have no date' in source.notes
+        words = 'the site is not used: the images have no date: state it (--times)'
+        is_named = words in source.notes
         assert is_named == (of_files == {'dated': False})
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, TiffImagePlugin
 import pytest
 
+from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.photographs import (
     by_camera,
     image_paths,
@@ -58,11 +59,11 @@ def test_focal_length_by_the_pixels_of_the_sensor_goes_before_it(tmp_path: Path)
     one = look_at(jpeg(tmp_path / 'a.jpg', CANON, tags))
     assert one.focal_px == pytest.approx(50.0 / (25.4 / 6451.6 * 100), rel=1e-4)
     for alone, words in (
-        ({'focal_length_mm': 20.0}, '--focal-length-mm needs --pixel-size-um: the file does not'),
-        ({'pixel_um': 4.0}, '--pixel-size-um needs --focal-length-mm: the file does not state it'),
+        ((20.0, 0.0), '--focal-length-mm needs --pixel-size-um: the file does not'),
+        ((0.0, 4.0), '--pixel-size-um needs --focal-length-mm: the file does not state it'),
     ):
         with pytest.raises(IngestError, match=words):
-            look_at(jpeg(tmp_path / 'none.jpg', CANON, {}), **alone)
+            look_at(jpeg(tmp_path / 'none.jpg', CANON, {}), *alone)
     given = look_at(tmp_path / 'a.jpg', focal_length_mm=20.0, pixel_um=4.0)
     assert given.focal_px == pytest.approx(5000.0)
 
@@ -76,6 +77,19 @@ def test_the_stamp_is_the_middle_of_the_exposure_in_utc(tmp_path: Path) -> None:
     os.utime(never_set, (TIME_S, TIME_S))
     assert look_at(never_set).time_ns == TIME_S * 10**9
     assert not look_at(never_set).dated
+
+
+def test_a_stated_time_and_flip_replace_those_of_a_file(tmp_path: Path) -> None:
+    facts = FileFacts({'c.jpg': TIME_S * 10**9}, 'top-bottom')
+    for path in (
+        jpeg(tmp_path / 'c.jpg', CANON, {}),
+        jpeg(tmp_path / 'c.jpg', CANON, {**DATE, 0x9011: ''}),
+    ):
+        one = look_at(path, facts=facts)
+        assert (one.time_ns, one.dated, one.utc) == (TIME_S * 10**9, True, True)
+        assert (one.flip, one.pixels_of) == ('top-bottom', 'mirrored top to bottom (--flip)')
+    with pytest.raises(IngestError, match='not in the table of --times'):
+        look_at(jpeg(tmp_path / 'd.jpg', CANON, DATE), facts=facts)
 
 
 def test_gps_tags_are_the_site(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.identification.tracking import track_stars
 from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.sky.astrometry import air_above, SiteOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
@@ -197,6 +198,18 @@ def test_a_catalog_of_another_region_is_said_to_be() -> None:
         observe_stars(
             exposure, given(0.3).truth, StarSearch(load_catalog(), identification=options)
         )
+
+
+def test_a_site_that_has_an_image_below_its_horizon_is_named() -> None:
+    one, image = shown(2.5, 1)
+    attitude_xyzw = one.icrf_from_star_tracker_xyzw
+    geometry, search = given(2.5).truth, StarSearch(sky_of(2.5))
+    boresight = geometry.icrf_from_camera(attitude_xyzw).apply([0.0, 0.0, 1.0])
+    sites = (SiteOptions('ground', 1.0, longitude) for longitude in range(0, 360, 30))
+    cosine = [float(air_above(image.time_ns, site)[0] @ boresight) for site in sites]
+    away = SiteOptions('ground', 1.0, 30.0 * int(np.argmin(cosine)))
+    with pytest.raises(ImageRefused, match='no_match: its attitude is below 10 degrees of elev'):
+        observe_stars(Exposure(image, attitude_xyzw, 0.5, site=away), geometry, search)
 
 
 @pytest.mark.parametrize('field_deg', [0.3, 1.0, 2.5])

@@ -25,7 +25,7 @@ def covariance(stars: int, held: bool = False) -> MapCovariance:
     sigma = np.r_[300.0 * SIGMA, np.full(2 * TERMS, 0.05)]  # without stars
     if held:
         sigma[7] = 0.0
-    pixels = np.random.default_rng(stars).uniform(size=(stars, 2)) * [1296, 1024]
+    pixels = np.random.default_rng(stars).uniform(size=(stars, 2)) * [1296, 1024] - 0.5
     J = Derivatives.at(CAMERA, pixels).J.reshape(-1, len(sigma))
     root = J * sigma * LENS.parameters[0] / 0.1  # stars of 0.1 px
     inverse = np.linalg.inv(root.T @ root + np.eye(len(sigma)))

@@ -9,10 +9,11 @@ import re
 import numpy as np
 import pytest
 from sample_records import calibration, without_field  # type: ignore[import-not-found]
+from scipy.spatial.transform import Rotation
 
 from starcal_ground.cli.commands.calibrate import print_calibration
 from starcal_ros.camera.projection import convert
-from starcal_ros.records import SigmaPart
+from starcal_ros.records import FOUND, SigmaPart
 
 
 def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[str]) -> None:
@@ -38,6 +39,20 @@ def test_a_calibration_without_a_budget_has_no_table_of_it(
     record = dataclasses.replace(calibration(), sigma_budget=())
     print_calibration(record, record.geometry)
     assert '1-sigma of lines' not in capsys.readouterr().out
+
+
+def test_an_alignment_that_the_images_gave_is_not_compared_with_itself(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    record = calibration()
+    moved = record.geometry.star_tracker_from_camera * Rotation.from_rotvec([1e-4, 0.0, 0.0])
+    prior = dataclasses.replace(record.geometry, star_tracker_from_camera_xyzw=moved.as_quat())
+    rows = []
+    for provenance in ({}, {FOUND: 'alignment'}):
+        print_calibration(dataclasses.replace(record, provenance=provenance), prior)
+        (row,) = re.findall('^alignment x .*$', capsys.readouterr().out, re.MULTILINE)
+        rows.append(row.split())
+    assert len(rows[0]) == 6 and rows[1] == rows[0][:4]
 
 
 def test_a_lens_that_the_prior_did_not_have_has_no_changes(

@@ -20,7 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
 from starcal_ground.mission.export.export_formats import export, Request
-from starcal_ros.assessment.lookup import common_rotation, Derivatives
+from starcal_ros.assessment.lookup import (
+    common_rotation,
+    Derivatives,
+    line_of_sight_covariance,
+    line_of_sight_table,
+    lines_of_sight,
+)
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import write_calibration
@@ -36,7 +42,8 @@ SAME_DIRECTION = 1e-12
 # A direction to 1e-12 is 4e-9 px at a focal length of 3600 px; Newton and field end below it.
 SAME_PX = 1e-8
 REFERENCE_DEGC = 20.0  # of `calibration(temperature=True)`
-BAD_ARGUMENT, NO_IMAGE, NOT_A_TABLE, OTHER_VERSION, TRUNCATED, DAMAGED, TOO_LARGE = (
+OUTSIDE, BAD_ARGUMENT, NO_IMAGE, NOT_A_TABLE, OTHER_VERSION, TRUNCATED, DAMAGED, TOO_LARGE = (
+    1,
     2,
     3,
     5,
@@ -303,6 +310,28 @@ def test_directions_that_the_camera_does_not_see_are_refused(tmp_path: Path) -> 
     _, text = run(program, 'pixels', lines=lines)
     statuses = [int(line.split()[0]) for line in text.splitlines()]
     assert statuses == [0, 1, *[NO_IMAGE] * 3, *[BAD_ARGUMENT] * 3]
+
+
+@pytest.mark.parametrize('with_field', [False, True])
+def test_c_and_python_have_the_same_edge_of_the_detector(tmp_path: Path, with_field: bool) -> None:
+    made = calibration('plumb_bob', with_field=with_field)
+    camera = made.geometry.camera
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    on = [[-0.5, -0.5], [right, bottom], [-0.5, bottom], [right, 0.0]]
+    beyond = [[-0.501, 10.0], [right + 0.001, 10.0], [10.0, -0.501], [10.0, bottom + 0.001]]
+    pixels = np.array([*on, *beyond, *pixel_grid(camera, 3, 3).tolist()])
+    lines = np.c_[np.full(len(pixels), REFERENCE_DEGC), pixels]
+    _, text = run(built(made, tmp_path), 'sights', lines=lines)
+    outside = np.array([line.split()[0] == str(OUTSIDE) for line in text.splitlines()])
+    assert np.flatnonzero(outside).tolist() == [4, 5, 6, 7]
+    table = line_of_sight_table(camera, made.map_covariance, pixels)
+    for found in (
+        lines_of_sight(made, pixels),
+        lines_of_sight(made, pixels, 'star_tracker'),
+        line_of_sight_covariance(made, pixels).reshape(len(pixels), 9),
+        *(column[:, None] for column in (table.shape_sigma_arcsec, table.sigma_arcsec)),
+    ):
+        np.testing.assert_array_equal(np.isnan(found), np.tile(outside, (found.shape[1], 1)).T)
 
 
 def test_the_function_of_the_page_compiles(tmp_path: Path) -> None:

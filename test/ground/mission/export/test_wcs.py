@@ -89,6 +89,8 @@ def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
         errors.append(np.linalg.norm(towards - true, axis=1) / (sigma_arcsec * ARCSECOND_RAD))
     # Ten attitudes and one camera: the mean square has some 15 degrees of freedom.
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
+    beyond, sigma_arcsec = directions_icrf(made, images[0], [[-0.6, 10.0]])
+    assert np.isnan(beyond).all() and np.isnan(sigma_arcsec).all()
     with pytest.raises(ValueError, match='fewer than three stars'):
         directions_icrf(made, images[0].select(np.arange(len(images[0])) < 2), [[0.0, 0.0]])
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import hashlib
 import json
 from pathlib import Path
 import shutil
@@ -48,6 +49,12 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def digests_of_originals(made: starcal_ground.Calibration) -> dict[str, str]:
+    start = 'original '
+    known = made.provenance.items()
+    return {name.removeprefix(start): value for name, value in known if name.startswith(start)}
+
+
 def run(aem: Path, *images_of: Path, bag: Path | None = None, more: Sequence[object] = ()) -> int:
     """Exit status of an import of images with attitudes, by default into `bag` beside these."""
     places = ['--attitude', aem, '-o', bag or aem.parent / 'bag']
@@ -69,6 +76,10 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
         assert isinstance(a, Image) and a.time_ns == b.time_ns and (a.pixels == b.pixels).all()
     # The file of the original: it has the sigma of the star tracker too.
     imported = starcal_ground.calibrate_bag(bag, TINY / 'params.yaml')
+    originals = [*night.iterdir(), aem, tmp_path / 'velocity.csv']
+    assert digests_of_originals(imported) == {
+        str(path): f'sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}' for path in originals
+    }
     original = starcal_ground.calibrate_bag(TINY, TINY / 'params.yaml')
     # Quaternions are scaled to unit length on the way: a rounding of 1e-16.
     change = np.abs(imported.geometry.camera.parameters - original.geometry.camera.parameters)
@@ -241,6 +252,43 @@ def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, capsys) -> N
     read = list(reader.read_images([tmp_path / 'bag'], '/camera/image_raw'))
     for one, image in zip(read, images(), strict=False):
         assert isinstance(one, Image) and (one.pixels == image.pixels).all()
+
+
+@pytest.mark.slow
+def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_them(
+    night: Path, tmp_path: Path
+) -> None:
+    """Of two bags with files of one name, and of the observations of their calibration."""
+    aem, prior = write_aem(tmp_path / 'a.aem'), ['--camera', str(TINY / 'camera.yaml')]
+    for name in ('one', 'two'):
+        folder = tmp_path / 'night'
+        folder.mkdir(exist_ok=True)
+        for k, path in enumerate(sorted(night.iterdir())[5 * (name == 'two') :][:5]):
+            shutil.copy(path, folder / f'{k}.fits')
+        files = (folder / '*.fits',)
+        flipped = [*prior, '--alignment', *ALIGNMENT, '--flip', 'top-bottom']
+        assert run(aem, *files, bag=tmp_path / name, more=flipped) == 0
+    pixels_of, originals = reader.origin_of([tmp_path / 'one', tmp_path / 'two'])
+    assert pixels_of == 'mirrored top to bottom (--flip)'
+    names = [str(tmp_path / 'night' / f'{k}.fits') for k in range(5)]
+    assert {*originals} == {*names, *(f'{name} (of another bag)' for name in names), str(aem)}
+    assert len({*originals.values()}) == 11
+    assert reader.origin_of([TINY]) == ('', {})
+
+
+@pytest.mark.slow
+def test_observations_carry_the_originals_of_their_bag(night: Path, tmp_path: Path) -> None:
+    aem, bag, out = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'out'
+    assert run(aem, night / '*.fits') == 0
+    params = ['--params', str(TINY / 'params.yaml'), '--no-report', '--quiet']
+    for given, made in ((bag, out), (out / 'observations.mcap', tmp_path / 'again')):
+        assert main(['calibrate', str(given), '-o', str(made), *params]) == 0
+        originals = digests_of_originals(starcal_ground.read_calibration(made))
+        assert {*originals} == {str(aem), *map(str, night.iterdir())}
+    # The block for signatures of the report has them.
+    assert main(['report', str(tmp_path / 'again')]) == 0
+    page = (tmp_path / 'again' / 'report.html').read_text()
+    assert all(digest in page for digest in originals.values())
 
 
 def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_ground.mission.trend.series import SECONDS_PER_YEAR, Trend, trend_of
+from starcal_ground.mission.trend.series import Trend, trend_of
+from starcal_ros.constants import SECONDS_PER_YEAR
 
 N = 60
 YEARS = np.arange(N) / 12
