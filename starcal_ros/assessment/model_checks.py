@@ -20,13 +20,13 @@ from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
+from starcal_ros.estimation.shared_errors import coarsest_cell_px
 from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
 _CLEAR_SIGMA = 5.0  # the default of the gate: a conflict that fails must be in the evidence too
-_INNER = (0.1, 0.9)  # nearer to the border too few stars lie on one side
-_STEPS = 97  # five places in the width of a strip: a step between two loses a tenth of its size
-_STRIP = 1 / 24  # in widths: a sixth of the shortest wave of the field, which so takes no step
+_STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
+_MARGIN = 0.1  # of the sides, where lenses leave residuals that look like steps: WISPR 0.25 px
 
 
 def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:
@@ -155,14 +155,23 @@ def _or_nan(variance: float) -> float:
 
 
 def detector_step(estimate: Estimate) -> DetectorStep:
-    """Return the most significant step between two parts of the detector."""
+    """
+    Return the most significant step between two parts of the detector.
+
+    It is the difference of the mean residuals of two strips side by side, so narrow that no wave of
+    the field takes a part of it.
+    """
     kept = estimate.kept
-    camera, strip_px = estimate.geometry.camera, _STRIP * estimate.geometry.camera.width
+    camera = estimate.geometry.camera
+    strip_px = coarsest_cell_px(camera.width)
     residual_px = estimate.residual_px[kept]
     weight = 2.0 / (estimate.covariance_px2[kept, 0] + estimate.covariance_px2[kept, 2])
-    best, best_significance = ('u', 0.0, 'u', 0.0), 0.0
+    best, best_significance, trials = ('u', 0.0, 'u', 0.0), 0.0, 0
     for axis, size in enumerate((camera.width, camera.height)):
-        place_px: Floats = np.asarray(np.linspace(*_INNER, _STEPS), np.float64) * size - 0.5
+        inner_px = (1.0 - 2.0 * _MARGIN) * size
+        count = round(_STEPS * inner_px / strip_px) + 1
+        place_px: Floats = _MARGIN * size - 0.5 + np.linspace(0.0, inner_px, count)
+        trials += 2 * round(inner_px / strip_px)  # two axes of the residual at places apart
         pixels = estimate.table.measured_px[kept, axis]
         before, variance_before = _means(
             pixels, residual_px, weight, place_px - strip_px, place_px
@@ -174,8 +183,6 @@ def detector_step(estimate: Estimate) -> DetectorStep:
         if significance[k, moved] > best_significance:
             best_significance = float(significance[k, moved])
             best = ('uv'[axis], float(place_px[k]), 'uv'[moved], float(step[k, moved]))
-    # Twice two axes, and places that do not overlap.
-    trials = 4 * min(_STEPS, round((_INNER[1] - _INNER[0]) / _STRIP))
     p_value = min(1.0, 2.0 * trials * float(ndtr(-best_significance)))
     return DetectorStep(*best, p_value)
 

@@ -25,6 +25,7 @@ from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.amplitudes import UNSTATED
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.limits import FREE_FACTOR
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
@@ -77,7 +78,6 @@ from starcal_ros.estimation.weights import (
     CentroidVariance,
     Data,
     degrees_of_freedom,
-    FREE_FACTOR,
     has_converged,
     judge,
     sky_rotations,

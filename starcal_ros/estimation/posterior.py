@@ -42,12 +42,12 @@ from starcal_ros.estimation.equations import (
     weighted_rows_by,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.limits import FREE_FACTOR
 from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
 
-_WITHOUT = 1e3  # factor that removes a prior: no data sheet is off by so many sigma
 LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
@@ -203,7 +203,7 @@ def without_prior(
             entry = dataclasses.replace(entry, sigma=_without_prior(entry, held))
         elif entry.kind.cause == CHANGE and not entry.of_image:
             kept = near.mean[linear.layout.places[entry.name]]
-            entry = dataclasses.replace(entry, sigma=_KEPT * entry.sigma, offset=-kept)
+            entry = dataclasses.replace(entry, sigma=entry.sigma / FREE_FACTOR, offset=-kept)
         entries.append(entry)
     wide = Layout(tuple(entries))
     linear = dataclasses.replace(linear, layout=wide)
@@ -226,7 +226,7 @@ def _without_prior(entry: Unknown, held: int | None) -> Floats:
     """Return the sigma (q,) of an entry without its prior: the largest possible."""
     if held is not None:
         return np.where(np.arange(len(entry)) == held, np.inf, entry.sigma)
-    widest = np.minimum(_WITHOUT * entry.sigma, entry.widest)
+    widest = np.minimum(FREE_FACTOR * entry.sigma, entry.widest)
     return np.asarray(np.maximum(entry.sigma, widest))
 
 
@@ -352,7 +352,6 @@ def common_shape(layout: Layout, common_px2: Floats) -> Floats:
 
 
 TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
-_KEPT = 1e-3  # factor on a prior sigma that holds an unknown at its mean
 _HELD = 0.05  # information on a mode times its variance, below which its prior holds it
 
 

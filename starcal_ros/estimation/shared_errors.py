@@ -122,10 +122,15 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     """
     found = [Groups('star places', star, None, _together(pixels, star, width))]
     for wave in _FINE_OCTAVES:
-        cells = _cells(pixels, wave * width / _CELLS_PER_WAVE)
+        cells = _cells(pixels, wave / _FINE_OCTAVES[0] * coarsest_cell_px(width))
         name = f'field at 1/{round(1 / wave)} of the width'
         found.append(Groups(name, cells, pairs_of(cells, star)))
     return tuple(found)
+
+
+def coarsest_cell_px(width: int) -> float:
+    """Return the side of the largest cells: over it, no wave of the field changes much."""
+    return _FINE_OCTAVES[0] * width / _CELLS_PER_WAVE
 
 
 def _together(pixels: Floats, star: Indices, width: int) -> Floats:

@@ -31,6 +31,7 @@ from starcal_ros.estimation.equations import (
     StarSums,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.limits import FREE_FACTOR
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.outliers import fitting_stars, misfit_images
 from starcal_ros.estimation.posterior import Posterior
@@ -59,9 +60,7 @@ from starcal_ros.estimation.tracker_errors import (
 from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
-# Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
-# thousand times the stated one, and of a milliarcsecond.
-FREE_FACTOR, EXACT_RAD = 1e3, 1e-3 * ARCSECOND_RAD
+EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
 _SIGMA_PER_MEDIAN = 1.5  # 1-sigma of normal errors over the median of their sizes
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
