@@ -33,7 +33,7 @@ from starcal_ros.estimation.equations import (
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
-from starcal_ros.estimation.outliers import fitting_stars, misfit_images
+from starcal_ros.estimation.outliers import fitting_stars, misfit_images, QUARTILE
 from starcal_ros.estimation.posterior import Posterior
 from starcal_ros.estimation.problem import (
     attitude_errors,
@@ -61,7 +61,6 @@ from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
 EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
-_SIGMA_PER_MEDIAN = 1.5  # 1-sigma of normal errors over the median of their sizes
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
 _ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
@@ -266,7 +265,7 @@ def weighted_attitudes(
     factor = np.ones((m, 3))
     if attitudes is None:
         error = attitude_errors(problem, state, state.camera_from_icrf) / data.stated_rad
-        factor *= max(1.0, _SIGMA_PER_MEDIAN * float(np.median(np.abs(error))))
+        factor *= max(1.0, float(np.median(np.abs(error))) / QUARTILE)
     else:
         for tracker in attitudes.trackers:
             factor[tracker.images[:, None], tracker.axes] = tracker.working
