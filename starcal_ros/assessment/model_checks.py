@@ -158,8 +158,8 @@ def detector_step(estimate: Estimate) -> DetectorStep:
     """
     Return the most significant step between two parts of the detector.
 
-    It is the difference of the mean residuals of two strips side by side, so narrow that no wave of
-    the field takes a part of it.
+    It is the difference of the mean residuals of two strips side by side, so narrow that no wave
+    of the field takes a part of it.
     """
     kept = estimate.kept
     camera = estimate.geometry.camera

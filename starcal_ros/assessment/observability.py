@@ -22,8 +22,8 @@ from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import information_of_images, stars_alone, StarSums
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.limits import FEWEST
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.problem import Problem, State, supported_terms
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table

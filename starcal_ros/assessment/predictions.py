@@ -32,6 +32,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.limits import NEGLIGIBLE
 from starcal_ros.estimation.shared_errors import pairs_of
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Ensemble, ResidualBin
@@ -125,7 +126,6 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
 _BINS = 4  # quantiles of radius, magnitude and time: corners and faint stars are separate
 _FEWEST_STARS = 30  # the normalised residual of a bin is then accurate to 9 %
 _FEWEST_IMAGES = 4  # three may determine no calibration without one of them
-_NO_EFFECT = 1e-3  # information on a coefficient times its prior variance
 
 
 def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
@@ -197,7 +197,7 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     # These keep their values: each image may have its own sidereal time, which others do not show,
     # and field coefficients that their prior holds at zero predict nothing of an image.
     shown = (sigma_px**2 + term[field] ** 2) * np.diag(given.information)[field]
-    kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])
+    kept = np.concatenate([layout.of(['site']), field[shown < NEGLIGIBLE]])
     part, held = np.setdiff1d(posterior.estimated, kept), np.intersect1d(posterior.estimated, kept)
     own = precision[part]
     pull = own * term[part]

@@ -28,6 +28,7 @@ from scipy.special import erf, expit
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.limits import LEAST_GAIN, MOST_ROUNDS, ROUNDING
 
 # Prior of the logarithm of an amplitude: a lens or a detector departs from its model by a
 # micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
@@ -41,9 +42,6 @@ LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0  # change of a camera from image to image
 # The gradient vanishes near zero: the search starts from a small amplitude and a large one, px.
 _STARTS_PX = (1e-4, 2e-2)
-_MOST_STEPS = 12  # steps of Fisher scoring from each start
-_SETTLED = 1e-3  # a smaller change of the log likelihood moves no sigma by a thousandth
-_NO_EFFECT = 1e-6  # information on an unknown times its prior variance
 NO_AMPLITUDE = -25.0  # log amplitude without any effect
 # Common factors of the amplitudes over which results are averaged, in logarithms.
 _SHIFTS = np.linspace(-8.0, 6.0, 57)
@@ -125,10 +123,10 @@ def field_amplitudes(
     def evaluate(log_px: Floats) -> tuple[float, Floats, Floats]:
         s = np.exp(log_px)[octave]
         # Coefficients without an effect: their tiny numbers slow a processor down tenfold.
-        shown = np.flatnonzero(s**2 * np.diag(information) > _NO_EFFECT)
+        shown = np.flatnonzero(s**2 * np.diag(information) > ROUNDING)
         s, own = s[shown], member[:, shown]
         scaled = information[np.ix_(shown, shown)] * np.outer(s, s)
-        scaled[np.abs(scaled) < _NO_EFFECT**2] = 0.0
+        scaled[np.abs(scaled) < ROUNDING] = 0.0
         scaled[np.diag_indices(len(s))] += 1.0
         lower, inverse = _cholesky_and_inverse(scaled)
         mode = inverse @ (s * gradient[shown])
@@ -142,7 +140,7 @@ def field_amplitudes(
     best, best_value = mean, -np.inf
     for log_px in starts:
         value, slope, fisher = evaluate(log_px)
-        for _ in range(_MOST_STEPS):
+        for _ in range(MOST_ROUNDS):
             step = np.linalg.solve(fisher, slope)
             # A step changes an amplitude by e^2 at most, and shrinks until the posterior rises.
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
@@ -153,7 +151,7 @@ def field_amplitudes(
                 if found[0] > value - 1e-9:
                     log_px, (value, slope, fisher) = trial, found
                     break
-            if abs(value - before) < _SETTLED:
+            if abs(value - before) < LEAST_GAIN:
                 break
         if value > best_value + 1e-6:
             best, best_value = log_px, value
@@ -345,7 +343,7 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
 
     def likelihood(log_px: Floats) -> Floats:
         k, s = len(log_px), np.exp(log_px)
-        shown = np.flatnonzero(s**2 @ total > _NO_EFFECT)
+        shown = np.flatnonzero(s**2 @ total > ROUNDING)
         if k > 1 and len(shown) * m > _AT_ONCE:  # more at once is slower: memory
             return np.concatenate([likelihood(log_px[: k // 2]), likelihood(log_px[k // 2 :])])
         left, log_det = np.tile(whole, (k, 1, 1)), np.zeros(k)
@@ -417,7 +415,7 @@ def _climb(
             trials[np.arange(len(at)), :, at] = there
             values = likelihood(trials.reshape(-1, count)).reshape(there.shape)
             values[(there <= NO_AMPLITUDE) | (there >= math.log(LARGEST_SHAPE_PX))] = -np.inf
-            better = np.flatnonzero(values.max(axis=1) > value + _SETTLED)
+            better = np.flatnonzero(values.max(axis=1) > value + LEAST_GAIN)
             k, settled = k + len(at), settled + len(at)
             if len(better):
                 first = better[0]

@@ -4,10 +4,20 @@
 from __future__ import annotations
 
 FALSE_ALARM_RATE = 1e-4
-"""Chance that a test of the data finds a fault in sound ones, at any of the places that it looks at:
-each place has its part of it.  One of some hundred calibrations then fails one of the tests."""
+"""Chance that a test finds a fault in sound data, at any of its places: each has a part of it.  A
+tenth of it would hide a drift of few images, ten times as much refuse one calibration in 100."""
 FEWEST = 3
 """Members of a group that are judged: of two that differ, either may be the wrong one."""
+STEP_SIGMA = 0.05
+"""Step in 1-sigma below which a search has ended: a twentieth of a sigma moves no result."""
+LEAST_GAIN = 0.5 * STEP_SIGMA**2
+"""The same as a change of the log likelihood, by which a search of amplitudes has ended."""
+MOST_ROUNDS = 50
+"""Steps after which a search is given up; three to ten are usual."""
+NEGLIGIBLE = 0.02
+"""Share of a variance without which its sigma is as good: by one in a hundred."""
+ROUNDING = 1e-12
+"""Relative rounding of a sum of a million products."""
 FREE_FACTOR = 1e3
-"""Factor on a 1-sigma that removes a prior, and by its inverse holds an unknown at its mean: no data
-sheet is off by so many sigma, and a thousandth of a sigma moves no result."""
+"""Factor on a 1-sigma that removes a prior, and by its inverse holds an unknown at its mean: no
+data sheet is off by so many sigma, and a thousandth of a sigma moves no result."""

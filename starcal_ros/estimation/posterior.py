@@ -42,7 +42,7 @@ from starcal_ros.estimation.equations import (
     weighted_rows_by,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.limits import FREE_FACTOR
+from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE
 from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
@@ -352,7 +352,6 @@ def common_shape(layout: Layout, common_px2: Floats) -> Floats:
 
 
 TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
-_HELD = 0.05  # information on a mode times its variance, below which its prior holds it
 
 
 @dataclass(frozen=True)
@@ -379,11 +378,20 @@ class Weights:
 
 
 def with_shared_errors(
-    found: Posterior, sums: StarSums, linear: Linearisation, weights: Weights
+    found: Posterior,
+    sums: StarSums,
+    linear: Linearisation,
+    weights: Weights,
+    negligible: float = NEGLIGIBLE,
 ) -> Posterior:
-    """Return the posterior with the covariance under the errors that observations share."""
+    """
+    Return the posterior with the covariance under the errors that observations share.
+
+    ``negligible``: information on a mode of the field times its variance, below which its prior
+    holds it.
+    """
     layout = linear.layout
-    root, held = _root(found.working, found.estimated, sums, layout)
+    root, held = _root(found.working, found.estimated, sums, layout, negligible)
     excess, shared = _of_observations(found, linear, weights, root)
     of_attitudes, by_tracker = _of_attitudes(found, linear, weights, root)
     excess += of_attitudes
@@ -399,7 +407,7 @@ def with_shared_errors(
 
 
 def _root(
-    covariance: Floats, estimated: Indices, sums: StarSums, layout: Layout
+    covariance: Floats, estimated: Indices, sums: StarSums, layout: Layout, negligible: float
 ) -> tuple[Floats, Floats]:
     """
     Return L (P, r) and M (P, h), where ``L L' + M M'`` is a covariance.
@@ -422,7 +430,7 @@ def _root(
     own = np.zeros((layout.count, len(others)))
     own[others] = size[:, None] * own_vectors * np.sqrt(own_values.clip(0.0))
     shown = np.einsum('im,ij,jm->m', vectors, sums.field_information, vectors, optimize=True)
-    moved = values * shown > _HELD
+    moved = values * shown > negligible
     return np.concatenate([own, modes[:, moved]], axis=1), modes[:, ~moved]
 
 

@@ -26,12 +26,12 @@ from starcal_ros.estimation.levenberg_marquardt import (
     NormalEquations,
     Solution,
 )
+from starcal_ros.estimation.limits import FEWEST
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     estimated_parameters,
 )
-from starcal_ros.estimation.limits import FEWEST
 from starcal_ros.estimation.problem import Problem, reference_degc, star_tracker_names, State
 from starcal_ros.estimation.star_equations import Measurements, StarTable, turned
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state

@@ -39,18 +39,14 @@ from starcal_ros.estimation.amplitudes import (
     OCTAVE_SIGMA,
     OCTAVE_STEP,
 )
+from starcal_ros.estimation.limits import MOST_ROUNDS, NEGLIGIBLE, ROUNDING
 
 # Wavelengths below those of the field, as fractions of the width: each octave is seen in cells of
 # a sixth of its longest wave, over which it keeps nine tenths of its correlation.
 _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
-# Groups that add under 1 % (stars 2 %) to the variance of their mean are skipped: in thousands of
-# images, places of stars that are seen a hundred times add 1 % and take a third of the time.
-_NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
-_ROUNDING = 1e-9  # relative rounding of a sum over pairs where there are no pairs
-_ROUNDS = 8  # iterations of expectation and maximisation for the factors of stars
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
@@ -94,8 +90,13 @@ class SharedError:
 
     @property
     def matters(self) -> bool:
-        """True if the precision of an estimate changes by the error."""
-        return self.effect > (_NO_EFFECT_OF_STAR if self.of_star else _NO_EFFECT)
+        """
+        True if the precision of an estimate changes by the error.
+
+        In thousands of images, places of stars that are seen a hundred times add 1 % to a
+        variance, and take a third of the time.
+        """
+        return self.effect > NEGLIGIBLE
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,7 @@ def _of_stars(
     )
     log_likelihood = np.zeros((len(_LOG_GRID), len(_LOG_GRID)))
     x = np.exp(2.0 * _LOG_GRID)
-    if constant > _ROUNDING * float((weight**2).sum()):
+    if constant > ROUNDING * float((weight**2).sum()):
         log_likelihood -= both * np.outer(x, x)
         log_likelihood += (by_constant * x - 0.5 * constant * x**2)[:, None]
         log_likelihood += by_relative * x - 0.5 * relative * x**2
@@ -274,7 +275,7 @@ def _factors(on_sky: Floats, weight: Floats, share_px2: Floats, star: Indices) -
     count = int(star.max(initial=0)) + 1
     total, squares = np.bincount(star, weight, count), np.bincount(star, weight**2, count)
     factor = np.ones(count)
-    several = np.flatnonzero(total**2 - squares > _ROUNDING * total**2)
+    several = np.flatnonzero(total**2 - squares > ROUNDING * total**2)
     if len(several) == 0:
         return factor[star]
     total, squares = total[several], squares[several]
@@ -284,12 +285,14 @@ def _factors(on_sky: Floats, weight: Floats, share_px2: Floats, star: Indices) -
     )
     squared, pairs = u**2 + v**2, (total**2 - squares) * s
     # The variance of a residual has the shared part in it.
-    e = np.maximum(1.0 / total - s * squares / total**2, _ROUNDING / total)
+    e = np.maximum(1.0 / total - s * squares / total**2, ROUNDING / total)
     own = np.ones(len(s))
-    for _ in range(_ROUNDS):
-        gain = own * s / (own * s + e)
+    for _ in range(MOST_ROUNDS):
+        before, gain = own, own * s / (own * s + e)
         own = (_TAIL + (squared * gain + 2.0 * e) * gain / s) / (_TAIL + 2.0)
         own *= pairs.sum() / (pairs @ own)
+        if np.abs(own / before - 1.0).max() < NEGLIGIBLE:
+            break
     factor[several] = own
     return np.asarray(factor[star])
 
@@ -315,7 +318,7 @@ def pair_moment(
         return _pairs(value, group) - own
 
     pairs = apart(weight)
-    if pairs <= _ROUNDING * float((weight**2).sum()):
+    if pairs <= ROUNDING * float((weight**2).sum()):
         return 0.0, math.inf
     products = sum(apart(weight * v) for v in residual_px.T)
     return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
@@ -331,7 +334,7 @@ def _increments(moments: Sequence[tuple[float, float]]) -> list[tuple[float, flo
     for (before, before_sigma), (after, sigma) in pairwise(moments):
         is_known = math.isfinite(sigma)
         own_sigma = math.sqrt(max(sigma**2 - before_sigma**2, 0.0)) if is_known else sigma
-        found.append((after - before if is_known else 0.0, max(own_sigma, _ROUNDING * sigma)))
+        found.append((after - before if is_known else 0.0, max(own_sigma, ROUNDING * sigma)))
     return found
 
 

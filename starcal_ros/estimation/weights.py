@@ -31,7 +31,7 @@ from starcal_ros.estimation.equations import (
     StarSums,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.limits import FREE_FACTOR
+from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, ROUNDING, STEP_SIGMA
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.outliers import fitting_stars, misfit_images, QUARTILE
 from starcal_ros.estimation.posterior import Posterior
@@ -63,9 +63,6 @@ from starcal_ros.records import CameraGeometry
 EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
-_ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
-_ROUNDS = 12  # iterations of a reweighted fit
-_SETTLED = 1e-3  # relative change of a fitted variance that ends the iterations
 _NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
 _BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
 _STARS_PER_NODE = 40  # 80 residuals determine a variance to 16 %
@@ -130,12 +127,12 @@ def estimate_variance(
     squared = (residual_px[used] ** 2).sum(axis=1) / left
     # The median of a squared length of two normal axes is ln 2 of its mean.
     scale, floor_px2 = max(float(np.median(squared / own)) / math.log(2.0), 1e-12), 0.0
-    for _ in range(_ROUNDS):
-        before = scale, floor_px2
+    for _ in range(MOST_ROUNDS):
         expected = scale * own + floor_px2
         weight = 0.5 * left * _part(squared / expected) / expected**2
         scale, floor_px2 = _line(own, squared, weight)
-        if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
+        step = scale * own + floor_px2 - expected
+        if weight @ step**2 < STEP_SIGMA**2:
             break
     ratio = squared / (scale * own + floor_px2)
     counted = 0.5 * left * _part(ratio)
@@ -160,7 +157,7 @@ def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
     determinant = by_own * by_one - both**2
     scale, floor_px2 = right_own / by_own, 0.0
-    if determinant > _ALIKE * by_own * by_one:
+    if determinant > ROUNDING * by_own * by_one:  # not all variances are equal
         scale = (by_one * right_own - both * right_one) / determinant
         floor_px2 = (by_own * right_one - both * right_own) / determinant
     if floor_px2 < 0:
@@ -193,7 +190,7 @@ def _brightness(
     basis = np.stack([np.interp(bins, nodes, row) for row in np.eye(len(nodes))], axis=1)
     log_factor = np.zeros(len(nodes))
     prior = np.eye(len(nodes)) / _NODE_SIGMA**2
-    for _ in range(_ROUNDS):
+    for _ in range(MOST_ROUNDS):
         scaled = summed * np.exp(-basis @ log_factor)
         gradient = basis.T @ (scaled - stars) - prior @ log_factor
         # Observed in place of expected information: monotone for a convex cost.
@@ -201,7 +198,7 @@ def _brightness(
             (basis * np.maximum(scaled, stars)[:, None]).T @ basis + prior, gradient
         )
         log_factor += step
-        if np.abs(step).max() < _SETTLED:
+        if gradient @ step < STEP_SIGMA**2:
             break
     return tuple(nodes.tolist()), tuple(np.exp(log_factor).tolist())
 

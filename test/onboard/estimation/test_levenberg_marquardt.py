@@ -16,6 +16,7 @@ from starcal_ros.estimation.levenberg_marquardt import (
     NotObservable,
     solve_arrow,
 )
+from starcal_ros.estimation.limits import MOST_ROUNDS
 
 Move = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -228,7 +229,7 @@ def falling_line(x: np.ndarray) -> NormalEquations:
 def test_a_search_without_end_says_so() -> None:
     solution = levenberg_marquardt(np.zeros(1), falling_line, add)
     assert not solution.converged
-    assert solution.termination == 'iteration_limit' and solution.iterations == 100
+    assert solution.termination == 'iteration_limit' and solution.iterations == MOST_ROUNDS
 
 
 def test_a_search_against_a_wall_says_so() -> None:

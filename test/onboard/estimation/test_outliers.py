@@ -13,11 +13,7 @@ from scipy.stats import chi2, norm
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.estimation.limits import FALSE_ALARM_RATE, FEWEST
-from starcal_ros.estimation.outliers import (
-    dropped_stars,
-    fitting_stars,
-    misfit_images,
-)
+from starcal_ros.estimation.outliers import dropped_stars, fitting_stars, misfit_images
 from starcal_ros.estimation.shared_errors import Groups, pairs_of
 from starcal_ros.estimation.star_equations import StarTable
 

@@ -31,6 +31,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.estimation import amplitudes
 from starcal_ros.estimation import posterior as module
 from starcal_ros.estimation.amplitudes import Amplitudes, Shapes, shapes, ShapeSums
+from starcal_ros.estimation.limits import NEGLIGIBLE
 from starcal_ros.estimation.posterior import (
     common_shape,
     Posterior,
@@ -62,7 +63,6 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, None))
     monkeypatch.setattr(amplitudes, '_SHIFTS', np.zeros(1))
     monkeypatch.setattr(amplitudes, '_OF_TERM', np.array([-300.0]))
-    monkeypatch.setattr(module, '_HELD', 1e-13)
 
 
 def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
@@ -321,8 +321,10 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
     return weights, {name: one.reshape(2 * n, 2 * n) for name, one in V.items()}
 
 
-def widened(given: Small, found: Posterior, weights: Weights) -> Posterior:
-    return with_shared_errors(found, given.sums(), given.linear(), weights)
+def widened(
+    given: Small, found: Posterior, weights: Weights, negligible: float = 1e-13
+) -> Posterior:
+    return with_shared_errors(found, given.sums(), given.linear(), weights, negligible)
 
 
 def propagated(
@@ -382,20 +384,17 @@ def test_shared_errors_at_known_amplitudes_propagate_as_the_dense_covariance(
         assert np.abs(off / np.outer(sigma[free], sigma[free])).max() < EXACT
 
 
-@pytest.mark.parametrize(('held', 'tolerance'), [(1e-13, 1e-4), (module._HELD, 0.03)])
+# By default modes of the field that hardly move are left out; here also with all of them.
+@pytest.mark.parametrize(('negligible', 'tolerance'), [(1e-13, 1e-4), (NEGLIGIBLE, 0.03)])
 def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance(
-    monkeypatch: pytest.MonkeyPatch,
-    held: float,
-    tolerance: float,
+    negligible: float, tolerance: float
 ) -> None:
-    # By default modes of the field below a thousandth are left out; here also with all of them.
-    monkeypatch.setattr(module, '_HELD', held)
     given = small(2, field_px=0.2)
     truth = dense(given)
     # Far larger than centroid errors, which are mostly hidden by the field of 150 coefficients.
     weights, V = shared(given, 2.0, 1.5)
     found = solved(given)
-    after = widened(given, found, weights)
+    after = widened(given, found, weights, negligible)
     P = given.layout.count
     # The gain of the averaged estimator: its covariance times what the images leave of X.
     own = np.arange(P, len(truth.stars.T))
