@@ -255,4 +255,5 @@ def test_a_step_to_no_cost_is_taken_back() -> None:
 
     solution = levenberg_marquardt(np.ones(1), evaluate, add)
     assert solution.converged and min(tried) <= 0
-    assert solution.state[0] == pytest.approx(np.exp(-5), rel=1e-8)
+    # It ends at a step of a millionth of a sigma, which is x.
+    assert solution.state[0] == pytest.approx(np.exp(-5), rel=2e-6)
