@@ -61,7 +61,6 @@ from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
 EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
-_CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
 _NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
 _BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
@@ -104,6 +103,7 @@ def estimate_variance(
     magnitude: NDArray[np.floating],
     used: Mask,
     freedom: Floats,
+    outlier_sigma: float,
 ) -> CentroidVariance:
     """
     Scale, floor and factor by brightness that make the covariances those of the residuals.
@@ -114,13 +114,15 @@ def estimate_variance(
         The observations that the fit used, with their covariances as measured.
     freedom : (n,)
         Degrees of freedom that the fit leaves each of them, of two.
+    outlier_sigma : float
+        Length of a residual beyond which it is an outlier.
 
     Notes
     -----
     Scale and floor maximise the restricted likelihood of the residuals, whose gradient is the sum
     of ``freedom / 2 (square / freedom - variance) / variance^2`` times the derivatives of the
     variance: weighted least squares of squares over freedom on the measured variance and one, the
-    weights renewed, with less of a square near 4.5 sigma (`_part`).
+    weights renewed, with less of a square near that of an outlier (`_part`).
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
     left = np.maximum(freedom[used], _LEAST_FREEDOM)
@@ -129,25 +131,25 @@ def estimate_variance(
     scale, floor_px2 = max(float(np.median(squared / own)) / math.log(2.0), 1e-12), 0.0
     for _ in range(MOST_ROUNDS):
         expected = scale * own + floor_px2
-        weight = 0.5 * left * _part(squared / expected) / expected**2
+        weight = 0.5 * left * _part(squared / expected, outlier_sigma) / expected**2
         scale, floor_px2 = _line(own, squared, weight)
         step = scale * own + floor_px2 - expected
         if weight @ step**2 < STEP_SIGMA**2:
             break
     ratio = squared / (scale * own + floor_px2)
-    counted = 0.5 * left * _part(ratio)
+    counted = 0.5 * left * _part(ratio, outlier_sigma)
     nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
     return CentroidVariance(scale, floor_px2, nodes, factors)
 
 
-def _part(ratio: Floats) -> Floats:
+def _part(ratio: Floats, outlier_sigma: float) -> Floats:
     """
     Return the part of squared residuals over variance (n,) that counts.
 
-    Half at 4.5 sigma, all to 4.1 and none from 4.9.
-    One at an edge of 4.5 sigma would count and not count in turns, and the estimate with it.
+    Half at the limit of outliers, 4.5 sigma, all to 4.1 and none from 4.9.
+    One at an edge would count and not count in turns, and the estimate with it.
     """
-    return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
+    return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * outlier_sigma**2), 0.0, 1.0))
 
 
 def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
@@ -197,7 +199,7 @@ def _brightness(
         step = np.linalg.solve(
             (basis * np.maximum(scaled, stars)[:, None]).T @ basis + prior, gradient
         )
-        log_factor += step
+        log_factor = np.clip(log_factor + step, *np.log(_SCALE_LIMITS))
         if gradient @ step < STEP_SIGMA**2:
             break
     return tuple(nodes.tolist()), tuple(np.exp(log_factor).tolist())
@@ -437,7 +439,12 @@ def judge(
     variance = CentroidVariance(1.0, 0.0)
     if options.variance_components:
         variance = estimate_variance(
-            residual_px, table.covariance_px2, table.magnitude, used, freedom
+            residual_px,
+            table.covariance_px2,
+            table.magnitude,
+            used,
+            freedom,
+            options.outlier_sigma,
         )
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()
