@@ -32,7 +32,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
-from starcal_ros.estimation.limits import NEGLIGIBLE
+from starcal_ros.estimation.limits import FEWEST, NEGLIGIBLE
 from starcal_ros.estimation.shared_errors import pairs_of
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Ensemble, ResidualBin
@@ -125,7 +125,6 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
 
 _BINS = 4  # quantiles of radius, magnitude and time: corners and faint stars are separate
 _FEWEST_STARS = 30  # the normalised residual of a bin is then accurate to 9 %
-_FEWEST_IMAGES = 4  # three may determine no calibration without one of them
 
 
 def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
@@ -137,7 +136,7 @@ def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
     than four images.
     """
     table = estimate.table
-    if table.image_count < _FEWEST_IMAGES:
+    if table.image_count <= FEWEST:  # fewer may determine no calibration without one of them
         return ()
     found, expected = predicted_residuals(estimate)
     used = estimate.kept & np.isfinite(found)

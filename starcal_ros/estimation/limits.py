@@ -8,6 +8,9 @@ FALSE_ALARM_RATE = 1e-4
 tenth of it would hide a drift of few images, ten times as much refuse one calibration in 100."""
 FEWEST = 3
 """Members of a group that are judged: of two that differ, either may be the wrong one."""
+MOST_CORRELATED = 100
+"""Images, or groups of them, whose correlations are kept: algebra on all of more would take most
+of the time of an estimate, and correlation times are a third of a campaign or more."""
 STEP_SIGMA = 0.05
 """Step in 1-sigma below which a search has ended: a twentieth of a sigma moves no result."""
 LEAST_GAIN = 0.5 * STEP_SIGMA**2
