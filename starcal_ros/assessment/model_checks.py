@@ -170,7 +170,7 @@ def detector_step(estimate: Estimate) -> DetectorStep:
     for axis, size in enumerate((camera.width, camera.height)):
         inner_px = (1.0 - 2.0 * _MARGIN) * size
         count = round(_STEPS * inner_px / strip_px) + 1
-        place_px: Floats = _MARGIN * size - 0.5 + np.linspace(0.0, inner_px, count)
+        place_px = np.asarray(_MARGIN * size - 0.5 + np.linspace(0.0, inner_px, count), np.float64)
         trials += 2 * round(inner_px / strip_px)  # two axes of the residual at places apart
         pixels = estimate.table.measured_px[kept, axis]
         before, variance_before = _means(

@@ -22,7 +22,7 @@ from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.amplitudes import UNSTATED
+from starcal_ros.estimation.amplitudes import STARTS_PX, UNSTATED
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, STEP_SIGMA
@@ -33,13 +33,7 @@ from starcal_ros.estimation.options import (
     check_options,
 )
 from starcal_ros.estimation.outliers import dropped_stars
-from starcal_ros.estimation.posterior import (
-    LEAST_SHAPE_PX,
-    Posterior,
-    posterior,
-    Weights,
-    with_shared_errors,
-)
+from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
 from starcal_ros.estimation.problem import (
     canonical_xyzw,
     image_parameters,
@@ -247,7 +241,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     residual_px = residuals_px(problem, state, table)
     from_sky = sky_rotations(state, table, data.prior.camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats | float = LEAST_SHAPE_PX
+    shape_px: Floats | float = STARTS_PX[0]
     before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
@@ -258,7 +252,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
+        shape_px = np.maximum(last.posterior.shapes.sigma_px, STARTS_PX[0])
         iterations += 1
         step_sigma = _step_sigma(last.posterior)
         is_settled = np.abs(step_sigma).max(initial=0.0) < STEP_SIGMA

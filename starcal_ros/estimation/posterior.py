@@ -13,6 +13,7 @@ from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
 import functools
+import math
 
 import numpy as np
 from scipy.linalg import solve
@@ -23,12 +24,13 @@ from starcal_ros.estimation.amplitudes import (
     Amplitudes,
     averaged_field,
     field_amplitudes,
+    LEAST_PX,
     LOG_CENTRE,
     LOG_SIGMA,
-    NO_AMPLITUDE,
     Shapes,
     shapes,
     ShapeSums,
+    STARTS_PX,
 )
 from starcal_ros.estimation.equations import (
     arrow,
@@ -47,8 +49,6 @@ from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
-
-LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Posterior:
 def posterior(
     sums: StarSums,
     linear: Linearisation,
-    before: Floats | float = LEAST_SHAPE_PX,
+    before: Floats | float = STARTS_PX[0],
     near: Posterior | None = None,
 ) -> Posterior:
     """
@@ -150,7 +150,7 @@ def posterior(
     start = eliminated(normal, layout, before)
     solver = _Solver(layout)
     base, field_px = solver.likely(start, near.field if near else None)
-    none = Amplitudes(np.full(len(before), NO_AMPLITUDE), 0.0)
+    none = Amplitudes(np.full(len(before), math.log(LEAST_PX)), 0.0)
     found, last = Shapes(before, none, None), start
     if len(sums.blocks) > 1:
         by_image = _shape_sums(sums, linear, solver, field_px)

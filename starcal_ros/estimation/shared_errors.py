@@ -34,6 +34,7 @@ from scipy.sparse import csr_array
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
+    log_amplitudes,
     LOG_CENTRE,
     LOG_SIGMA,
     OCTAVE_SIGMA,
@@ -47,9 +48,7 @@ _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
 _TAIL = 2.0  # degrees of freedom of the errors of stars
-_LOG_GRID: Floats = np.asarray(
-    np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
-)
+_LOG_GRID = log_amplitudes(LARGEST_FIELD_PX)
 _PRIOR: Floats = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
 
 
@@ -218,7 +217,7 @@ def _of_stars(
     """
     Return ``c^2``, px^2, and rho of the sightings of stars, and twice their log likelihood ratio.
 
-    And the likelihood (240,) of c.  Posterior means: products of pairs of residuals on the sky are
+    And the likelihood (g,) of c.  Posterior means: products of pairs of residuals on the sky are
     fitted by 1 and by the product of their sigmas over that of a usual star.
     """
     usual_px2 = float(np.median(variance_px2[weight > 0]))
@@ -251,7 +250,7 @@ def _of_stars(
 
 def _beside_stars(of_places: Floats, share: float) -> Floats:
     """
-    Return the likelihood (240,) of structure s of the detector, by that of c (240,).
+    Return the likelihood (g,) of structure s of the detector, by that of c (g,).
 
     Sightings of a star share ``c^2 + share s^2``, with the correlation of the structure.
     """
@@ -339,7 +338,7 @@ def _increments(moments: Sequence[tuple[float, float]]) -> list[tuple[float, flo
 
 
 def _next_octave(log_px: Floats) -> Floats:
-    """Weights (s, 240) on the grid of an octave that follows one of logarithms (s,)."""
+    """Weights (s, g) on the grid of an octave that follows one of logarithms (s,)."""
     off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
     kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
     kernel /= kernel.sum(axis=1, keepdims=True).clip(1e-300)
@@ -348,7 +347,7 @@ def _next_octave(log_px: Floats) -> Floats:
 
 @functools.cache
 def _transition() -> Floats:
-    """Weights (240, 240) of an octave after one at each place of the grid."""
+    """Weights (g, g) of an octave after one at each place of the grid."""
     return _next_octave(_LOG_GRID)
 
 
@@ -361,7 +360,7 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
 
     Parameters
     ----------
-    first : (240,)
+    first : (g,)
         Prior weights of the first on the grid.
     moments : sequence of (estimate, 1-sigma), px^2
         From `pair_moment`.

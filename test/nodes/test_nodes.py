@@ -198,6 +198,7 @@ def test_each_service_of_a_calibrator(
     assert main(['lookup', str(tmp_path), '-o', str(table), '--points', '7']) == 0
     columns = np.genfromtxt(table, delimiter=',', names=True)
     assert len(columns) == 49
+    assert columns.dtype.names is not None
     for name in columns.dtype.names:
         np.testing.assert_array_equal(getattr(answer, name), columns[name])
     budget = active.sigma_budget

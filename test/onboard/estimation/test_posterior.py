@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from four_images import (  # type: ignore[import-not-found]
@@ -28,9 +29,15 @@ import pytest
 from scipy.linalg import null_space
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation import amplitudes
 from starcal_ros.estimation import posterior as module
-from starcal_ros.estimation.amplitudes import Amplitudes, Shapes, shapes, ShapeSums
+from starcal_ros.estimation.amplitudes import (
+    _shape_likelihood,
+    Amplitudes,
+    averaged_field,
+    Shapes,
+    shapes,
+    ShapeSums,
+)
 from starcal_ros.estimation.limits import NEGLIGIBLE
 from starcal_ros.estimation.posterior import (
     common_shape,
@@ -61,8 +68,9 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     field, shape = (Amplitudes(np.log(one), 0.0) for one in (OCTAVES_PX, SHAPE))
     monkeypatch.setattr(module, 'field_amplitudes', lambda *_: field)
     monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, None))
-    monkeypatch.setattr(amplitudes, '_SHIFTS', np.zeros(1))
-    monkeypatch.setattr(amplitudes, '_OF_TERM', np.array([-300.0]))
+
+    at_amplitudes = partial(averaged_field, shifts=np.zeros(1), log_term=np.array([-1e3]))
+    monkeypatch.setattr(module, 'averaged_field', at_amplitudes)
 
 
 def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
@@ -144,7 +152,8 @@ def varied() -> Varied:
         return to_sums(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(amplitudes, '_OF_TERM', OF_TERM)
+        terms = np.log(1e-5) + 4.0 * OF_TERM
+        patch.setattr(module, 'averaged_field', partial(averaged_field, log_term=terms))
         patch.setattr(module, 'shapes', recorded)
         patch.setattr(module, '_shape_sums', of_field)
         found = solved(made)
@@ -267,7 +276,7 @@ def test_sums_of_the_shapes_have_the_likelihood_of_contrasts_free_of_everything_
     sizes_px = ([1e-4] * 5, [4.0, 1.0, 0.1, 0.1, 0.1], [0.3, 3.0, 2.0, 0.5, 1.0])
     at = [np.log(np.array(px)) for px in sizes_px]
     expected = np.array([with_prior(one) for one in at])
-    likelihood = amplitudes._shape_likelihood(sums)
+    likelihood = _shape_likelihood(sums)
     values = likelihood(np.array(at))
     # Rotations are held to 0.1 rad, a thousandth of the prior of cx and cy, which they can do.
     assert np.abs(np.diff(expected)).max() > 3.0
