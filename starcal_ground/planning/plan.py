@@ -29,7 +29,6 @@ from starcal_ros.assessment.gate import reasons_of
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.assessment.requirements import (
     FOCAL,
-    FOCAL_LENGTHS,
     LINE_OF_SIGHT,
     MAP,
     POINTING,
@@ -97,7 +96,7 @@ def target(estimate: Estimate, name: str) -> Target:
         unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
         squares = of_map if name == MAP else of_pointing
         return Target(f'{name}_arcsec', squares, unresolved, ARCSECOND_RAD)
-    labels = FOCAL_LENGTHS if name == FOCAL else (name,)
+    labels = QUANTITIES[name].parameters if name in QUANTITIES else (name,)
     if not {*labels} <= {*layout.labels}:
         known = {LINE_OF_SIGHT, MAP, POINTING, FOCAL, *layout.labels}
         allowed = ', '.join(name for name in QUANTITIES if name in known)

@@ -28,6 +28,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives, grid_derivatives
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.amplitudes import LEAST_PX
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
@@ -36,7 +37,6 @@ from starcal_ros.estimation.unknowns import CHANGE, Layout, NO_OPTION, Option, U
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, Statement, TOTAL
 from starcal_ros.text import significant
 
-_KNOWN_SHAPE_PX = 1e-7  # no star is measured to that
 _WORTH_STATING = 0.9  # a fall of the sigma by less than a tenth is not worth a statement
 _SHOWN = 3.0  # a slow error beyond three times the noise is in the images: no data sheet lowers it
 
@@ -240,7 +240,7 @@ def _known(
 
 def _of_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
     """Return the information (r, r) that the shapes of the images take from an estimate."""
-    without = equations(estimate.sums, estimate.linear, _KNOWN_SHAPE_PX)
+    without = equations(estimate.sums, estimate.linear, LEAST_PX)
     given = estimate.posterior.equations
     return np.asarray(errors.root.T @ (without.information - given.information) @ errors.root)
 

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from scipy.special import ndtri
 
 from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.remedies import REMEDIES, remedy_against
 from starcal_ros.assessment.requirements import requirement_checks
+from starcal_ros.estimation.limits import FALSE_ALARM_RATE
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.estimation.unknowns import CHANGE, prior_test_of
@@ -32,10 +34,6 @@ from starcal_ros.text import p_value_text, significant
 # a tenth of the half diagonal, by which the prior of the lens moves the corners (`lens_prior`).
 _PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX = 5.0, 0.01
 _PRIOR_ROTATION = 13.0  # to 5.2 degrees by default: mounts are off by 1.5, and by 5 in roll
-_DRIFT_P_VALUE = 1e-4  # false-alarm rate of the drift test; few images support no smaller one
-_STEP_P_VALUE = 1e-6  # false-alarm rate of the test for a step, over all places of the detector
-_NOT_BY_STARS = 'the stars alone do not determine it'
-_PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
 
 
 @dataclass(frozen=True)
@@ -135,9 +133,10 @@ def _unless_noise(check: GateCheck, is_noise: bool, statistic: str = '') -> Gate
     return dataclasses.replace(check, passed=passed, note=note)
 
 
-def _unless_chance(check: GateCheck, p_value: float, least_p_value: float) -> GateCheck:
-    """Return a check that fails for a significant value alone."""
-    return _unless_noise(check, not p_value < least_p_value, f'p-value {p_value_text(p_value)}')
+def _unless_chance(check: GateCheck, p_value: float, tests: int = 1) -> GateCheck:
+    """Return one of some checks, which fails for a significant value alone."""
+    is_chance = not p_value < FALSE_ALARM_RATE / tests
+    return _unless_noise(check, is_chance, f'p-value {p_value_text(p_value)}')
 
 
 def _worse(*checks: GateCheck) -> GateCheck:
@@ -323,7 +322,7 @@ def star_tracker_gate(
                 'arcsec',
                 'leave it out of more_star_trackers, or use a shorter time',
             )
-            yield _unless_chance(check, one.drift_p_value, _DRIFT_P_VALUE)
+            yield _unless_chance(check, one.drift_p_value, len(found))
 
 
 def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
@@ -334,8 +333,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         name = f'{one.name} as stated'
         yield GateCheck(name, '', math.nan, math.nan, '', one.passed, one.note)
     wrong = [one.name for one in found.statements if one.passed is False]
-    # A distance that the evidence does not decide on may be the cause all the same.
-    wrong += [t.name for t in found.held if t.distance > options.max_held_term_sigma]
+    wrong += [t.name for t in found.held if t.significance > options.max_held_term_sigma]
     remedy = remedy_against(CHANGE)
     if wrong:
         remedy = f'a wrong {wrong[0]} looks like it: first correct that'
@@ -356,7 +354,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'px',
         REMEDIES['detector step'],
     )
-    yield _unless_chance(check, step.p_value, _STEP_P_VALUE)
+    yield _unless_chance(check, step.p_value)
     yield from (_held_check(term, found, options) for term in found.held)
 
 
@@ -370,7 +368,7 @@ def _held_check(term: HeldTerm, found: ModelChecks, options: GateOptions) -> Gat
         'sigma',
     )
     if math.isnan(term.significance):
-        return dataclasses.replace(check, passed=None, note=_NOT_BY_STARS)
+        return dataclasses.replace(check, passed=None, note='the stars alone do not determine it')
     test, estimated = prior_test_of(term.name), significant(term.estimated, 6)
     note, remedy = f'{estimated} by the stars, {significant(term.assumed, 6)} assumed', test.remedy
     if test.unstated and not any(one.name in test.starts for one in found.statements):
@@ -391,9 +389,11 @@ def _predicted(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     if not bins:
         return
 
+    sigmas = -float(ndtri(FALSE_ALARM_RATE / len(bins)))
+
     def excess(part: ResidualBin) -> float:
         # The noise of a few stars must not fail a part.
-        return part.normalised - _PART_SIGMAS * part.sigma
+        return part.normalised - sigmas * part.sigma
 
     worst = max(bins, key=excess)
     check = limit_check(

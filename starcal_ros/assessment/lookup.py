@@ -46,14 +46,13 @@ class LineOfSightTable(Record):
 
     def columns(self) -> dict[str, Floats]:
         """Columns (n,) by name, as in files and messages."""
-        values = (*self.pixels.T, *self.direction_camera.T)
-        return dict(
-            zip(COLUMNS, (*values, self.shape_sigma_arcsec, self.sigma_arcsec), strict=True)
-        )
-
-
-COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
-"""Pixel, unit vector in the camera frame, and 1-sigma of the direction: see `LineOfSightTable`."""
+        u_px, v_px = self.pixels.T
+        x, y, z = self.direction_camera.T
+        sigmas = {
+            'shape_sigma_arcsec': self.shape_sigma_arcsec,
+            'sigma_arcsec': self.sigma_arcsec,
+        }
+        return {'u_px': u_px, 'v_px': v_px, 'x': x, 'y': y, 'z': z, **sigmas}
 
 
 def line_of_sight_table(

@@ -20,13 +20,12 @@ from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
+from starcal_ros.estimation.shared_errors import coarsest_cell_px
 from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
-_CLEAR_SIGMA = 5.0  # the default of the gate: a conflict that fails must be in the evidence too
-_INNER = (0.1, 0.9)  # nearer to the border too few stars lie on one side
-_STEPS = 97  # five places in the width of a strip: a step between two loses a tenth of its size
-_STRIP = 1 / 24  # in widths: a sixth of the shortest wave of the field, which so takes no step
+_STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
+_MARGIN = 0.1  # of the sides, where lenses leave residuals that look like steps: WISPR 0.25 px
 
 
 def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:
@@ -100,17 +99,15 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     Return unknowns that are held or have a stated prior, with what the stars ask for.
 
     Each prior is tested by estimating again without it, a held parameter by estimating it: the
-    field and the shapes of the images absorb the conflict, the unknown itself hardly moves.  Free
-    unknowns also fit errors of the lens: more than `_CLEAR_SIGMA` counts where the data are as
-    much likelier without the prior, and otherwise as much as they are.  What the stars alone do
-    not determine is listed too, with NaN.
+    field and the shapes of the images absorb the conflict, the unknown itself hardly moves.  What
+    the stars alone do not determine is listed too, with NaN.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
         own = int(k - camera[0])
-        means, variances, _ = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
+        means, variances = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
         held, shown = float(estimate.linear.state.parameters[own]), _or_nan(variances[own])
         by_stars = held + float(means[own]) + 0.0 * shown
         terms.append(HeldTerm(layout.labels[k], held, by_stars, math.sqrt(shown)))
@@ -127,25 +124,20 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         test = entry.kind.tested
         if test is None or not tested.any():
             continue
-        means, variances, log_evidence = without_prior(
-            estimate.sums, estimate.linear, entry.name, found
-        )
-        gained = log_evidence - found.log_evidence
+        means, variances = without_prior(estimate.sums, estimate.linear, entry.name, found)
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
             shown = _or_nan(variance)
             off = float(layout.prior_offset[k] + mean) + 0.0 * shown
             # Errors that observations share are in both variances.
             prior2 = min(1.0 / layout.prior_precision[k], entry.plausible_sigma**2)
             sigma = math.sqrt(prior2 + shown * total[k] / working[k])
-            is_far = math.isinf(entry.plausible_sigma) and abs(off) > _CLEAR_SIGMA * sigma
-            evidence = gained if is_far and not gained > 0.5 * _CLEAR_SIGMA**2 else math.nan
             # What is not in the state is zero there, so far from its prior mean.
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
             if k in camera:
                 prior = float(problem.prior_parameters[k - camera[0]])
             label = layout.labels[k]
             name, unit = {**mountings, **test.as_stated}.get(label, (label, 1.0))
-            terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma, evidence))
+            terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma))
     return tuple(terms)
 
 
@@ -155,14 +147,23 @@ def _or_nan(variance: float) -> float:
 
 
 def detector_step(estimate: Estimate) -> DetectorStep:
-    """Return the most significant step between two parts of the detector."""
+    """
+    Return the most significant step between two parts of the detector.
+
+    It is the difference of the mean residuals of two strips side by side, so narrow that no wave
+    of the field takes a part of it.
+    """
     kept = estimate.kept
-    camera, strip_px = estimate.geometry.camera, _STRIP * estimate.geometry.camera.width
+    camera = estimate.geometry.camera
+    strip_px = coarsest_cell_px(camera.width)
     residual_px = estimate.residual_px[kept]
     weight = 2.0 / (estimate.covariance_px2[kept, 0] + estimate.covariance_px2[kept, 2])
-    best, best_significance = ('u', 0.0, 'u', 0.0), 0.0
+    best, best_significance, trials = ('u', 0.0, 'u', 0.0), 0.0, 0
     for axis, size in enumerate((camera.width, camera.height)):
-        place_px: Floats = np.asarray(np.linspace(*_INNER, _STEPS), np.float64) * size - 0.5
+        inner_px = (1.0 - 2.0 * _MARGIN) * size
+        count = round(_STEPS * inner_px / strip_px) + 1
+        place_px = np.asarray(_MARGIN * size - 0.5 + np.linspace(0.0, inner_px, count), np.float64)
+        trials += 2 * round(inner_px / strip_px)  # two axes of the residual at places apart
         pixels = estimate.table.measured_px[kept, axis]
         before, variance_before = _means(
             pixels, residual_px, weight, place_px - strip_px, place_px
@@ -174,8 +175,6 @@ def detector_step(estimate: Estimate) -> DetectorStep:
         if significance[k, moved] > best_significance:
             best_significance = float(significance[k, moved])
             best = ('uv'[axis], float(place_px[k]), 'uv'[moved], float(step[k, moved]))
-    # Twice two axes, and places that do not overlap.
-    trials = 4 * min(_STEPS, round((_INNER[1] - _INNER[0]) / _STRIP))
     p_value = min(1.0, 2.0 * trials * float(ndtr(-best_significance)))
     return DetectorStep(*best, p_value)
 

@@ -22,8 +22,8 @@ from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import information_of_images, stars_alone, StarSums
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.limits import FEWEST
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.outliers import FEWEST_STARS
 from starcal_ros.estimation.problem import Problem, State, supported_terms
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
@@ -128,7 +128,7 @@ def _at_the_prior(
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
-    enough = np.array([len(image) >= FEWEST_STARS for image in ensemble.images])
+    enough = np.array([len(image) >= FEWEST for image in ensemble.images])
     measurements = arrange(table, enough[table.image], table.covariance_px2)
     layout = unknowns_in_state(problem, state)
     cost, sums = stars_alone(problem, state, layout, measurements)

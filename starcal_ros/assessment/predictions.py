@@ -32,6 +32,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.limits import FEWEST, NEGLIGIBLE
 from starcal_ros.estimation.shared_errors import pairs_of
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Ensemble, ResidualBin
@@ -124,9 +125,6 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
 
 _BINS = 4  # quantiles of radius, magnitude and time: corners and faint stars are separate
 _FEWEST_STARS = 30  # the normalised residual of a bin is then accurate to 9 %
-_FEWEST_IMAGES = 4  # three may determine no calibration without one of them
-_NO_EFFECT = 1e-3  # information on a coefficient times its prior variance
-_CELLS = 24  # cells across the width, the size of those of the first fine octave
 
 
 def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
@@ -138,7 +136,7 @@ def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
     than four images.
     """
     table = estimate.table
-    if table.image_count < _FEWEST_IMAGES:
+    if table.image_count <= FEWEST:  # fewer may determine no calibration without one of them
         return ()
     found, expected = predicted_residuals(estimate)
     used = estimate.kept & np.isfinite(found)
@@ -198,7 +196,7 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     # These keep their values: each image may have its own sidereal time, which others do not show,
     # and field coefficients that their prior holds at zero predict nothing of an image.
     shown = (sigma_px**2 + term[field] ** 2) * np.diag(given.information)[field]
-    kept = np.concatenate([layout.of(['site']), field[shown < _NO_EFFECT]])
+    kept = np.concatenate([layout.of(['site']), field[shown < NEGLIGIBLE]])
     part, held = np.setdiff1d(posterior.estimated, kept), np.intersect1d(posterior.estimated, kept)
     own = precision[part]
     pull = own * term[part]
@@ -274,20 +272,19 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
     from_sky = estimate.weights.from_sky[rows]
     on_sky = np.einsum('nba,nb->na', from_sky, residual_px)
     pixels = estimate.table.measured_px[rows]
-    size_px = estimate.geometry.camera.width / _CELLS
-    index = np.floor((pixels + 0.5) / size_px).astype(np.int64)
-    cell = np.unique(index[:, 0] * (1 << 20) + index[:, 1], return_inverse=True)[1]
+    of_stars, coarsest, *finer = estimate.weights.errors
+    cell = np.unique(coarsest.group[rows], return_inverse=True)[1]
     star = np.unique(estimate.table.star[rows], return_inverse=True)[1]
     magnitude = estimate.table.magnitude[rows].astype(np.float64)
     edges = np.quantile(magnitude, np.linspace(0.0, 1.0, _BINS + 1)[1:-1])
     alike = estimate.table.image[rows] * _BINS + np.searchsorted(edges, magnitude)
     alike = np.unique(alike, return_inverse=True)[1]
-    of_stars, *finer = (error.share_px2[rows] for error in estimate.weights.errors)
-    fine = np.sum(finer, axis=0)
+    of_star = of_stars.share_px2[rows]
+    fine = np.sum([error.share_px2[rows] for error in (coarsest, *finer)], axis=0)
     weight = 1.0 / variance
     bins = []
     for by, group, value, shared, along in (
-        ('star', star, on_sky, of_stars, np.bincount(star)[star]),
+        ('star', star, on_sky, of_star, np.bincount(star)[star]),
         ('cell', cell, residual_px, fine, _radius_px(estimate, pixels)),
         ('brightness', alike, residual_px, 0.0 * fine, magnitude),
     ):
@@ -296,7 +293,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
         if by == 'cell':  # a star that comes again in its cell brings its error again
             again = pairs_of(cell, star)
             first = np.unique(again, return_index=True)[1]
-            twice = _of_pairs(again, weight, of_stars)
+            twice = _of_pairs(again, weight, of_star)
             predicted += np.bincount(cell[first], twice, len(predicted))
         squared: Floats = np.asarray(sum(np.bincount(group, weight * v) ** 2 for v in value.T))
         mean = np.bincount(group, along) / count

@@ -36,10 +36,7 @@ from starcal_ros.untrusted import shown
 
 REQUIREMENTS, _NONE = 'requirements', 'none'
 LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
-FOCAL_LENGTHS = ('fx', 'fy')
 _LARGEST, _RMS = 'largest ', 'rms '  # over the detector
-_NUMBER = r'((?:\d+\.?\d*|\.\d+)(?:e-?\d+)?)'
-_FORM = re.compile(rf'\s*(\w+)\s*=\s*{_NUMBER}\s*([a-z]*)\s*(?:@\s*{_NUMBER}\s*%\s*)?')
 
 
 @dataclass(frozen=True)
@@ -58,6 +55,8 @@ class Quantity:
         `_LARGEST` or `_RMS` over the detector; empty for a parameter.
     of_camera, of_alignment : bool
         True if the camera alone, or the alignment, contributes to it.
+    parameters : tuple of str
+        Those of which it is the largest 1-sigma; empty over the detector.
     """
 
     units: tuple[str, ...]
@@ -65,6 +64,7 @@ class Quantity:
     statistic: str = ''
     of_camera: bool = True
     of_alignment: bool = False
+    parameters: tuple[str, ...] = ()
 
     def variance_arcsec2(self, part: SigmaPart) -> float:
         """Return the contribution of a cause to the variance, that of a map at its largest."""
@@ -110,14 +110,14 @@ def _of_parameters(names: tuple[str, ...], calibration: Calibration, unit: str) 
 
 def _parameters(unit: str, *names: str, of_alignment: bool = False) -> Quantity:
     sigma = functools.partial(_of_parameters, names)
-    return Quantity((unit,), sigma, of_camera=not of_alignment, of_alignment=of_alignment)
+    return Quantity((unit,), sigma, '', not of_alignment, of_alignment, names)
 
 
 QUANTITIES: Mapping[str, Quantity] = {
     LINE_OF_SIGHT: Quantity(('arcsec',), _line_of_sight, _LARGEST, of_alignment=True),
     MAP: Quantity(('arcsec', 'px'), _map, _LARGEST),
     POINTING: Quantity(('arcsec',), _pointing, _RMS, of_alignment=True),
-    FOCAL: _parameters('px', *FOCAL_LENGTHS),
+    FOCAL: _parameters('px', 'fx', 'fy'),
     **{name: _parameters('px', name) for name in INTRINSIC_NAMES},
     **{name: _parameters('arcsec', name, of_alignment=True) for name in ALIGNMENT_NAMES},
     **{name: _parameters('', name) for lens in LENSES.values() for name in lens.coefficients},
@@ -146,7 +146,9 @@ class Requirement:
     @classmethod
     def of(cls, text: str) -> Requirement:
         """Requirement of a text; raises OptionError with what is allowed."""
-        match = _FORM.fullmatch(text)
+        number = r'((?:\d+\.?\d*|\.\d+)(?:e-?\d+)?)'
+        form = rf'\s*(\w+)\s*=\s*{number}\s*([a-z]*)\s*(?:@\s*{number}\s*%\s*)?'
+        match = re.fullmatch(form, text)
         if match is None:
             raise OptionError(
                 f'{REQUIREMENTS}: {shown(text)} is not of the form line_of_sight=5arcsec@98%,'

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import CLOCKS_SET_NS, NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.estimation.limits import FEWEST
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, StarObservations, StatementCheck
 from starcal_ros.sky.astrometry import ESCAPE_M_S
@@ -27,12 +28,10 @@ from starcal_ros.sky.velocity import doubt_of, off_earth_m_s, velocity_in
 from starcal_ros.text import significant
 
 _SAMPLED = 8  # images whose velocities are compared, in 25 ms; eight show the turn of an orbit
-_FEWEST_STARS = 2  # one does not show the velocity along its direction
 _UNSTATED_M_S = 1.0  # from the velocity of the Earth, which is taken where none is stated
 # Two images that turn at one rate have rates that agree to a fifth.  Their turn shows the rate if
 # it exceeds the noise of two coarse attitudes ten times and is less than a full turn.
 _EVEN, _LEAST_TURN_RAD, _MOST_TURN_RAD = 0.2, 5e-3, 1.0
-_FEWEST_TURNS = 3
 _RATE_MISTAKES = {
     'opposite to the turn from image to image: change their sign': -1.0,
     'in degrees per second: send rad/s': math.radians(1.0),
@@ -128,7 +127,7 @@ def _stated_velocities(
     is_stated = False
     for image in usable[:: -(-len(usable) // _SAMPLED) or 1]:
         rows, known = catalog.rows_of(image.catalog_id)
-        if known.sum() < _FEWEST_STARS:
+        if known.sum() < 2:  # one does not show the velocity along its direction
             continue
         direction_icrf = image.direction_icrf[known]
         times_ns.append(image.time_ns)
@@ -184,7 +183,7 @@ def _rates(images: Sequence[StarObservations]) -> Iterator[StatementCheck]:
         off_rad = np.linalg.norm(factor * stated_rad - turned_rad, axis=1)[is_even]
         return bool(np.median(off_rad / length_rad[is_even]) < 2 * _EVEN)
 
-    if is_even.sum() < _FEWEST_TURNS:
+    if is_even.sum() < FEWEST:
         yield StatementCheck('rates', None, 'no even turns from image to image show the rates')
     elif explain(1.0):
         yield StatementCheck('rates', True, 'the rates are those of the turns from image to image')

@@ -17,17 +17,19 @@ is never a decision.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import functools
 import math
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.optimize import brentq
 from scipy.special import erf, expit
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.limits import LEAST_GAIN, MOST_CORRELATED, MOST_ROUNDS, ROUNDING
 
 # Prior of the logarithm of an amplitude: a lens or a detector departs from its model by a
 # micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
@@ -39,16 +41,24 @@ OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0  # change of a camera from image to image
-# The gradient vanishes near zero: the search starts from a small amplitude and a large one, px.
-_STARTS_PX = (1e-4, 2e-2)
-_MOST_STEPS = 12  # steps of Fisher scoring from each start
-_SETTLED = 1e-3  # a smaller change of the log likelihood moves no sigma by a thousandth
-_NO_EFFECT = 1e-6  # information on an unknown times its prior variance
-NO_AMPLITUDE = -25.0  # log amplitude without any effect
-# Common factors of the amplitudes over which results are averaged, in logarithms.
-_SHIFTS = np.linspace(-8.0, 6.0, 57)
-# Amplitudes of the likely term, in sigmas of the prior of the logarithm.
-_OF_TERM = np.linspace(-3.0, 3.0, 49)
+LEAST_PX = 1e-9  # amplitude without any effect: no star is measured to a nanopixel
+# Where searches start: at the centre of the prior, and beyond, since the gradient vanishes near
+# zero and there may be several maxima.
+STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
+# Common factors of the amplitudes over which results are averaged, in logarithms: from one without
+# an effect to one that few images still allow.  Many images leave the factor 1 alone.
+_SHIFTS: Floats = np.asarray(np.linspace(-8.0, 6.0, 43), np.float64)
+
+
+def log_amplitudes(largest_px: float) -> Floats:
+    """
+    Return logarithms (g,) over which the posterior of one amplitude is summed.
+
+    From one without an effect to the largest, in steps of 17 % of a variance.
+    """
+    steps = round(math.log(largest_px / LEAST_PX) / math.log(1.17**0.5))
+    logs = np.linspace(math.log(LEAST_PX), math.log(largest_px), steps + 1)
+    return np.asarray(logs, np.float64)
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,6 @@ class Averaged:
     log_px: Floats
     weight: Floats
     term: Amplitudes
-    log_evidence: float
 
 
 def octave_prior(count: int, first: tuple[float, float] = UNSTATED) -> tuple[Floats, Floats]:
@@ -100,6 +109,7 @@ def field_amplitudes(
     octave: Indices,
     near: Amplitudes | None = None,
     first: tuple[float, float] = UNSTATED,
+    starts_px: Sequence[float] = STARTS_PX[:3:2],
 ) -> Amplitudes:
     """
     Amplitudes of the octaves of a field by Fisher scoring.
@@ -113,22 +123,24 @@ def field_amplitudes(
         Amplitudes of the round before: the search starts there and from one other place.
     first : float, float
         Prior of the first octave, as of `octave_prior`.
+    starts_px : sequence of float
+        Where the search starts; the last is that beside ``near``.
     """
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count, first)
-    starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in _STARTS_PX]
+    starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in starts_px]
     if near is not None:
-        starts = [near.log_px, starts[1]]
+        starts = [near.log_px, starts[-1]]
     member = np.equal.outer(np.arange(count), octave).astype(float)
     cap = math.log(LARGEST_FIELD_PX)
 
     def evaluate(log_px: Floats) -> tuple[float, Floats, Floats]:
         s = np.exp(log_px)[octave]
-        # Coefficients without an effect: their tiny numbers slow a processor down tenfold.
-        shown = np.flatnonzero(s**2 * np.diag(information) > _NO_EFFECT)
+        # All others together change the likelihood by less than what ends the search.
+        shown = np.flatnonzero(s**2 * np.diag(information) > LEAST_GAIN / len(s))
         s, own = s[shown], member[:, shown]
         scaled = information[np.ix_(shown, shown)] * np.outer(s, s)
-        scaled[np.abs(scaled) < _NO_EFFECT**2] = 0.0
+        scaled[np.abs(scaled) < ROUNDING] = 0.0  # products of tiny numbers take tenfold time
         scaled[np.diag_indices(len(s))] += 1.0
         lower, inverse = _cholesky_and_inverse(scaled)
         mode = inverse @ (s * gradient[shown])
@@ -142,7 +154,7 @@ def field_amplitudes(
     best, best_value = mean, -np.inf
     for log_px in starts:
         value, slope, fisher = evaluate(log_px)
-        for _ in range(_MOST_STEPS):
+        for _ in range(MOST_ROUNDS):
             step = np.linalg.solve(fisher, slope)
             # A step changes an amplitude by e^2 at most, and shrinks until the posterior rises.
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
@@ -153,7 +165,7 @@ def field_amplitudes(
                 if found[0] > value - 1e-9:
                     log_px, (value, slope, fisher) = trial, found
                     break
-            if abs(value - before) < _SETTLED:
+            if abs(value - before) < LEAST_GAIN:
                 break
         if value > best_value + 1e-6:
             best, best_value = log_px, value
@@ -181,13 +193,16 @@ def averaged_field(
     amplitudes: Amplitudes,
     term: Floats,
     first: tuple[float, float] = UNSTATED,
+    shifts: Floats = _SHIFTS,
+    log_term: Floats | None = None,
 ) -> Averaged:
     """
     Return the coefficients averaged over a common factor of the amplitudes of the octaves.
 
     ``term`` (q,) are the coefficients of a departure that is likely, at 1 px.  It is averaged over
     an amplitude of its own; those of the octaves are found without it, since another
-    departure may look like it.
+    departure may look like it.  ``shifts`` are the logarithms of the factors, ``log_term``
+    those of the amplitude of the term (default: all).
     """
     mean, precision = octave_prior(len(amplitudes.log_px), first)
     s = np.exp(amplitudes.log_px)[octave]
@@ -195,7 +210,7 @@ def averaged_field(
     values = np.maximum(values, 0.0)
     along = vectors.T @ (s * gradient)
     room = math.log(LARGEST_FIELD_PX) - amplitudes.log_px.max()
-    shift = _SHIFTS[room + 1e-9 >= _SHIFTS]
+    shift = shifts[room + 1e-9 >= shifts]
     factor = np.exp(2.0 * shift)[:, None]
     held = 1.0 + values * factor
     variance = factor / held
@@ -207,10 +222,12 @@ def averaged_field(
     with_term = vectors.T @ (s * shown)
     own = np.maximum(term @ shown - variance @ with_term**2, 0.0)[:, None]
     pull = (term @ gradient - variance @ (with_term * along))[:, None]
-    log_term = np.minimum(LOG_CENTRE + LOG_SIGMA * _OF_TERM, math.log(LARGEST_FIELD_PX))
+    if log_term is None:
+        log_term = log_amplitudes(LARGEST_FIELD_PX)
     prior = np.exp(2.0 * log_term)
     of_term = prior / (1.0 + prior * own)
-    log_share = 0.5 * (of_term * pull**2 - np.log1p(prior * own)) - 0.5 * _OF_TERM**2
+    log_share = 0.5 * (of_term * pull**2 - np.log1p(prior * own))
+    log_share -= 0.5 * ((log_term - LOG_CENTRE) / LOG_SIGMA) ** 2
     share = np.exp(log_share - log_share.max(axis=1, keepdims=True))
     share /= share.sum(axis=1, keepdims=True)
     weight = np.exp(log_weight - log_weight.max())
@@ -230,7 +247,6 @@ def averaged_field(
         amplitudes.log_px[-1] + shift,
         weight,
         _of_one(float(own[best, 0]), float(pull[best, 0])),
-        float(np.logaddexp.reduce(log_weight + np.logaddexp.reduce(log_share, axis=1))),
     )
 
 
@@ -238,7 +254,7 @@ def _of_one(information: float, gradient: float) -> Amplitudes:
     """Return the amplitude at the maximum of the likelihood of one coefficient."""
     excess = gradient**2 / information - 1.0 if information > 0 else 0.0
     if excess <= 0:
-        return Amplitudes(np.array([NO_AMPLITUDE]), 0.0)
+        return Amplitudes(np.array([math.log(LEAST_PX)]), 0.0)
     log_px = 0.5 * math.log(excess / information)
     return Amplitudes(np.array([log_px]), excess - math.log1p(excess))
 
@@ -265,15 +281,7 @@ class ShapeSums:
 # of an orbit about the Earth if that is shorter.
 _PER_STEP = 0.9
 _STEP_S = 100.0  # time in which heat loses a tenth
-_MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
-_AT_ONCE = 8192  # images times amplitudes
-_AHEAD = 1024  # images times amplitudes that are tried before the one before them is settled
-_SHAPE_STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
-_SHAPE_SHIFTS = np.linspace(-8.0, 6.0, 43)
-_LOG_SHAPE = np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70)
-_NO_WEIGHT = 1e-9  # relative weight below which a sigma moves no interval by a millionth
-_HALVINGS = 36  # bisections in the logarithm: an interval of 20 shrinks to below 1e-9
-_TWO_SIGMA = math.erf(math.sqrt(2.0))
+_AT_ONCE = 8192  # images times trials: with more, memory is slower
 
 
 @dataclass(frozen=True)
@@ -301,11 +309,11 @@ def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
     """Return the amplitudes of the shapes; ``near``: those of the round before."""
     likelihood = _shape_likelihood(sums)
     m, count = sums.gradient.shape
-    best, value = _climb(likelihood, count, max(_AHEAD // max(m, 1), 1), near)
-    none = np.full(len(best), NO_AMPLITUDE)
+    best, value = _climb(likelihood, count, _AT_ONCE // max(m, 1), near)
+    none = np.full(len(best), math.log(LEAST_PX))
     prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
     ratio = 2.0 * (value - float(likelihood(none[None])[0])) + float(prior)
-    shift = _SHAPE_SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHAPE_SHIFTS]
+    shift = _SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHIFTS]
     log_weight = likelihood(best + shift[:, None])
     if not np.isfinite(log_weight.max()):
         raise NotObservable('the unknowns cannot be separated from the shapes of the images')
@@ -321,16 +329,13 @@ def interval_factor(sigma: Floats, weight: Floats) -> float:
     Errors of an uncertain sigma have long tails, as Student's t has: few images determine no
     variance.  A normal error of this sigma has the same 2-sigma interval.
     """
-    some = weight > _NO_WEIGHT * weight.max()
-    sigma, weight = sigma[some], weight[some] / weight[some].sum()
-    low, high = float(sigma.min()), float(sigma.max())
-    for _ in range(_HALVINGS):
-        middle = math.sqrt(low * high)
-        if weight @ erf(math.sqrt(2.0) * middle / sigma) < _TWO_SIGMA:
-            low = middle
-        else:
-            high = middle
-    return math.sqrt(low * high)
+
+    def beyond(log_half: float) -> float:
+        inside = weight @ erf(math.sqrt(2.0) * math.exp(log_half) / sigma) / weight.sum()
+        return float(inside) - math.erf(math.sqrt(2.0))
+
+    low, high = math.log(sigma.min()) - 1.0, math.log(sigma.max()) + 1.0
+    return math.exp(brentq(beyond, low, high))
 
 
 def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
@@ -345,7 +350,7 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
 
     def likelihood(log_px: Floats) -> Floats:
         k, s = len(log_px), np.exp(log_px)
-        shown = np.flatnonzero(s**2 @ total > _NO_EFFECT)
+        shown = np.flatnonzero(s**2 @ total > LEAST_GAIN)
         if k > 1 and len(shown) * m > _AT_ONCE:  # more at once is slower: memory
             return np.concatenate([likelihood(log_px[: k // 2]), likelihood(log_px[k // 2 :])])
         left, log_det = np.tile(whole, (k, 1, 1)), np.zeros(k)
@@ -394,21 +399,23 @@ def _inverse(matrices: Floats) -> tuple[Floats, Floats]:
 
 
 def _climb(
-    likelihood: Callable[[Floats], Floats], count: int, ahead: int, near: Amplitudes | None
+    likelihood: Callable[[Floats], Floats], count: int, at_once: int, near: Amplitudes | None
 ) -> tuple[Floats, float]:
     """
     Return the log amplitudes (count,) of the largest posterior, and its logarithm.
 
-    One amplitude at a time: to each of several values, then by shrinking steps.  The posterior is
-    flat where an amplitude has no effect, so that steps alone do not leave zero.
+    One amplitude at a time: to each of several values, then by shrinking steps; the trials of the
+    next amplitudes are made with it, as far as ``at_once`` allows.  The posterior is flat where an
+    amplitude has no effect, so that steps alone do not leave zero.
     """
-    coarse = np.log(_SHAPE_STARTS_PX if near is None else _SHAPE_STARTS_PX[1:-1:2])
+    coarse = np.log(STARTS_PX if near is None else STARTS_PX[1:4:2])
     starts = np.tile(coarse[:, None], (1, count)) if near is None else near.log_px[None]
     values = likelihood(starts)
     best, value = starts[np.argmax(values)], float(values.max())
     for step in (0.0, 1.0, 0.3, 0.1):
         k = settled = 0  # the next amplitude, and how many before it did not improve
         while settled < count:
+            ahead = max(at_once // len(coarse), 1)
             at = np.arange(k, k + min(ahead, count - settled)) % count
             there = np.tile(coarse, (len(at), 1))
             if step:
@@ -416,8 +423,8 @@ def _climb(
             trials = np.tile(best, (*there.shape, 1))
             trials[np.arange(len(at)), :, at] = there
             values = likelihood(trials.reshape(-1, count)).reshape(there.shape)
-            values[(there <= NO_AMPLITUDE) | (there >= math.log(LARGEST_SHAPE_PX))] = -np.inf
-            better = np.flatnonzero(values.max(axis=1) > value + _SETTLED)
+            values[(there <= math.log(LEAST_PX)) | (there >= math.log(LARGEST_SHAPE_PX))] = -np.inf
+            better = np.flatnonzero(values.max(axis=1) > value + LEAST_GAIN)
             k, settled = k + len(at), settled + len(at)
             if len(better):
                 first = better[0]
@@ -449,7 +456,7 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
     the images eliminated.
     """
     information = np.einsum('mii->mi', sums.information)
-    used = np.flatnonzero((information > 0).all(axis=1))[:_MOST_CORRELATED]
+    used = np.flatnonzero((information > 0).all(axis=1))[:MOST_CORRELATED]
     if len(used) < 2:
         return np.zeros(len(sigma_px))
     left = sums.gradient[used] - sums.cross[used] @ _shared_mean(sums, sigma_px)
@@ -477,9 +484,10 @@ def _evidence(values: Floats, ones: Floats, along: Floats) -> float:
     Along each axis (m,): variance at an amplitude of 1 px, component of a common shape, and of
     the shapes.
     """
-    inverse = 1.0 / (1.0 + np.exp(2.0 * _LOG_SHAPE)[:, None] * np.maximum(values, 0.0))
+    log_px = log_amplitudes(LARGEST_SHAPE_PX)
+    inverse = 1.0 / (1.0 + np.exp(2.0 * log_px)[:, None] * np.maximum(values, 0.0))
     of_ones, mean = inverse @ ones**2, inverse @ (ones * along)
     squared = inverse @ along**2 - mean**2 / of_ones
     log_det = np.log(of_ones) - np.log(inverse).sum(axis=1)
-    prior = ((_LOG_SHAPE - LOG_CENTRE) / LOG_SIGMA) ** 2
+    prior = ((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2
     return float(np.logaddexp.reduce(-0.5 * (log_det + squared + prior)))

@@ -22,9 +22,10 @@ from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.amplitudes import UNSTATED
+from starcal_ros.estimation.amplitudes import STARTS_PX, UNSTATED
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, STEP_SIGMA
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
@@ -32,13 +33,7 @@ from starcal_ros.estimation.options import (
     check_options,
 )
 from starcal_ros.estimation.outliers import dropped_stars
-from starcal_ros.estimation.posterior import (
-    LEAST_SHAPE_PX,
-    Posterior,
-    posterior,
-    Weights,
-    with_shared_errors,
-)
+from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
 from starcal_ros.estimation.problem import (
     canonical_xyzw,
     image_parameters,
@@ -77,7 +72,6 @@ from starcal_ros.estimation.weights import (
     CentroidVariance,
     Data,
     degrees_of_freedom,
-    FREE_FACTOR,
     has_converged,
     judge,
     sky_rotations,
@@ -96,9 +90,7 @@ from starcal_ros.records import (
 _START_FLOOR_PX = 0.05  # good images leave about that much; the residuals replace it
 _ROBUST_SCALE = 3.0  # Cauchy loss, sigma: normal noise loses 3 % of its information
 _ROBUST_GAIN = 0.1  # steps of less than half a sigma are left to the posterior
-_ROUNDS = 24  # three or four are usual; principal points that stars hardly show take ten
-_STEP_SIGMA = 0.05  # a twentieth of a sigma changes no result: the state is at the minimum
-_LEAST_SHARE = 0.25  # smaller steps would not arrive within `_ROUNDS`
+_LEAST_SHARE = 0.25  # smaller steps would not arrive within `MOST_ROUNDS`
 _SPACE_VELOCITY_M_S = 20000.0  # against the Earth: orbits about both Earth and Sun have such
 _PLAUSIBLE_M_S = 8000.0  # orbits about the Earth are no faster
 _UNKNOWN_READOUT_S = 0.02  # a rolling shutter takes 5 to 50 ms a frame
@@ -249,25 +241,25 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     residual_px = residuals_px(problem, state, table)
     from_sky = sky_rotations(state, table, data.prior.camera)
     judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats | float = LEAST_SHAPE_PX
+    shape_px: Floats | float = STARTS_PX[0]
     before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
     before_sigma: Floats = np.empty(0)
-    for k in range(_ROUNDS):
+    for k in range(MOST_ROUNDS):
         last = _round(data, problem, state, judged, residual_px, shape_px, before, share)
         after = judge(
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shapes.sigma_px, LEAST_SHAPE_PX)
+        shape_px = np.maximum(last.posterior.shapes.sigma_px, STARTS_PX[0])
         iterations += 1
         step_sigma = _step_sigma(last.posterior)
-        is_settled = np.abs(step_sigma).max(initial=0.0) < _STEP_SIGMA
+        is_settled = np.abs(step_sigma).max(initial=0.0) < STEP_SIGMA
         if is_settled and has_converged(judged, after, table):
             termination = 'converged'
             break
-        if k < _ROUNDS - 1:
+        if k < MOST_ROUNDS - 1:
             state, judged = last.after, after
         # Steps of unknowns that stars hardly show oscillate: the ratio of successive steps damps
         # them.

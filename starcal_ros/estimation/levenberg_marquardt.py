@@ -25,17 +25,12 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import TooFewObservations
+from starcal_ros.estimation.limits import MOST_ROUNDS, ROUNDING
 
 StateT = TypeVar('StateT')
 
-_MAX_ITERATIONS = 100
-_STEP_TOLERANCE = 1e-9  # in 1-sigma of a parameter: negligible
-# Relative: residuals of an image round alike, by 1e-13 px; in a cost of 30,000 that was 5e-9.
-_COST_TOLERANCE = 1e-12
-_SCHUR_TOLERANCE = 1e-12  # precision of a sum of a million products
 # The paper starts at 1e-3 (step 4), which slows weak directions: 6 passes instead of 3.
 _LAMBDA_START = 1e-6
-_LAMBDA_MAX = 1e12  # no step lowers the cost: the search ends
 
 
 @dataclass(frozen=True)
@@ -124,7 +119,7 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     w = np.einsum('mij,mj->mi', C_inverse, normal.c)
     flat_B = normal.B.reshape(len(normal.B) * q, p)
     S = A - flat_B.T @ W.reshape(flat_B.shape)
-    if (np.diag(S) < _SCHUR_TOLERANCE * np.diag(A)).any():
+    if (np.diag(S) < ROUNDING * np.diag(A)).any():
         raise NotObservable('a shared unknown cannot be separated from the blocks')
     shared = inverse(S) @ (normal.a - flat_B.T @ w.ravel())
     return shared, w - W @ shared
@@ -154,8 +149,8 @@ def levenberg_marquardt(
     -----
     Marquardt's damping in the paper's form (Eq. 25), scaled by the diagonal.  A step is judged by
     the actual over the predicted reduction of the cost (Nielsen's rule for the damping).
-    The search has converged when the undamped step is below ``1e-9`` of the 1-sigma scale in every
-    unknown, or lowers the cost by less than ``least_gain`` or its rounding.
+    The search has converged when the undamped step lowers the cost by less than ``least_gain`` or
+    its rounding: a step of a millionth of the 1-sigma scale.
 
     Raises
     ------
@@ -166,12 +161,8 @@ def levenberg_marquardt(
     if not np.isfinite(normal.cost):
         raise NotObservable('the cost at the start is not finite')
     damping, growth = _LAMBDA_START, 2.0
-    for iteration in range(1, _MAX_ITERATIONS + 1):
+    for iteration in range(1, MOST_ROUNDS + 1):
         shared, blocks = solve_arrow(normal, damping)
-        scaled = max(
-            np.abs(shared * np.sqrt(np.diag(normal.A))).max(initial=0.0),
-            np.abs(blocks * np.sqrt(np.einsum('mii->mi', normal.C))).max(initial=0.0),
-        )
         # Predicted reduction of the cost: step' (damping D step + [a; c]) / 2.
         predicted = 0.5 * (
             shared @ (damping * np.diag(normal.A) * shared + normal.a)
@@ -179,8 +170,9 @@ def levenberg_marquardt(
         )
         # The criteria apply to the undamped step.
         reach = 1.0 + damping
-        least = max(least_gain, _COST_TOLERANCE * normal.cost)
-        if scaled * reach < _STEP_TOLERANCE or predicted * reach < least:
+        # Residuals of an image round alike, by 1e-13 px: a cost of 30,000 by 5e-9.
+        least = max(least_gain, ROUNDING * max(normal.cost, 1.0))
+        if predicted * reach < least:
             return Solution(state, normal, iteration, 'converged')
         candidate = move(state, shared, blocks)
         candidate_normal = evaluate(candidate)
@@ -191,6 +183,6 @@ def levenberg_marquardt(
             damping, growth = max(damping, 1e-15), 2.0
         else:
             damping, growth = damping * growth, growth * 2.0
-            if damping > _LAMBDA_MAX:
+            if damping > 1.0 / ROUNDING:  # no step lowers the cost
                 return Solution(state, normal, iteration, 'no_descent')
-    return Solution(state, normal, _MAX_ITERATIONS, 'iteration_limit')
+    return Solution(state, normal, MOST_ROUNDS, 'iteration_limit')

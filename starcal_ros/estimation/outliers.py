@@ -7,22 +7,18 @@ An error is compared with its variance given the others, less the part that the 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, stdtrit
+from scipy.special import chdtri, ndtri, stdtrit
 
 from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.estimation.limits import FALSE_ALARM_RATE, FEWEST
 from starcal_ros.estimation.shared_errors import Groups
 from starcal_ros.estimation.star_equations import squared_sigmas, StarTable
 
-FEWEST_STARS = 3  # the rotation of an image fits one star exactly and two nearly
-_FEWEST_SIGHTINGS = 3  # sightings that separate the error of a star from those of its images
-_STAR_CHANCE = 1e-7  # probability that the sum of its residuals drops a good star
-_FEWEST_ATTITUDES = 3  # two show that one of them is wrong, but not which
-_MISFIT_SIGMA = 6.0  # noise exceeds it once in 10^8 attitudes, and a jump is far larger
-_EFFICIENCY = 0.37  # efficiency of a variance from the median of squares, normal errors
-_CHANCE = 1e-5  # probability that a good attitude lies beyond the limit
-_MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
+QUARTILE = float(ndtri(0.75))  # median size of normal errors of unit variance
 
 
 def fitting_stars(
@@ -60,10 +56,12 @@ def fitting_stars(
     share = np.minimum(star_px2 / own, 1.0)
     largest = np.bincount(star, share) / sightings * (sightings - 1) + 1.0
     summed = np.bincount(star, np.where(fits, length2, 0.0))
-    bad = (2 * misses > sightings) | (summed > chdtri(2 * sightings, _STAR_CHANCE) * largest)
-    fits &= ~(bad & (sightings >= _FEWEST_SIGHTINGS))[star]
+    judged = sightings >= FEWEST
+    chance = FALSE_ALARM_RATE / max(int(np.count_nonzero(judged)), 1)
+    bad = (2 * misses > sightings) | (summed > chdtri(2 * sightings, chance) * largest)
+    fits &= ~(bad & judged)[star]
     left = np.bincount(table.image[fits], minlength=table.image_count)
-    return np.asarray(fits & (left[table.image] >= FEWEST_STARS))
+    return np.asarray(fits & (left[table.image] >= FEWEST))
 
 
 def _squared_beside(
@@ -90,7 +88,7 @@ def _squared_beside(
 def dropped_stars(table: StarTable, kept: Mask) -> NDArray[np.int64]:
     """Return the catalog stars with enough sightings that are left out of all images."""
     sightings, uses = np.bincount(table.star), np.bincount(table.star, kept)
-    return np.asarray(np.unique(table.catalog_id)[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
+    return np.asarray(np.unique(table.catalog_id)[(sightings >= FEWEST) & (uses == 0)])
 
 
 def misfit_images(
@@ -115,23 +113,27 @@ def misfit_images(
 
     Notes
     -----
-    Beyond 6 sigma about an axis off the median, both of the stated sigma and of the scatter of the
-    images: a star tracker that drifts has no misfits.  Where the sigma is a guess, the scatter of
-    few images alone is uncertain: the limit is that of Student's t if it is larger.  If more than
-    a third would be misfits, the majority is unclear, and none is reported.
+    Farther off the median about an axis than noise is by chance, both that of the stated sigma and
+    that of the scatter of the images: a star tracker that drifts has no misfits.  Where the sigma
+    is a guess, the scatter of few images alone is uncertain: the limit is that of Student's t.  If
+    more than a third would be misfits, the majority is unclear, and none is reported.
     """
     misfit: Mask = np.zeros(len(seen), bool)
+    # Of the variance of normal errors from the median of their squares: relative to the mean.
+    efficiency = 8.0 * (QUARTILE * math.exp(-0.5 * QUARTILE**2)) ** 2 / (2.0 * math.pi)
     for k in np.unique(star_tracker[seen]):
         here = seen & (star_tracker == k)
-        if np.count_nonzero(here) < _FEWEST_ATTITUDES:
+        m = np.count_nonzero(here)
+        if m < FEWEST:
             continue
         left = error[here] - np.median(error[here], axis=0)
-        spread2 = np.median(left**2, axis=0) / _MEDIAN_OF_SQUARE
+        spread2 = np.median(left**2, axis=0) / QUARTILE**2
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
-        freedom = _EFFICIENCY * (np.count_nonzero(here) - 1)
-        limit = max(_MISFIT_SIGMA, 0.0 if is_stated else float(stdtrit(freedom, 1.0 - _CHANCE)))
+        chance = 0.5 * FALSE_ALARM_RATE / (3 * m)  # of each side of each axis
+        freedom = math.inf if is_stated else efficiency * (m - 1)
+        limit = -float(stdtrit(freedom, chance))
         found = (left**2 > limit**2 * usual).any(axis=1)
-        if 3 * np.count_nonzero(found) <= np.count_nonzero(here):
+        if 3 * np.count_nonzero(found) <= m:
             misfit[here] = found
     return misfit

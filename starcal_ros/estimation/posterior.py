@@ -13,6 +13,7 @@ from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
 import functools
+import math
 
 import numpy as np
 from scipy.linalg import solve
@@ -23,12 +24,11 @@ from starcal_ros.estimation.amplitudes import (
     Amplitudes,
     averaged_field,
     field_amplitudes,
-    LOG_CENTRE,
-    LOG_SIGMA,
-    NO_AMPLITUDE,
+    LEAST_PX,
     Shapes,
     shapes,
     ShapeSums,
+    STARTS_PX,
 )
 from starcal_ros.estimation.equations import (
     arrow,
@@ -42,13 +42,11 @@ from starcal_ros.estimation.equations import (
     weighted_rows_by,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE
 from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
-
-_WITHOUT = 1e3  # factor that removes a prior: no data sheet is off by so many sigma
-LEAST_SHAPE_PX = 1e-4  # to begin with
 
 
 @dataclass(frozen=True)
@@ -94,8 +92,6 @@ class Posterior:
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
-    log_evidence : float
-        Log evidence of the data given the priors, up to a constant.
     layout : Layout
     errors : ErrorParts or None
         None before `with_shared_errors`.
@@ -110,7 +106,6 @@ class Posterior:
     shapes: Shapes
     last_octave: tuple[Floats, Floats]
     resolved: float
-    log_evidence: float
     layout: Layout
     errors: ErrorParts | None = None
 
@@ -131,7 +126,7 @@ class Posterior:
 def posterior(
     sums: StarSums,
     linear: Linearisation,
-    before: Floats | float = LEAST_SHAPE_PX,
+    before: Floats | float = STARTS_PX[0],
     near: Posterior | None = None,
 ) -> Posterior:
     """
@@ -150,19 +145,13 @@ def posterior(
     start = eliminated(normal, layout, before)
     solver = _Solver(layout)
     base, field_px = solver.likely(start, near.field if near else None)
-    none = Amplitudes(np.full(len(before), NO_AMPLITUDE), 0.0)
+    none = Amplitudes(np.full(len(before), math.log(LEAST_PX)), 0.0)
     found, last = Shapes(before, none, None), start
     if len(sums.blocks) > 1:
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shapes.amplitudes if near else None)
         last = eliminated(normal, layout, found.sigma_px)
-    mean, covariance, last_octave, term, log_evidence = solver.solve(last, base)
-    # The unknowns of the images, eliminated, and the prior of their amplitudes.
-    log_evidence += 0.5 * float(np.linalg.slogdet(last.covariance)[1].sum())
-    log_evidence += 0.5 * float((last.own * normal.c).sum())
-    log_px = np.log(found.sigma_px)
-    log_evidence -= len(normal.c) * float(log_px.sum())
-    log_evidence -= 0.5 * float((((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2).sum())
+    mean, covariance, last_octave, term = solver.solve(last, base)
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
@@ -174,36 +163,30 @@ def posterior(
         shapes=found,
         last_octave=last_octave,
         resolved=resolved,
-        log_evidence=log_evidence,
         layout=layout,
     )
 
 
 def without_prior(
     sums: StarSums, linear: Linearisation, name: str, near: Posterior, held: int | None = None
-) -> tuple[Floats, Floats, float]:
+) -> tuple[Floats, Floats]:
     """
-    Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
+    Return mean and variance (q,) of the unknowns of an entry without its prior.
 
     With ``held`` only that number of the entry, which is held, is free.
 
     The amplitudes are estimated again: field and shapes may hide that a prior is wrong.  A free
     trend and a free velocity would absorb errors of the lens, so the trend keeps its value of the
-    posterior ``near`` with the prior, and its cost.  The variance is that of the working weights;
+    posterior ``near`` with the prior.  The variance is that of the working weights;
     infinite where stars show less than what is possible at all.
     """
-    at_trend = linear.layout.trend_at
-    trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
-    cost = 0.5 * float(
-        (stated * trend**2 - np.log(stated * np.diag(near.working)[at_trend])).sum()
-    )
     entries = []
     for entry in linear.layout.entries:
         if entry.name == name:
             entry = dataclasses.replace(entry, sigma=_without_prior(entry, held))
         elif entry.kind.cause == CHANGE and not entry.of_image:
             kept = near.mean[linear.layout.places[entry.name]]
-            entry = dataclasses.replace(entry, sigma=_KEPT * entry.sigma, offset=-kept)
+            entry = dataclasses.replace(entry, sigma=entry.sigma / FREE_FACTOR, offset=-kept)
         entries.append(entry)
     wide = Layout(tuple(entries))
     linear = dataclasses.replace(linear, layout=wide)
@@ -211,7 +194,7 @@ def without_prior(
     try:
         found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
-        return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
+        return np.zeros(len(at)), np.full(len(at), np.inf)
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
         shown = 1.0 / np.diag(found.working)[at] - precision
@@ -219,14 +202,14 @@ def without_prior(
         variance = np.where(seen, 1.0 / shown, np.inf)
         # The wide prior pulls a little: off + mean is the sum of both by their information.
         alone = (off + found.mean[at]) * (1.0 + precision * variance) - off
-    return np.where(seen, alone, 0.0), variance, found.log_evidence - cost
+    return np.where(seen, alone, 0.0), variance
 
 
 def _without_prior(entry: Unknown, held: int | None) -> Floats:
     """Return the sigma (q,) of an entry without its prior: the largest possible."""
     if held is not None:
         return np.where(np.arange(len(entry)) == held, np.inf, entry.sigma)
-    widest = np.minimum(_WITHOUT * entry.sigma, entry.widest)
+    widest = np.minimum(FREE_FACTOR * entry.sigma, entry.widest)
     return np.asarray(np.maximum(entry.sigma, widest))
 
 
@@ -272,8 +255,8 @@ class _Solver:
 
     def solve(
         self, arrow: Equations, amplitudes: Amplitudes
-    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes, float]:
-        """Return mean (P,), covariance (P, P), last octave, lens term, and log evidence."""
+    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes]:
+        """Return mean (P,), covariance (P, P), last octave and lens term."""
         count = self.layout.count
         mean, covariance = np.zeros(count), np.zeros((count, count))
         information, left, free, gradient, back = self._of_field(arrow)
@@ -287,14 +270,7 @@ class _Solver:
         covariance[np.ix_(self.free, self.field)] = to_free * self.unit
         covariance[np.ix_(self.field, self.free)] = (to_free * self.unit).T
         covariance[np.ix_(self.free, self.free)] = free - to_free @ back.T
-        precision, offset = self.precision[self.free], self.layout.prior_offset[self.free]
-        stated = precision > 0
-        log_evidence = field.log_evidence + 0.5 * float(
-            np.linalg.slogdet(free)[1]
-            + gradient @ free @ gradient
-            + (np.log(precision[stated]) - precision[stated] * offset[stated] ** 2).sum()
-        )
-        return mean, covariance, (field.log_px, field.weight), field.term, log_evidence
+        return mean, covariance, (field.log_px, field.weight), field.term
 
     def resolved(self, arrow: Equations, covariance: Floats) -> float:
         """Return the number of shared unknowns that the data determine."""
@@ -352,8 +328,6 @@ def common_shape(layout: Layout, common_px2: Floats) -> Floats:
 
 
 TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
-_KEPT = 1e-3  # factor on a prior sigma that holds an unknown at its mean
-_HELD = 0.05  # information on a mode times its variance, below which its prior holds it
 
 
 @dataclass(frozen=True)
@@ -380,11 +354,20 @@ class Weights:
 
 
 def with_shared_errors(
-    found: Posterior, sums: StarSums, linear: Linearisation, weights: Weights
+    found: Posterior,
+    sums: StarSums,
+    linear: Linearisation,
+    weights: Weights,
+    negligible: float = NEGLIGIBLE,
 ) -> Posterior:
-    """Return the posterior with the covariance under the errors that observations share."""
+    """
+    Return the posterior with the covariance under the errors that observations share.
+
+    ``negligible``: information on a mode of the field times its variance, below which its prior
+    holds it.
+    """
     layout = linear.layout
-    root, held = _root(found.working, found.estimated, sums, layout)
+    root, held = _root(found.working, found.estimated, sums, layout, negligible)
     excess, shared = _of_observations(found, linear, weights, root)
     of_attitudes, by_tracker = _of_attitudes(found, linear, weights, root)
     excess += of_attitudes
@@ -400,7 +383,7 @@ def with_shared_errors(
 
 
 def _root(
-    covariance: Floats, estimated: Indices, sums: StarSums, layout: Layout
+    covariance: Floats, estimated: Indices, sums: StarSums, layout: Layout, negligible: float
 ) -> tuple[Floats, Floats]:
     """
     Return L (P, r) and M (P, h), where ``L L' + M M'`` is a covariance.
@@ -423,7 +406,7 @@ def _root(
     own = np.zeros((layout.count, len(others)))
     own[others] = size[:, None] * own_vectors * np.sqrt(own_values.clip(0.0))
     shown = np.einsum('im,ij,jm->m', vectors, sums.field_information, vectors, optimize=True)
-    moved = values * shown > _HELD
+    moved = values * shown > negligible
     return np.concatenate([own, modes[:, moved]], axis=1), modes[:, ~moved]
 
 

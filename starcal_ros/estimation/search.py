@@ -26,12 +26,12 @@ from starcal_ros.estimation.levenberg_marquardt import (
     NormalEquations,
     Solution,
 )
+from starcal_ros.estimation.limits import FEWEST
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     estimated_parameters,
 )
-from starcal_ros.estimation.outliers import FEWEST_STARS
 from starcal_ros.estimation.problem import Problem, reference_degc, star_tracker_names, State
 from starcal_ros.estimation.star_equations import Measurements, StarTable, turned
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
@@ -203,7 +203,7 @@ def _rotations(
     u, _, vt = np.linalg.svd(np.stack(products, axis=1).reshape(m, 3, 3))
     fitted, before = u @ vt, predicted.as_matrix()
     # A mirrored image has an improper one: the search finds its negative focal length.
-    good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST_STARS)
+    good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST)
     count = np.bincount(image, minlength=m)
     middle = np.cumsum(count) - count + count // 2
     # Medians: lengths, at most 2, are sorted within their images by one key.

@@ -34,26 +34,21 @@ from scipy.sparse import csr_array
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
+    log_amplitudes,
     LOG_CENTRE,
     LOG_SIGMA,
     OCTAVE_SIGMA,
     OCTAVE_STEP,
 )
+from starcal_ros.estimation.limits import MOST_ROUNDS, NEGLIGIBLE, ROUNDING
 
 # Wavelengths below those of the field, as fractions of the width: each octave is seen in cells of
 # a sixth of its longest wave, over which it keeps nine tenths of its correlation.
 _FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
-# Groups that add under 1 % (stars 2 %) to the variance of their mean are skipped: in thousands of
-# images, places of stars that are seen a hundred times add 1 % and take a third of the time.
-_NO_EFFECT, _NO_EFFECT_OF_STAR = 0.01, 0.02
 _TAIL = 2.0  # degrees of freedom of the errors of stars
-_ROUNDING = 1e-9  # relative rounding of a sum over pairs where there are no pairs
-_ROUNDS = 8  # iterations of expectation and maximisation for the factors of stars
-_LOG_GRID: Floats = np.asarray(
-    np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
-)
+_LOG_GRID = log_amplitudes(LARGEST_FIELD_PX)
 _PRIOR: Floats = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
 
 
@@ -94,8 +89,13 @@ class SharedError:
 
     @property
     def matters(self) -> bool:
-        """True if the precision of an estimate changes by the error."""
-        return self.effect > (_NO_EFFECT_OF_STAR if self.of_star else _NO_EFFECT)
+        """
+        True if the precision of an estimate changes by the error.
+
+        In thousands of images, places of stars that are seen a hundred times add 1 % to a
+        variance, and take a third of the time.
+        """
+        return self.effect > NEGLIGIBLE
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,15 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     """
     found = [Groups('star places', star, None, _together(pixels, star, width))]
     for wave in _FINE_OCTAVES:
-        cells = _cells(pixels, wave * width / _CELLS_PER_WAVE)
+        cells = _cells(pixels, wave / _FINE_OCTAVES[0] * coarsest_cell_px(width))
         name = f'field at 1/{round(1 / wave)} of the width'
         found.append(Groups(name, cells, pairs_of(cells, star)))
     return tuple(found)
+
+
+def coarsest_cell_px(width: int) -> float:
+    """Return the side of the largest cells: over it, no wave of the field changes much."""
+    return _FINE_OCTAVES[0] * width / _CELLS_PER_WAVE
 
 
 def _together(pixels: Floats, star: Indices, width: int) -> Floats:
@@ -212,7 +217,7 @@ def _of_stars(
     """
     Return ``c^2``, px^2, and rho of the sightings of stars, and twice their log likelihood ratio.
 
-    And the likelihood (240,) of c.  Posterior means: products of pairs of residuals on the sky are
+    And the likelihood (g,) of c.  Posterior means: products of pairs of residuals on the sky are
     fitted by 1 and by the product of their sigmas over that of a usual star.
     """
     usual_px2 = float(np.median(variance_px2[weight > 0]))
@@ -226,7 +231,7 @@ def _of_stars(
     )
     log_likelihood = np.zeros((len(_LOG_GRID), len(_LOG_GRID)))
     x = np.exp(2.0 * _LOG_GRID)
-    if constant > _ROUNDING * float((weight**2).sum()):
+    if constant > ROUNDING * float((weight**2).sum()):
         log_likelihood -= both * np.outer(x, x)
         log_likelihood += (by_constant * x - 0.5 * constant * x**2)[:, None]
         log_likelihood += by_relative * x - 0.5 * relative * x**2
@@ -245,7 +250,7 @@ def _of_stars(
 
 def _beside_stars(of_places: Floats, share: float) -> Floats:
     """
-    Return the likelihood (240,) of structure s of the detector, by that of c (240,).
+    Return the likelihood (g,) of structure s of the detector, by that of c (g,).
 
     Sightings of a star share ``c^2 + share s^2``, with the correlation of the structure.
     """
@@ -269,7 +274,7 @@ def _factors(on_sky: Floats, weight: Floats, share_px2: Floats, star: Indices) -
     count = int(star.max(initial=0)) + 1
     total, squares = np.bincount(star, weight, count), np.bincount(star, weight**2, count)
     factor = np.ones(count)
-    several = np.flatnonzero(total**2 - squares > _ROUNDING * total**2)
+    several = np.flatnonzero(total**2 - squares > ROUNDING * total**2)
     if len(several) == 0:
         return factor[star]
     total, squares = total[several], squares[several]
@@ -279,12 +284,14 @@ def _factors(on_sky: Floats, weight: Floats, share_px2: Floats, star: Indices) -
     )
     squared, pairs = u**2 + v**2, (total**2 - squares) * s
     # The variance of a residual has the shared part in it.
-    e = np.maximum(1.0 / total - s * squares / total**2, _ROUNDING / total)
+    e = np.maximum(1.0 / total - s * squares / total**2, ROUNDING / total)
     own = np.ones(len(s))
-    for _ in range(_ROUNDS):
-        gain = own * s / (own * s + e)
+    for _ in range(MOST_ROUNDS):
+        before, gain = own, own * s / (own * s + e)
         own = (_TAIL + (squared * gain + 2.0 * e) * gain / s) / (_TAIL + 2.0)
         own *= pairs.sum() / (pairs @ own)
+        if np.abs(own / before - 1.0).max() < NEGLIGIBLE:
+            break
     factor[several] = own
     return np.asarray(factor[star])
 
@@ -310,7 +317,7 @@ def pair_moment(
         return _pairs(value, group) - own
 
     pairs = apart(weight)
-    if pairs <= _ROUNDING * float((weight**2).sum()):
+    if pairs <= ROUNDING * float((weight**2).sum()):
         return 0.0, math.inf
     products = sum(apart(weight * v) for v in residual_px.T)
     return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
@@ -326,12 +333,12 @@ def _increments(moments: Sequence[tuple[float, float]]) -> list[tuple[float, flo
     for (before, before_sigma), (after, sigma) in pairwise(moments):
         is_known = math.isfinite(sigma)
         own_sigma = math.sqrt(max(sigma**2 - before_sigma**2, 0.0)) if is_known else sigma
-        found.append((after - before if is_known else 0.0, max(own_sigma, _ROUNDING * sigma)))
+        found.append((after - before if is_known else 0.0, max(own_sigma, ROUNDING * sigma)))
     return found
 
 
 def _next_octave(log_px: Floats) -> Floats:
-    """Weights (s, 240) on the grid of an octave that follows one of logarithms (s,)."""
+    """Weights (s, g) on the grid of an octave that follows one of logarithms (s,)."""
     off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
     kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
     kernel /= kernel.sum(axis=1, keepdims=True).clip(1e-300)
@@ -340,7 +347,7 @@ def _next_octave(log_px: Floats) -> Floats:
 
 @functools.cache
 def _transition() -> Floats:
-    """Weights (240, 240) of an octave after one at each place of the grid."""
+    """Weights (g, g) of an octave after one at each place of the grid."""
     return _next_octave(_LOG_GRID)
 
 
@@ -353,7 +360,7 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
 
     Parameters
     ----------
-    first : (240,)
+    first : (g,)
         Prior weights of the first on the grid.
     moments : sequence of (estimate, 1-sigma), px^2
         From `pair_moment`.

@@ -29,6 +29,7 @@ from scipy.special import stdtr
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.amplitudes import interval_factor
+from starcal_ros.estimation.limits import FEWEST, MOST_CORRELATED
 from starcal_ros.estimation.problem import canonical_xyzw, Problem, State
 from starcal_ros.records import StarObservations, StarTrackerAlignment
 
@@ -42,12 +43,7 @@ _UNSTATED_SIGMA = 3.0  # the same where no sigma is stated: within a factor of 2
 _WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
 _STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
-# Images are joined in at most 100 groups of neighbours in time, a hundredth of a campaign against
-# correlation times of a third of it and more, so that the time of an estimate stays linear.
-_MOST_GROUPS = 100
 _MOST_MEMBERS = 4  # members of a group that give its mean correlation
-_FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
-_HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -216,17 +212,23 @@ def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise:
     return (stated_slow or noise) * math.exp(0.5 * log_sigma**2) * math.sqrt(shared)
 
 
-def groups_of(time_ns: Indices) -> Indices:
+def groups_of(time_ns: Indices, most: int = MOST_CORRELATED) -> Indices:
     """Return the group (m,) of each image: neighbours in time, of the same size but the last."""
     m = len(time_ns)
     group = np.empty(m, np.int64)
-    group[np.argsort(time_ns, kind='stable')] = np.arange(m) // -(-m // _MOST_GROUPS)
-    return group if m > _MOST_GROUPS else np.arange(m)
+    group[np.argsort(time_ns, kind='stable')] = np.arange(m) // -(-m // most)
+    return group if m > most else np.arange(m)
 
 
-def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlations:
-    """Return the correlations of slow errors of images at these stamps (m,) and attitudes."""
-    group = groups_of(time_ns)
+def correlations_of(
+    time_ns: Indices, camera_from_icrf: Rotation, most: int = MOST_CORRELATED
+) -> Correlations:
+    """
+    Return the correlations of slow errors of images at these stamps (m,) and attitudes.
+
+    Images are joined in at most so many groups of neighbours in time.
+    """
+    group = groups_of(time_ns, most)
     size = np.bincount(group)
     order = np.argsort(group, kind='stable')
     some = order[np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size) < _MOST_MEMBERS]
@@ -292,7 +294,6 @@ _UNKNOWN_RATE_RAD_S = 6.4e-4  # per axis: a low orbit, 1.1e-3, about an unknown 
 _NEAR_S = 600.0
 _LEAST_RAD2_S2 = 1e-18  # variance of a rate: a milliarcsecond in five seconds
 _TRACY_WIDOM_99 = 2.0234  # 99 % quantile of the Tracy-Widom law of order 1
-_FEWEST_RATES = 3  # their scatter replaces a sigma that a sender does not state
 
 
 @dataclass(frozen=True)
@@ -344,7 +345,7 @@ def measured_rates(images: Sequence[StarObservations]) -> Rates:
     several = np.count_nonzero(known) > 1
     scatter = np.cov(rate[known].T) if several else np.zeros((3, 3))
     unstated = np.full(3, _UNKNOWN_RATE_RAD_S)
-    if np.count_nonzero(known) >= _FEWEST_RATES:
+    if np.count_nonzero(known) >= FEWEST:
         unstated = np.sqrt(np.diag(scatter))
     own = np.where(sigma > 0, sigma, unstated)[:, :, None] ** 2 * np.eye(3)
     # Errors alone scatter so along their best direction; only the rest is a difference of rates.
@@ -460,10 +461,11 @@ def _drift(
     """
     unknown = np.full(3, np.nan), math.nan, math.nan
     used = here & attitudes.seen
-    if np.count_nonzero(used) < _FEWEST_IMAGES:
+    freedom = np.count_nonzero(used) - 2  # beside a mean and a slope
+    if freedom < 1:
         return unknown
     time_ns, error_rad = time_ns[used], attitudes.error_rad[used]
-    hours = (time_ns - time_ns[0]) / (NANOSECONDS_PER_SECOND * _HOUR_S)
+    hours = (time_ns - time_ns[0]) / (3600 * NANOSECONDS_PER_SECOND)
     variance_rad2 = np.einsum('mii->mi', attitudes.covariance_rad2)[used]
     weight = 1.0 / (variance_rad2 + sigma_rad**2)
     middle = (weight * hours[:, None]).sum(axis=0) / weight.sum(axis=0)
@@ -473,7 +475,6 @@ def _drift(
         return unknown
     slope = (weight * from_middle * error_rad).sum(axis=0) / information
     mean_rad = (weight * error_rad).sum(axis=0) / weight.sum(axis=0)
-    freedom = len(hours) - 2
     scatter = (weight * (error_rad - mean_rad - from_middle * slope) ** 2).sum(axis=0) / freedom
     t = slope * np.sqrt(information / np.maximum(scatter, 1e-300))
     p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # any axis

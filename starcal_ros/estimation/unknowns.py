@@ -65,7 +65,6 @@ _FOCAL_MODES = {
     'shear_px': (0.0, 1.0, 0.0),
 }
 """Changes of fx, skew and fy."""
-_DECENTRING = ('p1', 'p2')  # lens models without them have no decentring
 _TREND = 1e-4  # a lens that warms by some degrees changes its focal length by that share, rms
 _SCALE_BY_COLOUR = 3e-4  # per mag of BP - RP: blue and red stars are 0.5 px apart in a corner
 _NO_TURN_RAD = 1e-8  # 2 milliarcseconds within an image move no estimate
@@ -467,7 +466,7 @@ def _shape(given: Given) -> Unknown:
     """
     problem, state = given.problem, given.state
     names = problem.parameter_names
-    decentring = [name for name in _DECENTRING if name in names]
+    decentring = [name for name in ('p1', 'p2') if name in names]
     labels = (*_FOCAL_MODES, *(f'{name}_px' for name in decentring))
     modes = np.zeros((problem.camera_count, len(labels)))
     modes[:3, :3] = np.array(list(_FOCAL_MODES.values())).T
@@ -681,7 +680,6 @@ def _next_lens_term(width: int, height: int) -> Floats:
 Option = tuple[str, str, float]
 """Option that may be stated, a plausible value, and its variance over that of the prior."""
 NO_OPTION: Option = '', '', 1.0
-_NO_PRIOR = 'estimated, no prior'
 
 
 @dataclass(frozen=True)
@@ -733,7 +731,9 @@ class Kind:
     cause: str = ''
     line: int = 9
     of_tracker: bool = False
-    assumption: Callable[[Layout, Floats, CalibrationOptions], str] = lambda *_: _NO_PRIOR
+    assumption: Callable[[Layout, Floats, CalibrationOptions], str] = lambda *_: (
+        'estimated, no prior'
+    )
     option: Callable[[Layout, CalibrationOptions], Option] = lambda *_: NO_OPTION
     remedy: str = ''
     in_state: bool = False

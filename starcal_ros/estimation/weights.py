@@ -31,8 +31,9 @@ from starcal_ros.estimation.equations import (
     StarSums,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, ROUNDING, STEP_SIGMA
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
-from starcal_ros.estimation.outliers import fitting_stars, misfit_images
+from starcal_ros.estimation.outliers import fitting_stars, misfit_images, QUARTILE
 from starcal_ros.estimation.posterior import Posterior
 from starcal_ros.estimation.problem import (
     attitude_errors,
@@ -59,15 +60,8 @@ from starcal_ros.estimation.tracker_errors import (
 from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
-# Method 1 does not use the star tracker for the camera, Method 2 takes it as exact: a sigma of a
-# thousand times the stated one, and of a milliarcsecond.
-FREE_FACTOR, EXACT_RAD = 1e3, 1e-3 * ARCSECOND_RAD
-_SIGMA_PER_MEDIAN = 1.5  # 1-sigma of normal errors over the median of their sizes
-_CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
+EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
-_ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
-_ROUNDS = 12  # iterations of a reweighted fit
-_SETTLED = 1e-3  # relative change of a fitted variance that ends the iterations
 _NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
 _BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
 _STARS_PER_NODE = 40  # 80 residuals determine a variance to 16 %
@@ -109,6 +103,7 @@ def estimate_variance(
     magnitude: NDArray[np.floating],
     used: Mask,
     freedom: Floats,
+    outlier_sigma: float,
 ) -> CentroidVariance:
     """
     Scale, floor and factor by brightness that make the covariances those of the residuals.
@@ -119,40 +114,42 @@ def estimate_variance(
         The observations that the fit used, with their covariances as measured.
     freedom : (n,)
         Degrees of freedom that the fit leaves each of them, of two.
+    outlier_sigma : float
+        Length of a residual beyond which it is an outlier.
 
     Notes
     -----
     Scale and floor maximise the restricted likelihood of the residuals, whose gradient is the sum
     of ``freedom / 2 (square / freedom - variance) / variance^2`` times the derivatives of the
     variance: weighted least squares of squares over freedom on the measured variance and one, the
-    weights renewed, with less of a square near 4.5 sigma (`_part`).
+    weights renewed, with less of a square near that of an outlier (`_part`).
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
     left = np.maximum(freedom[used], _LEAST_FREEDOM)
     squared = (residual_px[used] ** 2).sum(axis=1) / left
     # The median of a squared length of two normal axes is ln 2 of its mean.
     scale, floor_px2 = max(float(np.median(squared / own)) / math.log(2.0), 1e-12), 0.0
-    for _ in range(_ROUNDS):
-        before = scale, floor_px2
+    for _ in range(MOST_ROUNDS):
         expected = scale * own + floor_px2
-        weight = 0.5 * left * _part(squared / expected) / expected**2
+        weight = 0.5 * left * _part(squared / expected, outlier_sigma) / expected**2
         scale, floor_px2 = _line(own, squared, weight)
-        if np.allclose(before, (scale, floor_px2), rtol=_SETTLED, atol=1e-12):
+        step = scale * own + floor_px2 - expected
+        if weight @ step**2 < STEP_SIGMA**2:
             break
     ratio = squared / (scale * own + floor_px2)
-    counted = 0.5 * left * _part(ratio)
+    counted = 0.5 * left * _part(ratio, outlier_sigma)
     nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
     return CentroidVariance(scale, floor_px2, nodes, factors)
 
 
-def _part(ratio: Floats) -> Floats:
+def _part(ratio: Floats, outlier_sigma: float) -> Floats:
     """
     Return the part of squared residuals over variance (n,) that counts.
 
-    Half at 4.5 sigma, all to 4.1 and none from 4.9.
-    One at an edge of 4.5 sigma would count and not count in turns, and the estimate with it.
+    Half at the limit of outliers, 4.5 sigma, all to 4.1 and none from 4.9.
+    One at an edge would count and not count in turns, and the estimate with it.
     """
-    return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * _CLIP_SIGMA**2), 0.0, 1.0))
+    return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * outlier_sigma**2), 0.0, 1.0))
 
 
 def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
@@ -162,7 +159,7 @@ def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
     determinant = by_own * by_one - both**2
     scale, floor_px2 = right_own / by_own, 0.0
-    if determinant > _ALIKE * by_own * by_one:
+    if determinant > ROUNDING * by_own * by_one:  # not all variances are equal
         scale = (by_one * right_own - both * right_one) / determinant
         floor_px2 = (by_own * right_one - both * right_own) / determinant
     if floor_px2 < 0:
@@ -195,15 +192,15 @@ def _brightness(
     basis = np.stack([np.interp(bins, nodes, row) for row in np.eye(len(nodes))], axis=1)
     log_factor = np.zeros(len(nodes))
     prior = np.eye(len(nodes)) / _NODE_SIGMA**2
-    for _ in range(_ROUNDS):
+    for _ in range(MOST_ROUNDS):
         scaled = summed * np.exp(-basis @ log_factor)
         gradient = basis.T @ (scaled - stars) - prior @ log_factor
         # Observed in place of expected information: monotone for a convex cost.
         step = np.linalg.solve(
             (basis * np.maximum(scaled, stars)[:, None]).T @ basis + prior, gradient
         )
-        log_factor += step
-        if np.abs(step).max() < _SETTLED:
+        log_factor = np.clip(log_factor + step, *np.log(_SCALE_LIMITS))
+        if gradient @ step < STEP_SIGMA**2:
             break
     return tuple(nodes.tolist()), tuple(np.exp(log_factor).tolist())
 
@@ -267,7 +264,7 @@ def weighted_attitudes(
     factor = np.ones((m, 3))
     if attitudes is None:
         error = attitude_errors(problem, state, state.camera_from_icrf) / data.stated_rad
-        factor *= max(1.0, _SIGMA_PER_MEDIAN * float(np.median(np.abs(error))))
+        factor *= max(1.0, float(np.median(np.abs(error))) / QUARTILE)
     else:
         for tracker in attitudes.trackers:
             factor[tracker.images[:, None], tracker.axes] = tracker.working
@@ -442,7 +439,12 @@ def judge(
     variance = CentroidVariance(1.0, 0.0)
     if options.variance_components:
         variance = estimate_variance(
-            residual_px, table.covariance_px2, table.magnitude, used, freedom
+            residual_px,
+            table.covariance_px2,
+            table.magnitude,
+            used,
+            freedom,
+            options.outlier_sigma,
         )
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()

@@ -10,18 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.cli.commands.lookup import write_lookup_table
-from starcal_ros.assessment.lookup import (
-    COLUMNS,
-    Derivatives,
-    line_of_sight_table,
-    LineOfSightTable,
-)
+from starcal_ros.assessment.lookup import Derivatives, line_of_sight_table, LineOfSightTable
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.records import MapCovariance
 
+COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
 LENS = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.1, 4e-4, -3e-4]))
 OCTAVES = 2
 TERMS = term_count(640, 512, OCTAVES)

@@ -16,13 +16,13 @@ from scipy.stats import chi2, multivariate_normal, norm
 from scipy.stats import t as student_t
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.estimation import amplitudes as module
 from starcal_ros.estimation.amplitudes import (
     averaged_field,
     field_amplitudes,
     interval_factor,
     LARGEST_FIELD_PX,
     LARGEST_SHAPE_PX,
+    log_amplitudes,
     octave_prior,
     shapes,
     ShapeSums,
@@ -116,13 +116,10 @@ def test_the_mode_is_that_of_the_dense_posterior(sigma_px: tuple[float, ...], se
 
 
 @pytest.mark.parametrize('start_px', [1e-4, 1e-2, 1e-1])
-def test_the_mode_is_found_from_each_start(
-    start_px: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_mode_is_found_from_each_start(start_px: float) -> None:
     made = field(np.random.default_rng(5), np.array([0.2, 0.1, 0.05]), each=10, n=80)
     whole = field_amplitudes(*made.sums)
-    monkeypatch.setattr(module, '_STARTS_PX', (start_px,))
-    alone = field_amplitudes(*made.sums)
+    alone = field_amplitudes(*made.sums, starts_px=(start_px,))
     assert alone.log_px == pytest.approx(whole.log_px, abs=0.1)
     assert alone.likelihood_ratio == pytest.approx(whole.likelihood_ratio, abs=0.01)
     assert alone.likelihood_ratio > 20.0
@@ -177,15 +174,15 @@ def test_coefficients_are_the_mixture_of_dense_posteriors(sigma_px: tuple[float,
     averaged = averaged_field(information, gradient, octave, mode, term)
     room = math.log(LARGEST_FIELD_PX) - mode.log_px.max()
     shifts = averaged.log_px - mode.log_px[2]
-    assert shifts == pytest.approx(-8.0 + 0.25 * np.arange(len(shifts)))
-    assert shifts.max() <= room < shifts.max() + 0.25 or shifts.max() == pytest.approx(6.0)
+    assert shifts == pytest.approx(-8.0 + np.arange(len(shifts)) / 3.0)
+    assert shifts.max() <= room < shifts.max() + 1.0 / 3.0 or shifts.max() == pytest.approx(6.0)
     # The weight of a factor is that without the term; then the term has its own amplitudes.
     logs = np.array([made.log_posterior(mode.log_px + shift) for shift in shifts])
     weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     assert averaged.weight == pytest.approx(weight, abs=1e-9)
-    off = np.linspace(-3.0, 3.0, 49)
-    of_term_px = np.minimum(np.exp(CENTRE + SIGMA * off), LARGEST_FIELD_PX)
+    of_term_px = np.exp(log_amplitudes(LARGEST_FIELD_PX))
+    off = (np.log(of_term_px) - CENTRE) / SIGMA
     means, seconds = [], []
     for shift in shifts:
         own = np.diag(np.exp(2 * (mode.log_px + shift)[octave]))
@@ -391,7 +388,7 @@ def common_px2(made: Images, sigma_px: Floats, k: int, step: float) -> float:
     evidence, ratio = [], []
     for R in (np.eye(m), 0.9 ** (step * apart)):  # no correlation, and one that decays
         found = 0.0
-        for log_px in np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70):
+        for log_px in log_amplitudes(LARGEST_SHAPE_PX):
             V = K.T @ (noise + math.exp(2 * log_px) * R) @ K
             likelihood = multivariate_normal.pdf(K.T @ shown, cov=V)
             found += likelihood * math.exp(-0.5 * ((log_px - CENTRE) / SIGMA) ** 2)

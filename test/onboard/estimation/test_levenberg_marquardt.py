@@ -16,6 +16,7 @@ from starcal_ros.estimation.levenberg_marquardt import (
     NotObservable,
     solve_arrow,
 )
+from starcal_ros.estimation.limits import MOST_ROUNDS
 
 Move = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -228,7 +229,7 @@ def falling_line(x: np.ndarray) -> NormalEquations:
 def test_a_search_without_end_says_so() -> None:
     solution = levenberg_marquardt(np.zeros(1), falling_line, add)
     assert not solution.converged
-    assert solution.termination == 'iteration_limit' and solution.iterations == 100
+    assert solution.termination == 'iteration_limit' and solution.iterations == MOST_ROUNDS
 
 
 def test_a_search_against_a_wall_says_so() -> None:
@@ -254,4 +255,5 @@ def test_a_step_to_no_cost_is_taken_back() -> None:
 
     solution = levenberg_marquardt(np.ones(1), evaluate, add)
     assert solution.converged and min(tried) <= 0
-    assert solution.state[0] == pytest.approx(np.exp(-5), rel=1e-8)
+    # It ends at a step of a millionth of a sigma, which is x.
+    assert solution.state[0] == pytest.approx(np.exp(-5), rel=2e-6)

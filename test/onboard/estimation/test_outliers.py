@@ -9,15 +9,11 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.estimation.outliers import (
-    dropped_stars,
-    FEWEST_STARS,
-    fitting_stars,
-    misfit_images,
-)
+from starcal_ros.estimation.limits import FALSE_ALARM_RATE, FEWEST
+from starcal_ros.estimation.outliers import dropped_stars, fitting_stars, misfit_images
 from starcal_ros.estimation.shared_errors import Groups, pairs_of
 from starcal_ros.estimation.star_equations import StarTable
 
@@ -112,8 +108,7 @@ def test_a_star_that_is_an_outlier_in_most_of_its_images_is_left_out_of_all() ->
 
 def test_a_star_whose_residuals_together_are_too_large_is_left_out() -> None:
     table, residual = usual()
-    # Half of the level on each of 24 axes is a chance of 1 in 10^7 for sound stars.
-    level = math.sqrt(chi2.isf(1e-7, 2 * IMAGES) / IMAGES) * SIGMA_PX
+    level = math.sqrt(chi2.isf(FALSE_ALARM_RATE / STARS, 2 * IMAGES) / IMAGES) * SIGMA_PX
     for star, share in ((3, 1.02), (7, 0.98)):
         residual[table.star == star] = share * level * np.array([0.6, 0.8])
     kept = fits(residual, table)
@@ -162,8 +157,8 @@ def test_the_variance_of_a_place_does_not_drop_good_stars() -> None:
 
 def test_an_image_with_too_few_of_its_stars_is_not_used() -> None:
     table, residual = usual()
-    left = FEWEST_STARS - 1
-    for image, stars in ((2, left), (5, FEWEST_STARS)):
+    left = FEWEST - 1
+    for image, stars in ((2, left), (5, FEWEST)):
         rows = np.flatnonzero(table.image == image)
         residual[rows[stars:], 1] = 50.0 * SIGMA_PX
     kept = fits(residual, table)
@@ -218,19 +213,20 @@ def test_an_attitude_that_jumps_is_a_misfit(m: int, axis: int) -> None:
     error, variance = attitudes(np.random.default_rng(4), m, 0.5)
     error[1, axis] -= 9.0
     assert np.flatnonzero(judged(error, variance)).tolist() == [1]
-    error[1, axis] += 5.0
+    error[1, axis] += 6.0
     assert not judged(error, variance).any()
 
 
-def test_the_limit_is_six_sigma_of_the_stated_noise() -> None:
+def test_the_limit_is_by_the_stated_noise_and_the_number_of_attitudes() -> None:
     error = np.zeros((9, 3))
     variance = np.zeros((9, 3))
-    error[4, 1] = 5.9
+    limit = norm.isf(0.5 * FALSE_ALARM_RATE / error.size)
+    error[4, 1] = limit - 0.01
     assert not judged(error, variance).any()
-    error[4, 1] = 6.1
+    error[4, 1] = limit + 0.01
     assert judged(error, variance)[4]
     # Few stars do not show it.
-    variance[4, 1] = 1.2
+    variance[4, 1] = 1.1
     assert not judged(error, variance).any()
 
 

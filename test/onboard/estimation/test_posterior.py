@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from four_images import (  # type: ignore[import-not-found]
@@ -28,9 +29,16 @@ import pytest
 from scipy.linalg import null_space
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation import amplitudes
 from starcal_ros.estimation import posterior as module
-from starcal_ros.estimation.amplitudes import Amplitudes, Shapes, shapes, ShapeSums
+from starcal_ros.estimation.amplitudes import (
+    _shape_likelihood,
+    Amplitudes,
+    averaged_field,
+    Shapes,
+    shapes,
+    ShapeSums,
+)
+from starcal_ros.estimation.limits import NEGLIGIBLE
 from starcal_ros.estimation.posterior import (
     common_shape,
     Posterior,
@@ -60,9 +68,9 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     field, shape = (Amplitudes(np.log(one), 0.0) for one in (OCTAVES_PX, SHAPE))
     monkeypatch.setattr(module, 'field_amplitudes', lambda *_: field)
     monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, None))
-    monkeypatch.setattr(amplitudes, '_SHIFTS', np.zeros(1))
-    monkeypatch.setattr(amplitudes, '_OF_TERM', np.array([-300.0]))
-    monkeypatch.setattr(module, '_HELD', 1e-13)
+
+    at_amplitudes = partial(averaged_field, shifts=np.zeros(1), log_term=np.array([-1e3]))
+    monkeypatch.setattr(module, 'averaged_field', at_amplitudes)
 
 
 def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
@@ -144,7 +152,8 @@ def varied() -> Varied:
         return to_sums(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(amplitudes, '_OF_TERM', OF_TERM)
+        terms = np.log(1e-5) + 4.0 * OF_TERM
+        patch.setattr(module, 'averaged_field', partial(averaged_field, log_term=terms))
         patch.setattr(module, 'shapes', recorded)
         patch.setattr(module, '_shape_sums', of_field)
         found = solved(made)
@@ -267,7 +276,7 @@ def test_sums_of_the_shapes_have_the_likelihood_of_contrasts_free_of_everything_
     sizes_px = ([1e-4] * 5, [4.0, 1.0, 0.1, 0.1, 0.1], [0.3, 3.0, 2.0, 0.5, 1.0])
     at = [np.log(np.array(px)) for px in sizes_px]
     expected = np.array([with_prior(one) for one in at])
-    likelihood = amplitudes._shape_likelihood(sums)
+    likelihood = _shape_likelihood(sums)
     values = likelihood(np.array(at))
     # Rotations are held to 0.1 rad, a thousandth of the prior of cx and cy, which they can do.
     assert np.abs(np.diff(expected)).max() > 3.0
@@ -321,8 +330,10 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
     return weights, {name: one.reshape(2 * n, 2 * n) for name, one in V.items()}
 
 
-def widened(given: Small, found: Posterior, weights: Weights) -> Posterior:
-    return with_shared_errors(found, given.sums(), given.linear(), weights)
+def widened(
+    given: Small, found: Posterior, weights: Weights, negligible: float = 1e-13
+) -> Posterior:
+    return with_shared_errors(found, given.sums(), given.linear(), weights, negligible)
 
 
 def propagated(
@@ -382,20 +393,17 @@ def test_shared_errors_at_known_amplitudes_propagate_as_the_dense_covariance(
         assert np.abs(off / np.outer(sigma[free], sigma[free])).max() < EXACT
 
 
-@pytest.mark.parametrize(('held', 'tolerance'), [(1e-13, 1e-4), (module._HELD, 0.03)])
+# By default modes of the field that hardly move are left out; here also with all of them.
+@pytest.mark.parametrize(('negligible', 'tolerance'), [(1e-13, 1e-4), (NEGLIGIBLE, 0.03)])
 def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance(
-    monkeypatch: pytest.MonkeyPatch,
-    held: float,
-    tolerance: float,
+    negligible: float, tolerance: float
 ) -> None:
-    # By default modes of the field below a thousandth are left out; here also with all of them.
-    monkeypatch.setattr(module, '_HELD', held)
     given = small(2, field_px=0.2)
     truth = dense(given)
     # Far larger than centroid errors, which are mostly hidden by the field of 150 coefficients.
     weights, V = shared(given, 2.0, 1.5)
     found = solved(given)
-    after = widened(given, found, weights)
+    after = widened(given, found, weights, negligible)
     P = given.layout.count
     # The gain of the averaged estimator: its covariance times what the images leave of X.
     own = np.arange(P, len(truth.stars.T))

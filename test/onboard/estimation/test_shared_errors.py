@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.estimation import shared_errors as module
+from starcal_ros.estimation.amplitudes import LARGEST_FIELD_PX, log_amplitudes
 from starcal_ros.estimation.shared_errors import (
     chain_means,
     group_sums,
@@ -86,9 +86,14 @@ def test_observations_without_a_partner_show_nothing() -> None:
     assert pair_moment(residual, weight, group, group) == (0.0, math.inf)
 
 
+# Weights of an amplitude that follows no other, N(ln 1e-5, 4), on the grid of logarithms.
+LOG_PX = log_amplitudes(LARGEST_FIELD_PX)
+ALONE = np.exp(-0.5 * ((LOG_PX - math.log(1e-5)) / 4.0) ** 2)
+
+
 def posterior_mean(estimate: float, sigma: float) -> float:
     """Return the mean variance of one error alone."""
-    (mean,) = chain_means(module._PRIOR, [(estimate, sigma)])
+    (mean,) = chain_means(ALONE, [(estimate, sigma)])
     return mean
 
 
@@ -117,31 +122,24 @@ def test_a_posterior_mean_has_its_limits() -> None:
     assert posterior_mean(5.0, 1e-3) <= 0.25 * (1.0 + 1e-9)
 
 
-def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    grid = np.linspace(math.log(1e-6), math.log(0.5), 40).astype(np.float64)
-    monkeypatch.setattr(module, '_LOG_GRID', grid)
-    alone = np.exp(-0.5 * ((grid - math.log(1e-5)) / 4.0) ** 2)
-    monkeypatch.setattr(module, '_PRIOR', alone)
-    monkeypatch.setattr(module, '_transition', lambda: module._next_octave(grid))
+def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes() -> None:
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     moments = [(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)]
-    found = chain_means(last[1] @ module._next_octave(last[0]), moments)
     # Each octave is e^-0.7 of the one before, within e, and one in twenty is as any amplitude.
 
     def following(log_px: Floats) -> Floats:
-        steps = np.exp(-0.5 * (grid[None, :] - log_px[:, None] + 0.7) ** 2)
+        steps = np.exp(-0.5 * (LOG_PX[None, :] - log_px[:, None] + 0.7) ** 2)
         return np.asarray(
-            0.95 * steps / steps.sum(axis=1, keepdims=True) + 0.05 * alone / alone.sum()
+            0.95 * steps / steps.sum(axis=1, keepdims=True) + 0.05 * ALONE / ALONE.sum()
         )
 
-    steps, first = following(np.asarray(grid, np.float64)), last[1] @ following(last[0])
-    by = [np.exp(-0.5 * ((e - np.exp(2 * grid)) / s) ** 2) for e, s in moments]
-    joint = np.einsum('a,a,ab,b,bc,c->abc', first, by[0], steps, by[1], steps, by[2])
+    steps, first = following(LOG_PX), last[1] @ following(last[0])
+    found = chain_means(first, moments)
+    by = [np.exp(-0.5 * ((e - np.exp(2 * LOG_PX)) / s) ** 2) for e, s in moments]
+    terms = first * by[0], steps * by[1], steps * by[2]
     for k, one in enumerate(found):
-        marginal = joint.sum(axis=tuple(i for i in range(3) if i != k))
-        expected = marginal @ np.exp(2 * grid) / marginal.sum()
+        marginal = np.einsum(f'a,ab,bc->{"abc"[k]}', *terms, optimize=True)
+        expected = marginal @ np.exp(2 * LOG_PX) / marginal.sum()
         assert one == pytest.approx(expected, rel=1e-9)
     assert found[0] == pytest.approx(4e-4, rel=0.3) and found[1] < found[0]
 

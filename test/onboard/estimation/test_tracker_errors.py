@@ -16,6 +16,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.estimation import tracker_errors as module
 from starcal_ros.estimation.amplitudes import interval_factor
 from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.limits import MOST_CORRELATED
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.tracker_errors import (
     correlations_of,
@@ -35,13 +36,14 @@ def found_of(
     is_stated: bool = True,
     stated_slow: float = 0.0,
     attitudes: Rotation | None = None,
+    most: int = MOST_CORRELATED,
 ) -> TrackerErrors:
     """Posterior of errors (m, 3), an image a minute; attitudes far apart by default."""
     m = len(error)
     if attitudes is None:
         attitudes = Rotation.random(m, random_state=np.random.default_rng(77))
     time_ns = 10**18 + CADENCE_NS * np.arange(m)
-    correlations = correlations_of(time_ns, attitudes)
+    correlations = correlations_of(time_ns, attitudes, most)
     return tracker_errors(error, np.full((m, 3), variance), correlations, is_stated, stated_slow)
 
 
@@ -272,16 +274,11 @@ def test_times_may_be_equal() -> None:
     assert np.isfinite(found.covariance).all() and found.working > 0.3
 
 
-def test_groups_of_neighbours_give_the_posterior_of_all_images(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_groups_of_neighbours_give_the_posterior_of_all_images() -> None:
     # 180 images of a slow walk, by themselves and in 60 groups of three.
     rng = np.random.default_rng(4)
     error = rng.normal(size=(180, 3)) + walk(rng, 180, 90.0, 2.0)
-    monkeypatch.setattr(module, '_MOST_GROUPS', 180)
-    whole = found_of(error)
-    monkeypatch.setattr(module, '_MOST_GROUPS', 60)
-    found = found_of(error)
+    whole, found = found_of(error, most=180), found_of(error, most=60)
     assert found.covariance.shape == (60, 60) and whole.covariance.shape == (180, 180)
     assert np.array_equal(found.group, np.arange(180) // 3)
     assert found.noise == pytest.approx(whole.noise, rel=0.02)

@@ -30,7 +30,9 @@ def residuals(rng: Generator, covariance_px2: Floats) -> Floats:
 
 def estimated(residual: Floats, covariance: Floats, magnitude: Floats) -> CentroidVariance:
     n = len(residual)
-    return estimate_variance(residual, covariance, magnitude, np.ones(n, bool), np.full(n, 2.0))
+    return estimate_variance(
+        residual, covariance, magnitude, np.ones(n, bool), np.full(n, 2.0), 4.5
+    )
 
 
 @pytest.mark.parametrize(
@@ -103,7 +105,7 @@ def test_only_stars_that_are_used_count_and_outliers_do_not() -> None:
     assert estimated(wrong, covariance, magnitude).scale == pytest.approx(plain.scale, rel=0.05)
     used = np.arange(N) % 3 > 0
     residual[~used] *= 3.0  # within the clip
-    found = estimate_variance(residual, covariance, magnitude, used, np.full(N, 2.0))
+    found = estimate_variance(residual, covariance, magnitude, used, np.full(N, 2.0), 4.5)
     assert found.scale == pytest.approx(1.0, abs=0.1)
     assert estimated(residual, covariance, magnitude).scale > 1.3
 
@@ -138,13 +140,13 @@ def test_freedom_makes_the_variance_of_a_fit_with_few_stars_unbiased() -> None:
     used = np.ones(n, bool)
     flat = residual.reshape(n, 2)
     freedom = 2.0 * (1.0 - share.ravel())
-    found = estimate_variance(flat, covariance, magnitude, used, freedom)
+    found = estimate_variance(flat, covariance, magnitude, used, freedom, 4.5)
     of_star = found.of(covariance, magnitude)[:, 0] / covariance[:, 0]
     bright = magnitude == 2.0
     # The bright star keeps a tenth of its freedom: 100 of 1000, so 14 %, and the prior's share.
     assert of_star[bright].mean() == pytest.approx(1.0, abs=0.3)
     assert of_star[~bright].mean() == pytest.approx(1.0, abs=0.1)
-    ignored = estimate_variance(flat, covariance, magnitude, used, np.full(n, 2.0))
+    ignored = estimate_variance(flat, covariance, magnitude, used, np.full(n, 2.0), 4.5)
     assert (ignored.of(covariance, magnitude)[:, 0] / covariance[:, 0])[bright].mean() < 0.5
 
 
@@ -155,7 +157,7 @@ def test_a_star_without_freedom_does_not_count_without_limit() -> None:
     freedom = np.full(400, 2.0)
     freedom[:20] = 0.0
     residual[:20] = 0.0
-    found = estimate_variance(residual, covariance, magnitude, np.ones(400, bool), freedom)
+    found = estimate_variance(residual, covariance, magnitude, np.ones(400, bool), freedom, 4.5)
     assert found.scale == pytest.approx(1.0, abs=0.25)
 
 
@@ -224,10 +226,10 @@ def test_scale_and_floor_maximise_the_restricted_likelihood(bright_px: float) ->
         residual, freedom = fitted(variance)
         assert ((residual**2).sum(axis=1) < 4.0**2 * variance).all()  # inside the clip
         found = estimate_variance(
-            residual, covariance, np.full(len(own), 5.0), np.ones(len(own), bool), freedom
+            residual, covariance, np.full(len(own), 5.0), np.ones(len(own), bool), freedom, 4.5
         )
         variance = found.scale * own + found.floor_px2
-    # Rounds stop at a change of a thousandth.
+    # Rounds stop at a step of a twentieth of a sigma.
     assert (found.scale, found.floor_px2) == pytest.approx(tuple(best), rel=5e-3)
 
 
