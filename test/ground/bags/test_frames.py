@@ -184,20 +184,6 @@ def test_bad_velocities_are_left_out_and_reported_once(
         assert velocity_m_s is not None and velocity_m_s[1] == 7.0
 
 
-def test_late_samples_are_reported(tmp_path: Path) -> None:
-    """One of the attitudes about the second image comes three seconds late."""
-    messages = recording()
-    late = messages.pop(messages.index(('attitude', 11)))
-    messages.insert(messages.index(('attitude', 41)), late)
-    count, differ, said = compared([write(tmp_path / 'bag', messages)])
-    assert (count, differ) == (IMAGES, 1)
-    (sentence,) = said
-    assert sentence == (
-        'telemetry is recorded more than a second out of order, after'
-        ' 1 image that it belongs to; sort the messages of the bag by time'
-    )
-
-
 def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, chunks: list[int]) -> None:
     """The frames of a damaged bag are its images, and the loss is reported as by `read_images`."""
     bag = write(tmp_path / 'bag', recording())
