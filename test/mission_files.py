@@ -126,6 +126,13 @@ def write_encoded(
     writer.write(topic, IMAGE_TYPE, image.time_ns, message)
 
 
+def write_unread(writer: BagWriter, topic: str, type_name: str) -> None:
+    """Write an empty message of a type, which may be unknown: it is named, and never decoded."""
+    own: Any = writer._writer
+    schema = own.register_schema(type_name, 'ros2msg', b'int8 x')
+    own.add_message(own.register_channel(topic, 'cdr', schema), 1, b'', 1)
+
+
 def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object) -> Path:
     """A FITS file of an image: uint16, tiled (Rice), float32 in electrons, or an extension."""
     pixels = image.pixels

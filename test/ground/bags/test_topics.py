@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
-from mission_files import attitudes, images, TINY, write_tiny  # type: ignore[import-not-found]
+from mission_files import attitudes, images, TINY, write_tiny, write_unread  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
@@ -96,8 +95,7 @@ def with_topics(folder: Path, kinds: dict[str, str]) -> list[Path]:
     with BagWriter(folder) as writer:
         writer.write_image('/image', images()[0], 'camera')
         for name, kind in kinds.items():
-            channel, _ = writer._open(name, kind)
-            writer._writer.add_message(channel, 1, b'', publish_time=1)
+            write_unread(writer, name, kind)
     return [folder]
 
 
@@ -156,12 +154,7 @@ def test_attitudes_that_are_not_read_are_named_where_none_are_asked_for(
 ) -> None:
     """Without parameters the camera was found by its stars, and nothing was said of them."""
     reader.log_damage.cache_clear()
-    with BagWriter(tmp_path / 'bag') as writer:
-        writer.write_image('/image', images()[0], 'camera')
-        own: Any = writer._writer
-        schema = own.register_schema(kind, 'ros2msg', b'int8 x')
-        own.add_message(own.register_channel('/a', 'cdr', schema), 1, b'', 1)
-    assert topics.without_attitudes([tmp_path / 'bag'], Topics(), {})
+    assert topics.without_attitudes(with_topics(tmp_path / 'bag', {'/a': kind}), Topics(), {})
     said = f'/a is a {kind.rpartition("/")[2]}, which is not read: publish its orientation as a'
     assert (said in caplog.text) is is_named
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mission_files import attitudes, images, TINY, write_tiny  # type: ignore[import-not-found]
-import numpy as np
+from mission_files import attitudes, images, TINY, write_tiny, write_unread  # type: ignore[import-not-found]
 import pytest
 import yaml
 
@@ -17,13 +16,6 @@ from starcal_ground.bags.topics import Topics
 from starcal_ground.cli.main import main
 from starcal_ground.simulation.simulated_bag import IMAGE_TOPIC
 from starcal_ros.errors import BagError
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import (
-    make_header,
-    Message,
-    quaternion_to_message,
-    vector_to_message,
-)
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Image
@@ -33,47 +25,15 @@ ODOMETRY, POSE, TF = (
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     'tf2_msgs/msg/TFMessage',
 )
-XYZ = np.zeros(3)
-
-
-def attitude(kind: str, time_ns: int, xyzw: np.ndarray) -> Message:
-    """Return a message of a type that starcal does not read, with an attitude in it."""
-    header, orientation = (
-        make_header(time_ns, 'icrf', make_message),
-        quaternion_to_message(xyzw, make_message),
-    )
-    if kind == TF:
-        place = vector_to_message(XYZ, make_message)
-        transform = make_message(
-            'geometry_msgs/msg/Transform', translation=place, rotation=orientation
-        )
-        stamped = make_message(
-            'geometry_msgs/msg/TransformStamped',
-            header=header,
-            child_frame_id='star_tracker',
-            transform=transform,
-        )
-        return make_message(TF, transforms=[stamped])
-    point = make_message('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0)
-    pose = make_message('geometry_msgs/msg/Pose', position=point, orientation=orientation)
-    wide = make_message('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=np.zeros(36))
-    if kind == POSE:
-        return make_message(POSE, header=header, pose=wide)
-    still = vector_to_message(XYZ, make_message)
-    twist = make_message('geometry_msgs/msg/Twist', linear=still, angular=still)
-    speed = make_message(
-        'geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=np.zeros(36)
-    )
-    return make_message(ODOMETRY, header=header, child_frame_id='body', pose=wide, twist=speed)
 
 
 def write_bag(path: Path, kind: str) -> Path:
-    """Write four images with the attitudes in messages of a type; none for an empty one."""
+    """Write four images, and attitudes in messages of a type that is not read; empty: none."""
     with BagWriter(path) as writer:
         for image in images()[:4]:
             writer.write_image(IMAGE_TOPIC, image, 'camera')
-        for time_ns, xyzw in attitudes() if kind else ():
-            writer.write('/gnc/state', kind, time_ns, attitude(kind, time_ns, xyzw))
+        if kind:
+            write_unread(writer, '/gnc/state', kind)
     return path
 
 
