@@ -244,6 +244,8 @@ def test_a_diagnosis_reads_as_a_calibration(
 @pytest.mark.parametrize(
     ('arguments', 'problem'),
     [
+        (('--image-topic', 'other'), 'no topic other of type'),
+        (('--image-topic', '/star_tracker/attitude'), 'no topic /star_tracker/attitude of type'),
         (('--attitude-topic', 'other'), 'no topic other of type'),
         (('--observations-topic', 'other'), 'no topic other of type'),
     ],

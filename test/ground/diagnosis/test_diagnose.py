@@ -390,8 +390,8 @@ def off(degrees: float) -> Callable[[Night], Night]:
         ([of_pixels(np.rot90)], ['rotated'], 90.0, 'degrees counterclockwise.'),
         ([of_pixels(lambda p: np.rot90(p, -1))], ['rotated'], 90.0, 'degrees clockwise.'),
         # One image shows it to a few parts in a thousand, its distortion being unknown.
-        ([with_focal_length(0.8)], ['focal_length'], 'fx to 0.01', ''),
-        ([with_focal_length(1.2)], ['focal_length'], 'fx to 0.01', ''),
+        ([with_focal_length(0.8)], ['focal_length'], 'fx to 0.01', '% too short'),
+        ([with_focal_length(1.2)], ['focal_length'], 'fx to 0.01', '% too long'),
         ([dark], ['no_stars'], None, ''),
         ([capped_at_first], ['none'], None, ''),
         # Up to 10 px they are measured; one longer than the window of 13 px is cut.

@@ -14,7 +14,6 @@ import cv2
 from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-import yaml
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
@@ -83,16 +82,6 @@ def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None =
     return path
 
 
-def rescaled_camera(folder: Path, scale: float) -> Path:
-    """Write the prior camera of the tiny bag with another focal length."""
-    content = yaml.safe_load((TINY / 'camera.yaml').read_text())
-    for k in (0, 4):
-        content['camera_matrix']['data'][k] *= scale
-    path = folder / 'camera.yaml'
-    path.write_text(yaml.safe_dump(content))
-    return path
-
-
 def said(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
@@ -155,19 +144,6 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(
     for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
         assert 'two clocks' in text and '2026-05-15 09:19:59.250 UTC' in text
         assert 'stamp_offset_s' in text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('scale', 'command'), [(2.0, 'diagnose'), (0.5, 'calibrate')])
-def test_a_focal_length_of_other_pixels(
-    scale: float, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The search takes a command 7 s."""
-    parameters = params_with(tmp_path, camera_info_url=str(rescaled_camera(tmp_path, scale)))
-    path = bag(tmp_path / 'bag.mcap', _raw)
-    for text in said(capsys, tmp_path, path, parameters, [command]).values():
-        assert ('100 % too long' if scale > 1 else '50 % too short') in text
-        assert 'fx = fy = 180' in text
 
 
 @pytest.mark.parametrize(
@@ -235,33 +211,3 @@ def test_a_folder_of_image_files_is_imported(
             assert main.main([*command, str(path)]) == 2
             error = capsys.readouterr().err
             assert 'no image can be read; left out: 1 file (001.fits): not' in error
-
-
-def test_a_bag_without_attitudes_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = bag(tmp_path / 'bag.mcap', _raw, None)
-    main.main(['diagnose', str(path), '--params', str(params_with(tmp_path))])
-    text = ' '.join(capsys.readouterr())
-    assert 'attitudes of the star tracker' in text and 'starcal import' in text
-
-
-@pytest.mark.parametrize('top', [False, True])
-def test_parameters_outside_a_section(
-    top: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    values = {'camera_info_url': str(TINY / 'camera.yaml')}
-    path = tmp_path / 'params.yaml'
-    path.write_text(yaml.safe_dump({'ros__parameters': values} if top else values))
-    assert main.main(['diagnose', str(TINY), '--params', str(path)]) == 2
-    wanted = 'write /**: above' if top else 'write /**: and ros__parameters: above'
-    assert wanted in capsys.readouterr().err
-
-
-def test_a_clock_error_that_shows_nothing_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ['simulate', '-o', str(tmp_path / 'bag'), '--scenario', 'tiny']
-    assert main.main([*command, '--clock-error', '-0.5']) == 2
-    assert '--clock-error: -0.5 s changes no result' in capsys.readouterr().err
-    assert not (tmp_path / 'bag').exists()
