@@ -151,9 +151,7 @@ def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object)
 def write_aem(
     path: Path,
     system: str = 'utc',
-    frames: tuple[str, str] = ('ICRF', 'STARTRACKER_1'),
-    direction: str = 'A2B',
-    order: str = 'LAST',
+    frame: str = 'ICRF',
     version: str = '1.0',
 ) -> Path:
     """An AEM of the small bag in KVN, written by hand from CCSDS 504.0-B."""
@@ -165,22 +163,19 @@ def write_aem(
         'OBJECT_NAME = MSN',
         'OBJECT_ID = 2026-001A',
         'CENTER_NAME = EARTH',
-        f'REF_FRAME_A = {frames[0]}',
-        f'REF_FRAME_B = {frames[1]}',
-        *([f'ATTITUDE_DIR = {direction}'] if version == '1.0' else []),
+        f'REF_FRAME_A = {frame}',
+        'REF_FRAME_B = STARTRACKER_1',
+        *(['ATTITUDE_DIR = A2B'] if version == '1.0' else []),
         f'TIME_SYSTEM = {system.upper()}',
         f'START_TIME = {date(attitudes()[0][0], system)}',
         f'STOP_TIME = {date(attitudes()[-1][0], system)}',
         'ATTITUDE_TYPE = QUATERNION',
-        *([f'QUATERNION_TYPE = {order}'] if version == '1.0' else []),
+        *(['QUATERNION_TYPE = LAST'] if version == '1.0' else []),
         'META_STOP',
         'DATA_START',
     ]
-    forward = (frames[0] != 'STARTRACKER_1') == (direction == 'A2B')
     for time_ns, xyzw in attitudes():
-        q = xyzw if forward else xyzw * [-1, -1, -1, 1]
-        values = q if order == 'LAST' else np.roll(q, 1)
-        numbers = ' '.join(repr(float(value)) for value in values)
+        numbers = ' '.join(map(repr, xyzw.tolist()))
         lines.append(f'{date(time_ns, system)} {numbers}')
     path.write_text('\n'.join([*lines, 'DATA_STOP']) + '\n')
     return path

@@ -129,20 +129,3 @@ def test_mirrored_files_are_mirrored_back(
     undistort_file(tmp_path / 'plain.png', made, maps, tmp_path / 'a.png')
     undistort_file(tmp_path / 'mirrored.png', mirrored, maps, tmp_path / 'b.png')
     assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
-
-
-def test_no_image_is_replaced(
-    made: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_calibration(made, tmp_path / 'calibration.json')
-    cv2.imwrite(str(tmp_path / 'one.png'), np.zeros((512, 640), np.uint8))
-    assert (
-        main.main(['undistort', str(tmp_path), str(tmp_path / 'one.png'), '-o', str(tmp_path)])
-        == 2
-    )
-    assert 'is an input' in capsys.readouterr().err
-    (tmp_path / 'two').mkdir()
-    cv2.imwrite(str(tmp_path / 'two' / 'one.png'), np.zeros((512, 640), np.uint8))
-    both = [str(tmp_path / 'one.png'), str(tmp_path / 'two' / 'one.png')]
-    assert main.main(['undistort', str(tmp_path), *both, '-o', str(tmp_path / 'straight')]) == 2
-    assert 'several images' in capsys.readouterr().err

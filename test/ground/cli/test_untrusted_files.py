@@ -71,6 +71,7 @@ FILES = {
     '--velocity': f'{_IMPORT} --velocity FILE',
     '--times': _IMPORT.replace('HERE/frames/times.csv', 'FILE'),
     '--camera': f'{_IMPORT} --camera FILE',
+    'TABLE': 'catalog FILE -o HERE/o.npz',
     '--params of trend': 'trend HERE/bag -o HERE/o --params FILE',
 }
 """Arguments and options that name a file; images are in the tests of their readers."""
