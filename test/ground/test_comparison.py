@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground import comparison
 from starcal_ground.cli import main
-from starcal_ground.comparison import compare
+from starcal_ground.comparison import chi_squared, compare
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.camera.projection import convert
@@ -275,3 +275,13 @@ def test_the_truth_of_a_simulated_bag_has_no_sigma(
     assert main.main(command) == 2
     error = capsys.readouterr().err
     assert 'not the truth of a simulated bag' in error and error.count('\n') == 1
+
+
+def test_chi_squared_leaves_out_what_has_no_variance_or_is_singular() -> None:
+    """Rows without a variance do not count; of two copies of one number, one does."""
+    copies = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0] * 4, [0.0] * 3 + [4e10]])
+    found = chi_squared(np.array([2.0, 2.0, 7.0, 6e5]), copies)
+    assert found.degrees_of_freedom == 2
+    assert found.value == pytest.approx(2.0**2 + 3.0**2, rel=1e-12)
+    copies[3, 3] = np.nan
+    assert chi_squared(np.array([2.0, 2.0, 7.0, 6e5]), copies).degrees_of_freedom == 1

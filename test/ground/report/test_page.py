@@ -13,7 +13,9 @@ import shutil
 import subprocess
 from typing import Any
 
+from attacks import CHANGES, drawn, with_changes  # type: ignore[import-not-found]
 from browser import BROWSER  # type: ignore[import-not-found]
+from hypothesis import given
 from markupsafe import Markup
 import numpy as np
 import pytest
@@ -233,6 +235,17 @@ def test_numbers_that_are_none_do_no_harm(
     nan = {'residual_rms_px': np.nan, 'variance_factor': np.nan}
     covariance = np.full((13, 13), np.nan)
     assert '<html' in page_of(calibration, tmp_path, covariance=covariance, **none, **nan)
+
+
+@pytest.mark.slow
+@drawn(5)
+@given(CHANGES)
+def test_a_report_of_an_odd_calibration(folder: Path, changes: list[tuple[int, object]]) -> None:
+    content = json.loads((folder / CALIBRATION_FILE).read_text())
+    changed = folder.with_name('changed')
+    shutil.copytree(folder, changed, dirs_exist_ok=True)
+    (changed / CALIBRATION_FILE).write_text(json.dumps(with_changes(content, changes)))
+    assert main.main(['report', str(changed)]) in (EXIT_ACCEPTED, EXIT_BAD_INPUT)
 
 
 @pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])

@@ -46,6 +46,7 @@ def test_export_states_the_cost_of_each_part(folder: Path, tmp_path: Path, capsy
     [
         ('--to spice', '--spacecraft-id'),
         ('--to matlab', "'matlab' is not one of spice, ck, wcs, isd, c, giant"),
+        ('--to opencvv', 'did you mean opencv'),
         ('--to spice --spacecraft-id 5', 'not a negative NAIF ID'),
     ],
 )

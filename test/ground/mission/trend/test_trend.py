@@ -20,7 +20,7 @@ from trend_missions import make_mission, trend, write  # type: ignore[import-not
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras, Task
-from starcal_ground.mission.trend.trend_table import COMPUTED, Row, Table
+from starcal_ground.mission.trend.trend_table import COMPUTED, RECORDED, Row, Table
 
 
 @pytest.fixture
@@ -94,15 +94,6 @@ def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(
     assert main(line) == 2 and capsys.readouterr().err.count('\n') == 1
 
 
-def test_refused_calibrations_alone_have_a_page(mission: Path, capsys) -> None:
-    for day in range(3):
-        folder = mission / f'refused/{day}'
-        write(folder, day, child_frame='other_camera', accepted=False, reasons=('bad',))
-    assert trend(mission) == 0
-    page = (mission.parent / 'out/trend.html').read_text()
-    assert 'other_camera' in page and '11 calibrations' in page
-
-
 def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, capsys) -> None:
     (mission / '3').rename(os.fsdecode(os.fsencode(mission) + b'/caf\xe9'))
     bad = write(Path(os.fsdecode(os.fsencode(mission) + b'/\xff')), 9)
@@ -157,19 +148,6 @@ def test_a_number_that_no_page_can_show_is_left_out(mission: Path, capsys) -> No
     assert '<b>fx</b>Not tested' not in (mission.parent / 'out/trend.html').read_text()
 
 
-@pytest.mark.slow
-def test_bags_are_calibrated_with_parameters(few_images: Path, tmp_path: Path, capsys) -> None:
-    shutil.copytree(few_images, tmp_path / 'fleet/one')
-    (tmp_path / 'fleet/two').mkdir()
-    (tmp_path / 'fleet/two/poison.mcap').write_bytes(b'\x89MCAP0\r\n' + bytes(1000))
-    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
-    assert main([*line, '--params', str(TINY / 'params.yaml')]) == 0
-    assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
-    good = [row for row in Table(tmp_path / 'out').rows() if not row.error]
-    assert [row.kind for row in good] == [COMPUTED]
-    assert good[0].calibration and good[0].calibration.accepted
-
-
 @pytest.mark.parametrize(
     ('line', 'words'),
     [
@@ -222,19 +200,6 @@ def test_a_worker_killed_while_it_starts_is_one_line_and_the_next_run_goes_on(
     assert trend(mission) == 0 and '8 new, 0 known, 0 failed' in capsys.readouterr().out
 
 
-def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
-    shutil.copytree(mission / '1', mission / 'copy')
-    assert trend(mission) == 0
-    capsys.readouterr()
-
-    def unread(*_: object) -> None:
-        raise AssertionError('a file is read')
-
-    monkeypatch.setattr(fleet, 'compute', unread)
-    assert trend(mission) == 0
-    assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
-
-
 def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(mission: Path) -> None:
     found = list(fleet.find(str(mission), Cameras()))
     away = mission.rename(mission.parent / 'unmounted')
@@ -264,7 +229,10 @@ def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, capsys) -> N
     assert '2 new, 0 known, 0 failed' in capsys.readouterr().out
     assert main(line) == 0
     assert '0 new, 2 known, 0 failed' in capsys.readouterr().out
-    paths = sorted(row.path for row in Table(tmp_path).rows())
-    assert paths == ['memory://fleet/bag', 'memory://fleet/one/calibration.json']
+    kinds = {row.path: row.kind for row in Table(tmp_path).rows()}
+    assert kinds == {
+        'memory://fleet/bag': COMPUTED,
+        'memory://fleet/one/calibration.json': RECORDED,
+    }
     assert main([*line[:3], 'memory://fleet/out']) == 2
     assert 'results are written to a local folder, no URL' in capsys.readouterr().err
