@@ -6,23 +6,27 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+import re
 import shutil
 
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from sample_records import calibration, without_field  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.reader import read_observations
 from starcal_ground.cli import main
+from starcal_ground.cli.commands.calibrate import print_calibration
 from starcal_ground.products import (
     NOT_CALIBRATED_FILE,
     OBSERVATIONS_FILE,
     OBSERVATIONS_TOPIC,
     write_observations,
 )
+from starcal_ros.camera.projection import convert
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.records import refused_image
+from starcal_ros.records import refused_image, SigmaPart
 
 
 @pytest.mark.slow
@@ -164,3 +168,46 @@ def test_a_part_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
     main.main([*command, '--to', '+20'])  # six may be too few for the gate
     assert 'images      6 used' in capsys.readouterr().out
+
+
+def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[str]) -> None:
+    budget = (
+        *calibration().sigma_budget,
+        SigmaPart('stamps', 0.01, 0.02, '5 ms assumed'),
+        SigmaPart('star tracker noise', 0.0, 12.0, 'estimated: 20, 20, 20″ about x, y, z'),
+    )
+    record = dataclasses.replace(calibration(), sigma_budget=budget)
+    print_calibration(record, record.geometry)
+    lines = capsys.readouterr().out.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith('1-sigma of lines'))
+    assert [line.split('  ')[0] for line in lines[first + 1 : first + 4]] == [
+        'total', 'star tracker noise', 'velocity'
+    ]  # fmt: skip
+    assert lines[first + 3].split() == ['velocity', '0.6″', '0.75″']
+    assert 'stamps' not in '\n'.join(lines) and max(map(len, lines)) <= 80
+
+
+def test_a_calibration_without_a_budget_has_no_table_of_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    record = dataclasses.replace(calibration(), sigma_budget=())
+    print_calibration(record, record.geometry)
+    assert '1-sigma of lines' not in capsys.readouterr().out
+
+
+def test_a_lens_that_the_prior_did_not_have_has_no_changes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With ``lens_model: auto``."""
+    prior = calibration().geometry
+    camera, _ = convert(prior.camera, 'rational_polynomial')
+    record = dataclasses.replace(
+        without_field(),
+        geometry=dataclasses.replace(prior, camera=camera),
+        covariance=np.eye(len(camera.parameters) + 3),
+    )
+    print_calibration(record, prior)
+    said = capsys.readouterr().out
+    assert re.search(r'^k6 +\S+ +held, \S+ *$', said, re.MULTILINE)
+    print_calibration(dataclasses.replace(record, parent_frame=''), prior)  # no alignment either
+    assert 'from prior' in said and 'from prior' not in capsys.readouterr().out
