@@ -15,9 +15,9 @@ import numpy as np
 from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground import comparison
-from starcal_ground.cli import main
 from starcal_ground.comparison import chi_squared, compare
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
@@ -57,17 +57,14 @@ def moved(
 
 
 @pytest.fixture
-def compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Compared:
+def compared(tmp_path: Path, starcal: Starcal) -> Compared:
     """Text and JSON object of `starcal compare`."""
 
     def run(*calibrations: Calibration) -> tuple[str, dict[str, Any]]:
         files = [tmp_path / f'{name}.json' for name in 'ab']
         for path, calibration in zip(files, calibrations, strict=True):
             write_calibration(calibration, path)
-        assert main.main(['compare', *map(str, files)]) == 0
-        text = capsys.readouterr().out
-        assert main.main(['compare', *map(str, files), '--json']) == 0
-        return text, json.loads(capsys.readouterr().out)
+        return starcal('compare', *files).out, json.loads(starcal('compare', *files, '--json').out)
 
     return run
 
@@ -261,20 +258,17 @@ def test_the_tool_compares(tiny: Calibration, compared: Compared) -> None:
 
 
 def test_the_truth_of_a_simulated_bag_has_no_sigma(
-    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Calibration, tmp_path: Path, starcal: Starcal
 ) -> None:
     write_calibration(tiny, tmp_path / 'calibration.json')
     truth = tmp_path / 'truth.json'
     shutil.copy(TINY / 'truth.json', truth)
-    command = ['compare', str(tmp_path), str(truth)]
-    assert main.main([*command, '--json']) == 0
-    made, true = json.loads(capsys.readouterr().out), json.loads(truth.read_text())
+    made = json.loads(starcal('compare', tmp_path, truth, '--json').out)
+    true = json.loads(truth.read_text())
     assert made['sigma'] == pytest.approx(tiny.sigma.tolist())
     assert made['b'] == [*true['k_true'], *true['d_true']] and made['p_value'] > 1e-3
     truth.write_text(json.dumps({**true, 'A_true': 1}))
-    assert main.main(command) == 2
-    error = capsys.readouterr().err
-    assert 'not the truth of a simulated bag' in error and error.count('\n') == 1
+    assert_refused(starcal('compare', tmp_path, truth), 'not the truth of a simulated bag')
 
 
 def test_chi_squared_leaves_out_what_has_no_variance_or_is_singular() -> None:

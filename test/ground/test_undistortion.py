@@ -11,8 +11,8 @@ from astropy.io import fits
 import cv2
 import numpy as np
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
 
-from starcal_ground.cli import main
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.undistortion import (
@@ -79,7 +79,7 @@ def test_stars_are_where_a_pinhole_camera_has_them(made: Calibration, k1: float)
 
 
 def test_images_of_any_kind_are_straightened(
-    made: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: Calibration, tmp_path: Path, starcal: Starcal
 ) -> None:
     """As stored: colours, bits and types; with the camera that they are of then."""
     write_calibration(made, tmp_path / 'calibration.json')
@@ -93,9 +93,7 @@ def test_images_of_any_kind_are_straightened(
     fits.PrimaryHDU(ramp.astype(np.float32)).writeto(photos / 'ramp.fits')
     cv2.imwrite(str(photos / 'small.png'), ramp[:100])
     (photos / 'notes.txt').write_text('clouds')
-    line = ['undistort', str(tmp_path), str(photos), '-o', str(tmp_path / 'straight')]
-    assert main.main(line) == 0
-    said = ' '.join(capsys.readouterr().out.split())
+    said = starcal('undistort', tmp_path, photos, '-o', tmp_path / 'straight').words
     assert '3 images and camera_info.yaml written' in said
     assert '1 file (small.png): 640 x 100 pixels, not 640 x 512' in said
     read = {

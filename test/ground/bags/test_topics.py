@@ -9,6 +9,7 @@ import cv2
 from mission_files import attitudes, images, TINY, write_tiny, write_unread  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground import calibrate_bag
@@ -96,13 +97,14 @@ NOT_READ = (
 )
 
 
-def with_topics(folder: Path, kinds: dict[str, str]) -> list[Path]:
-    """A bag of an image and of topics with a message each, which nobody decodes."""
-    with BagWriter(folder) as writer:
-        writer.write_image('/image', images()[0], 'camera')
+def with_topics(path: Path, kinds: dict[str, str], count: int = 1) -> list[Path]:
+    """A bag of some images and of topics with a message each, which nobody decodes."""
+    with BagWriter(path) as writer:
+        for image in images()[:count]:
+            writer.write_image(IMAGE_TOPIC, image, 'camera')
         for name, kind in kinds.items():
             write_unread(writer, name, kind)
-    return [folder]
+    return [path]
 
 
 @pytest.mark.parametrize(
@@ -225,14 +227,9 @@ ODOMETRY, POSE, TF = (
 )
 
 
-def write_bag(path: Path, kind: str) -> Path:
-    """Write four images, and attitudes in messages of a type that is not read; empty: none."""
-    with BagWriter(path) as writer:
-        for image in images()[:4]:
-            writer.write_image(IMAGE_TOPIC, image, 'camera')
-        if kind:
-            write_unread(writer, '/gnc/state', kind)
-    return path
+def of_four_images(path: Path, kind: str) -> Path:
+    """A bag of four images and a message of a type that is not read; empty: none."""
+    return with_topics(path, {'/gnc/state': kind} if kind else {}, 4)[0]
 
 
 def params(folder: Path, **options: object) -> Path:
@@ -251,16 +248,17 @@ STATED = {
 @pytest.mark.parametrize('stated', STATED)
 @pytest.mark.parametrize('kind', [ODOMETRY, POSE, TF, ''])
 def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_command(
-    kind: str, stated: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: str, stated: str, tmp_path: Path, starcal: Starcal
 ) -> None:
-    bag = write_bag(tmp_path / 'bag.mcap', kind)
+    bag = of_four_images(tmp_path / 'bag.mcap', kind)
     given = ['--params', str(params(tmp_path, **{stated: STATED[stated]}))]
     for command, status in (
-        (['calibrate', str(bag), *given, '-o', str(tmp_path / 'out')], 2),
-        (['diagnose', str(bag), *given], 3),
+        (['calibrate', bag, *given, '-o', tmp_path / 'out'], 2),
+        (['diagnose', bag, *given], 3),
     ):
-        assert main(command) == status
-        said = ' '.join(' '.join(capsys.readouterr()).split())
+        answer = starcal(*command)
+        said = ' '.join([answer.words, answer.err])
+        assert answer.status == status
         assert 'record the attitudes of the star tracker' in said
         assert 'starcal calibrate --camera-alone' in said
         if kind:
@@ -279,32 +277,32 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
 )
 @pytest.mark.slow
 def test_diagnose_takes_images_without_attitudes_where_calibrate_does(
-    kind: str, options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: str, options: list[str], tmp_path: Path, starcal: Starcal
 ) -> None:
-    bag = write_bag(tmp_path / 'bag.mcap', kind)
+    bag = of_four_images(tmp_path / 'bag.mcap', kind)
     stated = STATED if '--camera-alone' in options else {}
     words = {'PARAMS': ['--params', str(params(tmp_path, **stated))]}
     given = [word for option in options for word in words.get(option, [option])]
-    assert main(['diagnose', str(bag), *given]) == 0
-    said = capsys.readouterr().out
+    status, said, _ = starcal('diagnose', bag, *given)
+    assert status == 0
     assert '4 of 4 images' in said and 'the camera alone can be calibrated' in said
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('with_attitudes', [False, True])
 def test_the_camera_alone_is_calibrated_where_it_is_requested(
-    with_attitudes: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    with_attitudes: bool, tmp_path: Path, starcal: Starcal
 ) -> None:
-    bag = TINY if with_attitudes else write_bag(tmp_path / 'bag.mcap', ODOMETRY)
-    command = ['calibrate', str(bag), '--camera-alone', '-o', str(tmp_path / 'out')]
-    given = ['--params', str(TINY / 'params.yaml')]
-    assert main([*command, *given]) in (0, 3)
+    bag = TINY if with_attitudes else of_four_images(tmp_path / 'bag.mcap', ODOMETRY)
+    given = ['--params', TINY / 'params.yaml']
+    answer = starcal('calibrate', bag, '--camera-alone', '-o', tmp_path / 'out', *given)
+    assert answer.status in (0, 3)
     made = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert not made.has_alignment
-    assert 'not used, since the attitudes are those of the stars: prior' in capsys.readouterr().err
+    assert 'not used, since the attitudes are those of the stars: prior' in answer.err
     # Its observations say so: repeated from them, it gained the alignment to a star tracker.
     out, again = str(tmp_path / 'out/observations.mcap'), str(tmp_path / 'again')
-    assert main(['calibrate', out, *given, '-o', again]) in (0, 3)
+    assert starcal('calibrate', out, *given, '-o', again).status in (0, 3)
     repeated = read_calibration(tmp_path / 'again/calibration.json')
     assert not repeated.has_alignment
     name = 'observations_sha256'

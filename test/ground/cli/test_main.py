@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
 import importlib.util
 import json
 import os
@@ -20,6 +19,7 @@ import sys
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.child_process import module_command
@@ -31,43 +31,15 @@ from starcal_ros.constants import software_version
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import Image
 
-Run = Callable[..., 'tuple[int, str, str]']
 
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the tool in this process; returns status, stdout and stderr."""
-
-    def tool(*arguments: object) -> tuple[int, str, str]:
-        try:
-            status = main.main([str(argument) for argument in arguments])
-        except SystemExit as error:  # argparse's way out
-            status = int(error.code or 0)
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return tool
-
-
-def assert_refused(result: tuple[int, str, str], *words: str) -> None:
-    """Status 2 and one line that has all the words."""
-    status, _, err = result
-    assert status == 2
-    assert err.count('\n') == 1 and err.endswith('\n'), err
-    assert err.startswith('starcal: ')
-    assert 'Traceback' not in err
-    for word in words:
-        assert word in err
-
-
-def test_no_command_prints_the_help(run: Run) -> None:
-    status, out, err = run()
+def test_no_command_prints_the_help(starcal: Starcal) -> None:
+    status, out, err = starcal()
     assert (status, err) == (0, '')
     assert out == parser().format_help()
 
 
-def test_version(run: Run) -> None:
-    assert run('--version') == (0, f'starcal {software_version()}\n', '')
+def test_version(starcal: Starcal) -> None:
+    assert starcal('--version') == (0, f'starcal {software_version()}\n', '')
 
 
 def test_help_is_there_at_once() -> None:
@@ -136,14 +108,14 @@ def test_a_command_line_imports_its_command_alone() -> None:
     ],
 )
 def test_bad_arguments(
-    run: Run,
+    starcal: Starcal,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     arguments: list[str],
     words: list[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert_refused(run(*arguments), *words)
+    assert_refused(starcal(*arguments), *words)
     assert not any(tmp_path.iterdir())
 
 
@@ -157,10 +129,12 @@ def test_bad_arguments(
         ('/**:\n  ros__parameters: {min_images: few}\n', ['min_images', 'bad.yaml']),
     ],
 )
-def test_bad_parameter_files(run: Run, tmp_path: Path, text: str, words: list[str]) -> None:
+def test_bad_parameter_files(
+    starcal: Starcal, tmp_path: Path, text: str, words: list[str]
+) -> None:
     file = tmp_path / 'bad.yaml'
     file.write_text(text)
-    assert_refused(run('calibrate', TINY, '--params', file, '-o', tmp_path / 'out'), *words)
+    assert_refused(starcal('calibrate', TINY, '--params', file, '-o', tmp_path / 'out'), *words)
 
 
 @pytest.fixture(scope='module')
@@ -172,10 +146,10 @@ def lookup_columns() -> list[str]:
 
 
 def test_lookup_writes_the_columns_of_the_interface_document(
-    run: Run, tmp_path: Path, tiny_products: Path, lookup_columns: list[str]
+    starcal: Starcal, tmp_path: Path, tiny_products: Path, lookup_columns: list[str]
 ) -> None:
     file = tmp_path / 'table.csv'
-    status, out, err = run('lookup', tiny_products, '-o', file)
+    status, out, err = starcal('lookup', tiny_products, '-o', file)
     assert (status, err) == (0, '')
     assert '625 lines of sight' in out and str(file) in out
     table = np.genfromtxt(file, delimiter=',', names=True)
@@ -185,7 +159,7 @@ def test_lookup_writes_the_columns_of_the_interface_document(
     assert (table['u_px'][0], table['v_px'][0]) == (0.0, 0.0)
     assert (table['u_px'][24], table['v_px'][24]) == (639.0, 0.0)
     assert (table['u_px'][-1], table['v_px'][-1]) == (639.0, 511.0)
-    status, _, err = run(
+    status, _, err = starcal(
         'lookup', tiny_products / 'calibration.json', '-o', tmp_path / 'table.npz', '--points', 3
     )
     assert (status, err) == (0, '')
@@ -205,23 +179,25 @@ def test_lookup_writes_the_columns_of_the_interface_document(
     ],
 )
 def test_bad_lookups(
-    run: Run,
+    starcal: Starcal,
     tmp_path: Path,
     tiny_products: Path,
     file: str,
     options: tuple[str, ...],
     words: list[str],
 ) -> None:
-    assert_refused(run('lookup', tiny_products, '-o', tmp_path / file, *options), *words)
+    assert_refused(starcal('lookup', tiny_products, '-o', tmp_path / file, *options), *words)
     assert not (tmp_path / file).exists()
-    assert_refused(run('lookup', tmp_path, '-o', tmp_path / 'a.csv'), 'no calibration.json')
+    assert_refused(starcal('lookup', tmp_path, '-o', tmp_path / 'a.csv'), 'no calibration.json')
 
 
-def test_outputs_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
+def test_outputs_that_cannot_be_written(starcal: Starcal, tmp_path: Path) -> None:
     file = tmp_path / 'file'
     file.write_text('in the way')
-    assert_refused(run('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', file), str(file))
-    result = run('simulate', '--scenario', 'tiny', '-o', file / 'bag')
+    assert_refused(
+        starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', file), str(file)
+    )
+    result = starcal('simulate', '--scenario', 'tiny', '-o', file / 'bag')
     assert_refused(result, str(file))
     assert file.read_text() == 'in the way'
 
@@ -229,9 +205,9 @@ def test_outputs_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
 BLANK = np.full((512, 640), 33, np.uint16)
 
 
-def test_a_temperature_topic_must_be_there(run: Run, tmp_path: Path) -> None:
+def test_a_temperature_topic_must_be_there(starcal: Starcal, tmp_path: Path) -> None:
     files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    result = run('calibrate', TINY, *files, '--temperature-topic', '/box')
+    result = starcal('calibrate', TINY, *files, '--temperature-topic', '/box')
     assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
     two = tmp_path / 'two.mcap'
     with BagWriter(two) as writer:
@@ -240,23 +216,23 @@ def test_a_temperature_topic_must_be_there(run: Run, tmp_path: Path) -> None:
         for topic in ('/lens', '/box'):
             writer.write_temperature(topic, 5, 20.0, 'camera')
     # Two thermometers: which one, is asked only where it matters.
-    assert_refused(run('calibrate', two, *files), 'No image of 1 can be used', 'as blank')
+    assert_refused(starcal('calibrate', two, *files), 'No image of 1 can be used', 'as blank')
     asks = params_with(tmp_path, focal_temperature_order=1)
-    result = run('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
+    result = starcal('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
     assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
 
 
 @pytest.mark.slow
-def test_simulate_writes_bag_truth_and_parameters(run: Run, tmp_path: Path) -> None:
+def test_simulate_writes_bag_truth_and_parameters(starcal: Starcal, tmp_path: Path) -> None:
     made = ('--scenario', 'tiny', '--seed', '5', '--images', '4')
-    status, out, err = run('simulate', '-o', tmp_path / 'bag', *made)
+    status, out, err = starcal('simulate', '-o', tmp_path / 'bag', *made)
     assert (status, err) == (0, '')
     truth = json.loads((tmp_path / 'bag' / 'truth.json').read_text())
     assert (truth['seed'], truth['images'], truth['scenario']) == (5, 4, 'tiny')
     assert (tmp_path / 'bag' / truth['bag']).is_file()
     assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
     assert 'truth.json' in out and 'params.yaml' in out
-    assert run('simulate', '-o', tmp_path / 'b.mcap', *made)[0] == 0
+    assert starcal('simulate', '-o', tmp_path / 'b.mcap', *made)[0] == 0
     same = (tmp_path / 'bag' / truth['bag']).read_bytes()
     assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
     assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}
@@ -291,14 +267,14 @@ def test_each_command_has_examples_that_it_takes() -> None:
 @pytest.mark.packaging
 @pytest.mark.slow
 def test_the_first_steps_run_in_an_empty_folder(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As after `pip install`, where there is neither ROS nor the bag of the repository."""
     monkeypatch.chdir(tmp_path)
     *steps, demo_step = [words[1:] for name, words in examples() if not name]
     assert [words[0] for words in steps] == ['simulate', 'calibrate', 'compare']
     for words in steps:
-        assert run(*words)[0] == 0, words
+        assert starcal(*words)[0] == 0, words
     assert demo_step == ['demo']
 
 
@@ -307,13 +283,13 @@ def test_the_first_steps_run_in_an_empty_folder(
 )
 @pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
 def test_what_needs_ros_names_it(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
+    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
 ) -> None:
     for name in [name for name in sys.modules if name.partition('.')[0] == missing]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)  # cannot be imported
     monkeypatch.setitem(sys.modules, 'starcal_ground.report', None)  # ROS is named first
-    result = run(*line.format(t=tmp_path, b=TINY).split())
+    result = starcal(*line.format(t=tmp_path, b=TINY).split())
     assert_refused(result, missing, 'is not installed', 'source a ROS 2 workspace')
     assert 'starcal calibrate' in result[2]
     assert not (tmp_path / 'out').exists()
@@ -365,33 +341,33 @@ def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> No
     ],
 )
 def test_a_command_becomes_its_node(
-    run: Run, monkeypatch: pytest.MonkeyPatch, line: str, module: str, arguments: str
+    starcal: Starcal, monkeypatch: pytest.MonkeyPatch, line: str, module: str, arguments: str
 ) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
-    run(*line.split())
+    starcal(*line.split())
     entry = module_command('starcal_ros.entry_points')
     assert called == [[*entry, module, *arguments.split()]]
     assert '.' not in module or importlib.util.find_spec(module)
 
 
 def test_no_report_is_written_where_none_is_wanted(
-    run: Run, tmp_path: Path, tiny_bag: Path, tiny_products: Path
+    starcal: Starcal, tmp_path: Path, tiny_bag: Path, tiny_products: Path
 ) -> None:
     write_atomically(tmp_path / 'report.html', 'of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
-    status, out, _ = run('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
+    status, out, _ = starcal('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
     assert status == 0 and f'\nproducts written to {tmp_path}\n' in out
     assert (tmp_path / 'calibration.json').is_file()
     assert not (tmp_path / 'report.html').exists()
 
 
 @pytest.mark.slow
-def test_parameters_of_the_nodes_are_known_to_the_tool(run: Run, tmp_path: Path) -> None:
+def test_parameters_of_the_nodes_are_known_to_the_tool(starcal: Starcal, tmp_path: Path) -> None:
     shared = params_with(
         tmp_path, autostart=True, attitude_timeout_s=2.0, use_sim_time=True, max_change_px=1e-6
     )
-    status, _, err = run('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
+    status, _, err = starcal('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
     assert (status, err) == (3, '')
 
 
@@ -415,7 +391,7 @@ def test_demo_makes_the_bag_where_there_is_none(
 
 @pytest.mark.slow
 def test_demo_says_which_node_failed(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
     waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
@@ -424,7 +400,7 @@ def test_demo_says_which_node_failed(
         'node_command',
         lambda name, *_: failing if name == 'calibrator' else waiting,
     )
-    assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
+    assert_refused(starcal('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
 
 def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from hypothesis import given
 from markupsafe import Markup
 import numpy as np
 import pytest
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground import products
 from starcal_ground.bags.reader import read_observations
@@ -253,14 +254,12 @@ def test_a_report_of_an_odd_calibration(folder: Path, changes: list[tuple[int, o
 
 @pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])
 def test_damaged_files_are_named_in_one_line(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str
+    folder: Path, tmp_path: Path, starcal: Starcal, damage: str
 ) -> None:
     broken = tmp_path / 'broken'
     shutil.copytree(folder, broken)
     (broken / damage).write_bytes(b'no such thing')
-    assert main.main(['report', str(broken)]) == EXIT_BAD_INPUT
-    complaint = capsys.readouterr().err
-    assert complaint.count('\n') == 1 and damage in complaint
+    assert_refused(starcal('report', broken), damage)
 
 
 # Put first in the page: what goes wrong is kept from the start.

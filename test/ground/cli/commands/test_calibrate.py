@@ -13,10 +13,10 @@ from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_records import calibration, without_field  # type: ignore[import-not-found]
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.reader import read_observations
-from starcal_ground.cli import main
 from starcal_ground.cli.commands.calibrate import print_calibration
 from starcal_ground.products import (
     NOT_CALIBRATED_FILE,
@@ -31,17 +31,15 @@ from starcal_ros.records import refused_image, SigmaPart
 
 @pytest.mark.slow
 def test_a_failure_replaces_an_older_calibration(
-    tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_products: Path, tmp_path: Path, starcal: Starcal
 ) -> None:
     out = tmp_path / 'out'
     shutil.copytree(tiny_products, out)
     assert 'Accepted' in (out / 'report.html').read_text()
-    params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
-    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
-    complaint = capsys.readouterr().err
-    words = 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)'
-    assert words in complaint and complaint.count('\n') == 1
-    assert complaint.endswith(f'; look at {out}/report.html\n')
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    answer = starcal('calibrate', TINY, '--params', params, '-o', out)
+    assert_refused(answer, 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)')
+    assert answer.err.endswith(f'; look at {out}/report.html\n')
     record = json.loads((out / NOT_CALIBRATED_FILE).read_text())
     assert (record['calibrated'], record['cause']) == (False, 'attitude_direction')
     assert record['images_refused'] == {'no_match': 10}
@@ -53,16 +51,15 @@ def test_a_failure_replaces_an_older_calibration(
         assert 'Not calibrated' in page and 'Accepted' not in page
         assert page.count('<figure><img src="data:image/png;base64,') == 3
         assert 'attitude_direction: st_to_inertial' in page
-        assert main.main(['report', str(out)]) == 0
-    again = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
-    assert main.main(again) == 0
+        assert starcal('report', out).status == 0
+    assert starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', out).status == 0
     assert not (out / NOT_CALIBRATED_FILE).exists()
     assert 'Accepted' in (out / 'report.html').read_text()
 
 
 @pytest.mark.slow
 def test_the_reason_of_each_refusal_is_said(
-    tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_products: Path, tmp_path: Path, starcal: Starcal
 ) -> None:
     images = list(read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC))
     one, two, *others = images
@@ -72,10 +69,9 @@ def test_the_reason_of_each_refusal_is_said(
     ]
     (tmp_path / 'bag').mkdir()
     write_observations([*refused, *others], tmp_path / 'bag', 'camera')
-    command = ['calibrate', str(tmp_path / 'bag'), '--params', str(TINY / 'params.yaml')]
-    main.main([*command, '-o', str(tmp_path / 'out'), '--no-report'])
+    command = ['calibrate', tmp_path / 'bag', '--params', TINY / 'params.yaml']
+    said = starcal(*command, '-o', tmp_path / 'out', '--no-report').err
     words = '2 of 10 images refused, no_match: no rotation of the predicted stars explains'
-    said = capsys.readouterr().err
     assert words in said and '(in one part only)' in said
 
 
@@ -94,16 +90,14 @@ def broken(*_: object) -> None:
     ],
 )
 def test_a_drawing_that_fails_costs_the_drawing_only(
-    few_images: Path, tmp_path: Path, capsys, monkeypatch, place: str, missing: str
+    few_images: Path, tmp_path: Path, starcal: Starcal, monkeypatch, place: str, missing: str
 ) -> None:
     out = tmp_path / 'out'
     out.mkdir()
     write_atomically(out / 'report.html', 'of earlier products')
     monkeypatch.setattr(place, broken)
-    params = str(few_images / 'params.yaml')
-    assert main.main(['calibrate', str(few_images), '--params', params, '-o', str(out)]) == 0
-    said = capsys.readouterr()
-    assert 'accepted by the gate' in said.out
+    said = starcal('calibrate', few_images, '--params', few_images / 'params.yaml', '-o', out)
+    assert said.status == 0 and 'accepted by the gate' in said.out
     assert f'warning: no {missing}, ' in said.err and 'TypeError: another version' in said.err
     assert said.err.count('\n') == 1
     assert ('the products cannot be drawn' in said.err) == (missing == 'report')
@@ -112,26 +106,26 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
 
 
 @pytest.mark.slow
-def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monkeypatch) -> None:
+def test_a_failure_page_that_fails_hides_no_failure(
+    tmp_path: Path, starcal: Starcal, monkeypatch
+) -> None:
     monkeypatch.setattr('starcal_ground.report.page.write_failure_page', broken)
     monkeypatch.setattr('starcal_ground.report.thumbnails._expected_picture', broken)
-    params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
     out = tmp_path / 'out'
-    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
-    words = capsys.readouterr().err.splitlines()
+    answer = starcal('calibrate', TINY, '--params', params, '-o', out)
+    words = answer.err.splitlines()
+    assert answer.status == 2
     assert len(words) == 3 and 'no pictures of images' in words[0] and 'no report' in words[1]
     assert 'Set attitude_direction: st_to_inertial.' in words[2]
     assert (out / NOT_CALIBRATED_FILE).exists() and not (out / 'report.html').exists()
 
 
 @pytest.mark.slow
-def test_alignment_and_tracker_sigma_are_found_and_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    params = str(params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None))
+def test_alignment_and_tracker_sigma_are_found_and_said(tmp_path: Path, starcal: Starcal) -> None:
+    params = params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None)
     out = tmp_path / 'out'
-    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 0
-    said = capsys.readouterr()
+    said = starcal('calibrate', TINY, '--params', params, '-o', out)
     assert 'prior_alignment is not given: found [' in said.err
     assert 'star_tracker_sigma_arcsec: assumed from the scatter of the images' in said.out
     made = json.loads((out / 'calibration.json').read_text())
@@ -148,26 +142,24 @@ def test_alignment_and_tracker_sigma_are_found_and_said(
 
 @pytest.mark.parametrize('rate', [0.0, np.nan])
 def test_rates_that_no_image_has_are_said(
-    rate: float, tmp_path: Path, tiny_products: Path, capsys: pytest.CaptureFixture[str]
+    rate: float, tmp_path: Path, tiny_products: Path, starcal: Starcal
 ) -> None:
     recorded = read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC)
     rates = np.full(3, rate)
     images = [dataclasses.replace(image, star_tracker_rate_rad_s=rates) for image in recorded]
     write_observations(images, tmp_path, 'camera')
-    out, params = str(tmp_path / 'out'), str(params_with(tmp_path, shutter=None))
-    bag = str(tmp_path / OBSERVATIONS_FILE)
-    assert main.main(['calibrate', bag, '--params', params, '-o', out, '--no-report']) == 0
-    said = ' '.join(capsys.readouterr().out.split())
+    bag, params = tmp_path / OBSERVATIONS_FILE, params_with(tmp_path, shutter=None)
+    given = ['--params', params, '-o', tmp_path / 'out', '--no-report']
+    said = starcal('calibrate', bag, *given).words
     assert ('the turn of a low orbit in the sigma' in said) == np.isnan(rate)
     assert 'read out within 20 ms' in said
 
 
 @pytest.mark.slow
-def test_a_part_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / 'out'
-    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
-    main.main([*command, '--to', '+20'])  # six may be too few for the gate
-    assert 'images      6 used' in capsys.readouterr().out
+def test_a_part_of_a_bag(tmp_path: Path, starcal: Starcal) -> None:
+    command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
+    # Six may be too few for the gate.
+    assert 'images      6 used' in starcal(*command, '--to', '+20').out
 
 
 def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,10 +14,10 @@ import cv2
 from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
-from starcal_ground.cli import main
 from starcal_ground.mission.ingest.deep_catalog import write_deep_catalog
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
@@ -83,7 +83,7 @@ def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None =
 
 
 def said(
-    capsys: pytest.CaptureFixture[str],
+    starcal: Starcal,
     tmp_path: Path,
     path: Path,
     parameters: Path,
@@ -93,16 +93,13 @@ def said(
     more = {'calibrate': ['-o', str(tmp_path / 'out'), '--no-report']}
     found = {}
     for command in commands:
-        given = [command, str(path), '--params', str(parameters)]
-        status = main.main([*given, *more.get(command, ['--json'])])
-        text = capsys.readouterr()
-        assert status in (2, 3) and 'Traceback' not in text.err
-        if status == 2:
-            found[command] = text.err
-            assert text.err.count('\n') == 1
-        else:
-            content = json.loads(text.out)
+        answer = starcal(command, path, '--params', parameters, *more.get(command, ['--json']))
+        if answer.status == 3:
+            content = json.loads(answer.out)
             found[command] = ' '.join([content['sentence'], *content['mend']])
+        else:
+            assert_refused(answer)
+            found[command] = answer.err
     return found
 
 
@@ -127,21 +124,19 @@ def test_a_mistake_of_the_bag(
     shift_s: float | None,
     words: list[str],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    starcal: Starcal,
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', write, shift_s)
-    for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
+    for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():
         for word in words:
             assert word.lower() in text.lower(), text
 
 
 @pytest.mark.slow
-def test_clocks_that_cannot_be_matched_are_two_clocks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_clocks_that_cannot_be_matched_are_two_clocks(tmp_path: Path, starcal: Starcal) -> None:
     """With the attitudes of one image only no shift can be found."""
     path = bag(tmp_path / 'bag.mcap', _raw, 7200.0, cut=4)
-    for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
+    for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():
         assert 'two clocks' in text and '2026-05-15 09:19:59.250 UTC' in text
         assert 'stamp_offset_s' in text
 
@@ -155,15 +150,15 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(
     ],
 )
 def test_a_mistake_of_the_parameters(
-    changes: dict[str, Any], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    changes: dict[str, Any], words: list[str], tmp_path: Path, starcal: Starcal
 ) -> None:
-    for text in said(capsys, tmp_path, TINY, params_with(tmp_path, **changes)).values():
+    for text in said(starcal, tmp_path, TINY, params_with(tmp_path, **changes)).values():
         for word in words:
             assert word in text
 
 
 def test_an_uncertainty_of_the_mounting_that_is_too_small(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
     """A field of half a degree, off by another one, and stated to be known to 0.01 degrees."""
     given = dataclasses.replace(scenario('narrow'), image_count=6)
@@ -172,42 +167,34 @@ def test_an_uncertainty_of_the_mounting_that_is_too_small(
     write_deep_catalog(tmp_path / 'bag' / 'gaia.csv', tmp_path / 'bag' / 'gaia.npz')
     text = made.params.read_text()
     made.params.write_text(re.sub(r'(alignment_sigma_deg): .*', r'\1: 0.01', text))
-    found = said(capsys, tmp_path, made.bag, made.params, ['calibrate'])['calibrate']
+    found = said(starcal, tmp_path, made.bag, made.params, ['calibrate'])['calibrate']
     assert re.search(r'points 0\.[45]\d+ degrees away .* prior_alignment_sigma_deg: 0\.01', found)
     assert 'Set prior_alignment: [' in found
 
 
-def test_the_remedy_is_named_without_parameters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_remedy_is_named_without_parameters(tmp_path: Path, starcal: Starcal) -> None:
     path = bag(tmp_path / 'bag.mcap', _bmp)
-    assert main.main(['diagnose', str(path)]) == 3
-    assert 'is not a PNG or JPEG' in capsys.readouterr().out.partition('Cannot be calibrated')[2]
+    status, out, _ = starcal('diagnose', path)
+    assert status == 3
+    assert 'is not a PNG or JPEG' in out.partition('Cannot be calibrated')[2]
 
 
 @pytest.mark.parametrize('start', ['2030-01-01T00:00:00', '+5000'])
-def test_no_image_is_chosen(
-    start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '--from', start]
-    assert main.main([*command, '-o', str(tmp_path / 'out')]) == 2
-    error = capsys.readouterr().err
-    assert '2026-05-15 07:20:00.000 UTC to 2026-05-15 07:20:36.000 UTC, +0 to +36 s' in error
+def test_no_image_is_chosen(start: str, tmp_path: Path, starcal: Starcal) -> None:
+    command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '--from', start]
+    span = '2026-05-15 07:20:00.000 UTC to 2026-05-15 07:20:36.000 UTC, +0 to +36 s'
+    assert_refused(starcal(*command, '-o', tmp_path / 'out'), span)
 
 
-def test_a_folder_of_image_files_is_imported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_image_files_is_imported(tmp_path: Path, starcal: Starcal) -> None:
     night = tmp_path / 'night'
     night.mkdir()
     (night / '001.fits').write_bytes(b'SIMPLE  =                    T')
-    for command in (['calibrate', '-o', str(tmp_path / 'out')], ['diagnose']):
+    for command in (['calibrate', '-o', tmp_path / 'out'], ['diagnose']):
         for path in (night, night / '001.fits'):
             # What is stated of a star tracker has to be there.
-            stated = [*command, str(path), '--params', str(TINY / 'params.yaml')]
-            assert main.main(stated) == 2
-            assert 'a bag that has them (starcal import)' in capsys.readouterr().err
+            stated = starcal(*command, path, '--params', TINY / 'params.yaml')
+            assert_refused(stated, 'a bag that has them (starcal import)')
             # By the stars alone: a file that is none is named.
-            assert main.main([*command, str(path)]) == 2
-            error = capsys.readouterr().err
-            assert 'no image can be read; left out: 1 file (001.fits): not' in error
+            alone = starcal(*command, path)
+            assert_refused(alone, 'no image can be read; left out: 1 file (001.fits): not')

@@ -15,8 +15,8 @@ from astropy.table import MaskedColumn, Table
 import erfa
 import numpy as np
 import pytest
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
-from starcal_ground.cli.main import main
 from starcal_ground.mission.ingest.deep_catalog import (
     deep_catalog,
     integer_columns,
@@ -256,7 +256,7 @@ OUTSIDE = [
 
 
 def test_rows_outside_the_range_of_a_column_are_counted_and_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
     given = table()
     expected: Counter[str] = Counter()
@@ -265,8 +265,8 @@ def test_rows_outside_the_range_of_a_column_are_counted_and_left_out(
         expected[words if words.startswith('with') else f'{name} {words}'] += 1
     given.write(tmp_path / 'a.fits')
     out = tmp_path / 'deep.npz'
-    assert main(['catalog', str(tmp_path / 'a.fits'), '-o', str(out)]) == 0
-    (line,) = [one for one in capsys.readouterr().out.splitlines() if 'refused' in one]
+    said = starcal('catalog', tmp_path / 'a.fits', '-o', out).out
+    (line,) = [one for one in said.splitlines() if 'refused' in one]
     counts = (one.split(' ', 1) for one in line.removeprefix('rows refused: ').split(', '))
     assert {words: int(count) for count, words in counts} == expected
     catalog = load_catalog(out)
@@ -335,15 +335,8 @@ HEADER = 'source_id,ra,dec,phot_g_mean_mag\n'
     ],
 )
 def test_bad_tables_are_one_line(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    content: str,
-    words: str,
+    tmp_path: Path, starcal: Starcal, name: str, content: str, words: str
 ) -> None:
-    path, out = tmp_path / name, str(tmp_path / 'deep')
-    path.write_text(content)
-    assert main(['catalog', str(path), '-o', out]) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count('\n') == 1
-    assert not Path(f'{out}.npz').exists()
+    (tmp_path / name).write_text(content)
+    assert_refused(starcal('catalog', tmp_path / name, '-o', tmp_path / 'deep'), words)
+    assert not (tmp_path / 'deep.npz').exists()
