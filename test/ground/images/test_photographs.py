@@ -42,11 +42,10 @@ def jpeg(
     tags: Mapping[int, object],
     of_exif: Mapping[int, object],
     gps: Mapping[int, object] | None = None,
-    size: tuple[int, int] = (60, 40),
 ) -> Path:
     exif = Image.Exif()
     exif.update({**tags, EXIF: dict(of_exif), GPS: dict(gps or {})})
-    Image.new('RGB', size, (10, 60, 110)).save(path, exif=exif, quality=95)
+    Image.new('RGB', (60, 40), (10, 60, 110)).save(path, exif=exif, quality=95)
     return path
 
 
@@ -309,11 +308,7 @@ STRANGE: Mapping[str, tuple[Mapping[int, object], Mapping[int, object]]] = {
 
 @pytest.mark.parametrize('case', STRANGE)
 def test_strange_facts_are_facts_that_are_not_known(case: str, tmp_path: Path) -> None:
-    of_exif, gps = STRANGE[case]
-    exif = Image.Exif()
-    exif.update({**CANON, EXIF: dict(of_exif), GPS: dict(gps)})
-    Image.fromarray(PIXELS).save(tmp_path / 'a.jpg', exif=exif)
-    photograph = read(tmp_path / 'a.jpg')
+    photograph = read(jpeg(tmp_path / 'a.jpg', CANON, *STRANGE[case]))
     assert 631152000 <= photograph.time_ns / 1e9 < 2**31
     assert np.isnan(photograph.focal_px)
     assert photograph.site is None or max(map(abs, photograph.site[:2])) < 1.02
