@@ -26,16 +26,10 @@ from starcal_ground.bag_writer import BagWriter, image_to_message
 from starcal_ground.bags import reader as bag_reader
 from starcal_ground.bags.frames import read_telemetry
 from starcal_ground.bags.reader import Damage, Topics
-from starcal_ground.file_kinds import explained
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import typestore as typestore_module
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
-    CALIBRATION_TYPE,
-    IMAGE_TYPE,
-    stamp_ns,
-)
+from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE, IMAGE_TYPE, stamp_ns
 from starcal_ros.formats.messages.sensor_messages import image_to_message as picture_to_message
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -164,19 +158,6 @@ def test_metadata_for_rosbag2(folder: Path) -> None:
     assert information['relative_file_paths'] == ['six_0.mcap']
 
 
-def test_topics_and_their_choice(folder: Path) -> None:
-    """The only topic of a type is chosen; otherwise the error lists the topics."""
-    listed = {t.name: (t.type_name, t.count) for t in bag_reader.topics([folder])}
-    assert listed['/image'] == (IMAGE_TYPE, 6)
-    assert listed['/attitude'] == (ATTITUDE_TYPE, 12)
-    assert bag_reader.choose_topic([folder], IMAGE_TYPE) == '/image'
-    assert bag_reader.choose_topic([folder], IMAGE_TYPE, 'image') == '/image'
-    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*available: /image\)'):
-        bag_reader.choose_topic([folder], IMAGE_TYPE, '/nope')
-    with pytest.raises(BagError, match='no topic of type starcal/msg/Calibration'):
-        bag_reader.choose_topic([folder], CALIBRATION_TYPE)
-
-
 def test_several_topics_of_a_type(tmp_path: Path) -> None:
     """Two topics of a type need an explicit choice."""
     with BagWriter(tmp_path / 'two') as writer:
@@ -184,34 +165,6 @@ def test_several_topics_of_a_type(tmp_path: Path) -> None:
             writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
     with pytest.raises(BagError, match='several topics of type .*: /a, /b'):
         bag_reader.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
-
-
-@pytest.mark.parametrize(
-    ('name', 'content', 'text'),
-    [
-        ('missing', None, 'no such file or folder'),
-        ('text.mcap', b'hello', 'not an MCAP bag'),
-        ('empty.mcap', b'', 'not an MCAP bag'),
-        ('folder/', None, 'no .mcap files'),
-        ('folder/x.db3', b'', 'an SQLite bag: rosbags-convert --src'),
-        ('x.db3', b'SQLite format 3\0 and more', 'an SQLite bag: rosbags-convert --src'),
-        ('x.bag', b'#ROSBAG V2.0\n', 'x.bag --dst'),
-    ],
-)
-def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) -> None:
-    """The error for a file that is not a bag is one line with its path."""
-    path = tmp_path / name
-    if '/' in name:
-        path.parent.mkdir(exist_ok=True)
-        (tmp_path / 'folder').mkdir(exist_ok=True)
-    if content is not None:
-        path.write_bytes(content)
-    path = tmp_path / name.split('/')[0]
-    with pytest.raises(BagError) as error:
-        bag_reader.topics([path])
-    said = explained(error.value)
-    assert str(path) in said and text in said
-    assert '\n' not in said
 
 
 @pytest.mark.parametrize(('content', 'kind'), [(b'', 'truncated'), (bytes(4096), 'damaged')])
