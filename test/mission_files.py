@@ -21,7 +21,7 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
+from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
     velocity_from_message,
@@ -124,6 +124,16 @@ def write_encoded(
         width=width, encoding=encoding, is_bigendian=0, step=len(data) // height, data=data,
     )  # fmt: skip
     writer.write(topic, IMAGE_TYPE, image.time_ns, message)
+
+
+def write_compressed(
+    writer: BagWriter, topic: str, image: Image, ending: str, pixels: np.ndarray
+) -> None:
+    """Write a CompressedImage of other pixels with the time of an image, encoded by OpenCV."""
+    coded = np.asarray(cv2.imencode(f'.{ending}', pixels)[1]).ravel()
+    header = make_header(image.time_ns, 'camera', make_message)
+    message = make_message(COMPRESSED_TYPE, header=header, format=ending, data=coded)
+    writer.write(topic, COMPRESSED_TYPE, image.time_ns, message)
 
 
 def write_unread(writer: BagWriter, topic: str, type_name: str) -> None:

@@ -9,8 +9,7 @@ import json
 import math
 from pathlib import Path
 
-import cv2
-from mission_files import attitudes, params_with, TINY, write_tiny  # type: ignore[import-not-found]
+from mission_files import attitudes, params_with, TINY, write_compressed, write_tiny  # type: ignore[import-not-found]
 from mission_files import images as tiny_images
 import numpy as np
 import pytest
@@ -25,8 +24,6 @@ from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.source_diagnosis import Contents, examine, without_setup
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.records import Image, refused_image
 
@@ -168,22 +165,15 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
 def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / 'png.mcap'
     with BagWriter(path) as writer:
-        for k, ending in enumerate(('.png', '.jpg', '.bmp')):
-            pixels = tiny_images()[k].pixels
-            coded = cv2.imencode(ending, pixels if ending == '.png' else pixels.astype(np.uint8))
-            message = make_message(
-                COMPRESSED_TYPE,
-                header=make_header(tiny_images()[k].time_ns, 'camera', make_message),
-                format=ending[1:],
-                data=np.asarray(coded[1]).ravel(),
-            )
-            writer.write('/image', COMPRESSED_TYPE, tiny_images()[k].time_ns, message)
+        for image, ending in zip(tiny_images(), ('png', 'jpg', 'bmp'), strict=False):
+            pixels = image.pixels if ending == 'png' else image.pixels.astype(np.uint8)
+            write_compressed(writer, '/image', image, ending, pixels)
         for time_ns, xyzw in attitudes():
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
     found = contents_of(path)
-    (image,) = (t for t in found.topics if t.name == '/image')
+    (shown,) = (t for t in found.topics if t.name == '/image')
     kinds = {'PNG 640 x 512': 1, 'JPEG 640 x 512': 1, 'bmp, not a PNG or JPEG': 1}
-    assert image.kinds == kinds
+    assert shown.kinds == kinds
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-from mission_files import attitudes, images, TINY, write_tiny, write_unread  # type: ignore[import-not-found]
+from mission_files import attitudes, images, TINY, write_encoded, write_tiny, write_unread  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from starcal_tool import Starcal  # type: ignore[import-not-found]
@@ -24,7 +24,6 @@ from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     ATTITUDE_TYPE,
-    IMAGE_TYPE,
     IMU_TYPE,
     make_header,
     POSE_TYPE,
@@ -60,21 +59,10 @@ def bag(tmp_path: Path) -> Path:
             )
             writer.write('/attitude', ALIGNMENT_TYPE, time_ns, message)
         for image in images()[:2]:
-            height, width = image.pixels.shape
-            grey = image.pixels >> 4 if image.pixels.dtype == np.uint16 else image.pixels
-            grey = np.clip(grey, 0, 255).astype(np.uint8)
-            black = np.zeros_like(grey)
-            message = make_message(
-                IMAGE_TYPE,
-                header=make_header(image.time_ns, 'camera', make_message),
-                height=height,
-                width=width,
-                encoding='rgb8',
-                is_bigendian=0,
-                step=3 * width,
-                data=cv2.merge([black, grey, black]).reshape(-1),
-            )
-            writer.write('/image', IMAGE_TYPE, image.time_ns, message)
+            green = np.clip(image.pixels >> 4, 0, 255).astype(np.uint8)
+            black = np.zeros_like(green)
+            colours = cv2.merge([black, green, black])
+            write_encoded(writer, '/image', image, 'rgb8', colours)
     return tmp_path / 'bag'
 
 

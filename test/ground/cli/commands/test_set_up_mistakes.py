@@ -10,8 +10,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-import cv2
-from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
+from mission_files import params_with, TINY, write_compressed, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
@@ -22,8 +21,6 @@ from starcal_ground.mission.ingest.deep_catalog import write_deep_catalog
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
@@ -40,14 +37,7 @@ def _as(encoding: str, pixels: Callable[[Any], Any]) -> Write:
 
 
 def _bmp(writer: BagWriter, image: Image) -> None:
-    coded = cv2.imencode('.bmp', (image.pixels >> 4).astype(np.uint8))[1]
-    message = make_message(
-        COMPRESSED_TYPE,
-        header=make_header(image.time_ns, 'camera', make_message),
-        format='bmp',
-        data=np.asarray(coded).ravel(),
-    )
-    writer.write(IMAGE_TOPIC, COMPRESSED_TYPE, image.time_ns, message)
+    write_compressed(writer, IMAGE_TOPIC, image, 'bmp', (image.pixels >> 4).astype(np.uint8))
 
 
 def _raw(writer: BagWriter, image: Image) -> None:
