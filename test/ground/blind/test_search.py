@@ -25,7 +25,14 @@ from starcal_ground.blind.pattern_index import (
     scales_for,
     sphere_points,
 )
-from starcal_ground.blind.search import confirm_sky, find_in_any, matched_again, mirror, SkyMatch
+from starcal_ground.blind.search import (
+    confirm_sky,
+    find_in_any,
+    matched_again,
+    mirror,
+    mirrored_camera,
+    SkyMatch,
+)
 from starcal_ground.blind.sky_fit import (
     _chance_of_order,
     FOUND,
@@ -35,7 +42,7 @@ from starcal_ground.blind.sky_fit import (
     STATED,
 )
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
@@ -101,6 +108,15 @@ def test_random_points_are_no_stars(catalog: StarCatalog) -> None:
 def test_four_sources_are_too_few(catalog: StarCatalog) -> None:
     found = find_sky(np.array([[1.0, 1], [50, 9], [700, 40], [99, 300]]), camera(25), catalog)
     assert found is None
+
+
+def test_a_mirrored_camera_sees_mirrored_stars() -> None:
+    prior = camera(25).replace(cx=500.0, p2=1e-3, skew=0.5)
+    pixels = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
+    mirrored = line_of_sight(prior, pixels) * [-1.0, 1.0, 1.0]
+    seen = project(mirrored_camera(prior), mirrored)
+    expected_px = mirror(pixels, prior.width)
+    np.testing.assert_allclose(seen, expected_px, rtol=0, atol=1e-8)  # where Newton's method ends
 
 
 def random_fours(seed: int, count: int) -> Floats:
