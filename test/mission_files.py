@@ -21,7 +21,7 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import IMAGE_TYPE, make_header
+from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import (
     attitude_from_message,
     velocity_from_message,
@@ -126,6 +126,23 @@ def write_encoded(
     writer.write(topic, IMAGE_TYPE, image.time_ns, message)
 
 
+def write_compressed(
+    writer: BagWriter, topic: str, image: Image, ending: str, pixels: np.ndarray
+) -> None:
+    """Write a CompressedImage of other pixels with the time of an image, encoded by OpenCV."""
+    coded = np.asarray(cv2.imencode(f'.{ending}', pixels)[1]).ravel()
+    header = make_header(image.time_ns, 'camera', make_message)
+    message = make_message(COMPRESSED_TYPE, header=header, format=ending, data=coded)
+    writer.write(topic, COMPRESSED_TYPE, image.time_ns, message)
+
+
+def write_unread(writer: BagWriter, topic: str, type_name: str) -> None:
+    """Write an empty message of a type, which may be unknown: it is named, and never decoded."""
+    own: Any = writer._writer
+    schema = own.register_schema(type_name, 'ros2msg', b'int8 x')
+    own.add_message(own.register_channel(topic, 'cdr', schema), 1, b'', 1)
+
+
 def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object) -> Path:
     """A FITS file of an image: uint16, tiled (Rice), float32 in electrons, or an extension."""
     pixels = image.pixels
@@ -144,9 +161,7 @@ def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object)
 def write_aem(
     path: Path,
     system: str = 'utc',
-    frames: tuple[str, str] = ('ICRF', 'STARTRACKER_1'),
-    direction: str = 'A2B',
-    order: str = 'LAST',
+    frame: str = 'ICRF',
     version: str = '1.0',
 ) -> Path:
     """An AEM of the small bag in KVN, written by hand from CCSDS 504.0-B."""
@@ -158,22 +173,19 @@ def write_aem(
         'OBJECT_NAME = MSN',
         'OBJECT_ID = 2026-001A',
         'CENTER_NAME = EARTH',
-        f'REF_FRAME_A = {frames[0]}',
-        f'REF_FRAME_B = {frames[1]}',
-        *([f'ATTITUDE_DIR = {direction}'] if version == '1.0' else []),
+        f'REF_FRAME_A = {frame}',
+        'REF_FRAME_B = STARTRACKER_1',
+        *(['ATTITUDE_DIR = A2B'] if version == '1.0' else []),
         f'TIME_SYSTEM = {system.upper()}',
         f'START_TIME = {date(attitudes()[0][0], system)}',
         f'STOP_TIME = {date(attitudes()[-1][0], system)}',
         'ATTITUDE_TYPE = QUATERNION',
-        *([f'QUATERNION_TYPE = {order}'] if version == '1.0' else []),
+        *(['QUATERNION_TYPE = LAST'] if version == '1.0' else []),
         'META_STOP',
         'DATA_START',
     ]
-    forward = (frames[0] != 'STARTRACKER_1') == (direction == 'A2B')
     for time_ns, xyzw in attitudes():
-        q = xyzw if forward else xyzw * [-1, -1, -1, 1]
-        values = q if order == 'LAST' else np.roll(q, 1)
-        numbers = ' '.join(repr(float(value)) for value in values)
+        numbers = ' '.join(map(repr, xyzw.tolist()))
         lines.append(f'{date(time_ns, system)} {numbers}')
     path.write_text('\n'.join([*lines, 'DATA_STOP']) + '\n')
     return path

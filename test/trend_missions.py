@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""A mission of eight calibrations, a day each, and its trend."""
+"""A mission of eight calibrations, a day each."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 
 from export_calibrations import calibration  # type: ignore[import-not-found]
 
-from starcal_ground.cli.main import main
 from starcal_ground.products import write_products
 
 DAY_NS = 86400 * 10**9
@@ -25,7 +24,3 @@ def make_mission(tmp_path: Path) -> Path:
     for day in range(8):
         write(tmp_path / f'mission/{day}', day)
     return tmp_path / 'mission'
-
-
-def trend(mission: Path, *more: str) -> int:
-    return main(['trend', str(mission), '-o', str(mission.parent / 'out'), *more])

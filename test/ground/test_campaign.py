@@ -14,6 +14,7 @@ import cv2
 from mission_files import images, TINY, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
 import yaml
 
 import starcal_ground
@@ -94,14 +95,13 @@ def by_trend(bag: Path) -> Mapping[str, Any]:
     return numbers_of(row.calibration)
 
 
-def by_plan(bag: Path, capsys: pytest.CaptureFixture[str]) -> Mapping[str, Any]:
+def by_plan(bag: Path, starcal: Starcal) -> Mapping[str, Any]:
     """The sigma from which a plan starts, whatever pointings it chooses from."""
-    capsys.readouterr()
     pointings = bag.parent / 'pointings.csv'
     pointings.write_text('ra_deg,dec_deg\n1,2\n')
-    wanted = ['--images', '1', '--minimise', 'fx', '--json', '--pointings', str(pointings)]
-    assert main(['plan', str(bag), '--params', str(bag / 'params.yaml'), *wanted]) == 0
-    return {'sigma of fx': json.loads(capsys.readouterr().out)['sigma']}
+    wanted = ['--images', '1', '--minimise', 'fx', '--json', '--pointings', pointings]
+    answer = starcal('plan', bag, '--params', bag / 'params.yaml', *wanted)
+    return {'sigma of fx': json.loads(answer.out)['sigma']}
 
 
 def numbers_of(calibration: Calibration) -> Mapping[str, Any]:
@@ -119,9 +119,9 @@ def test_all_entrances_give_one_calibration(
     bag: Path,
     expected: Calibration,
     entrance: Callable[..., Mapping[str, Any]],
-    capsys: pytest.CaptureFixture[str],
+    starcal: Starcal,
 ) -> None:
-    given = (bag, capsys) if entrance is by_plan else (bag,)
+    given = (bag, starcal) if entrance is by_plan else (bag,)
     for name, number in entrance(*given).items():
         # JSON and Parquet keep all digits; the process has solved it with one BLAS thread.
         np.testing.assert_allclose(number, numbers_of(expected)[name], rtol=1e-9, err_msg=name)
@@ -228,12 +228,10 @@ def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
 
 
 def test_a_diagnosis_reads_as_a_calibration(
-    bag: Path, expected: Calibration, capsys: pytest.CaptureFixture[str]
+    bag: Path, expected: Calibration, starcal: Starcal
 ) -> None:
     """Before the images that matched nothing are measured again."""
-    capsys.readouterr()
-    main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), '--json'])
-    shown = json.loads(capsys.readouterr().out)
+    shown = json.loads(starcal('diagnose', bag, '--params', bag / 'params.yaml', '--json').out)
     contents = shown['contents']
     unmatched = {group['reason']: group['count'] for group in contents['refused']}
     assert set(unmatched) <= {'no_match'}
@@ -244,14 +242,16 @@ def test_a_diagnosis_reads_as_a_calibration(
 @pytest.mark.parametrize(
     ('arguments', 'problem'),
     [
+        (('--image-topic', 'other'), 'no topic other of type'),
+        (('--image-topic', '/star_tracker/attitude'), 'no topic /star_tracker/attitude of type'),
         (('--attitude-topic', 'other'), 'no topic other of type'),
         (('--observations-topic', 'other'), 'no topic other of type'),
     ],
 )
 def test_a_diagnosis_lists_the_topics_where_one_is_wrong(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, str], problem: str
+    tmp_path: Path, starcal: Starcal, arguments: tuple[str, str], problem: str
 ) -> None:
     bag = unaligned(tmp_path)
-    assert main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
-    shown = capsys.readouterr().out
+    status, shown, _ = starcal('diagnose', bag, '--params', bag / 'params.yaml', *arguments)
+    assert status == 3
     assert '/opnav/image_raw' in shown and problem in shown

@@ -15,10 +15,10 @@ import numpy as np
 from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground import comparison
-from starcal_ground.cli import main
-from starcal_ground.comparison import compare
+from starcal_ground.comparison import chi_squared, compare
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.camera.projection import convert
@@ -57,17 +57,14 @@ def moved(
 
 
 @pytest.fixture
-def compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Compared:
+def compared(tmp_path: Path, starcal: Starcal) -> Compared:
     """Text and JSON object of `starcal compare`."""
 
     def run(*calibrations: Calibration) -> tuple[str, dict[str, Any]]:
         files = [tmp_path / f'{name}.json' for name in 'ab']
         for path, calibration in zip(files, calibrations, strict=True):
             write_calibration(calibration, path)
-        assert main.main(['compare', *map(str, files)]) == 0
-        text = capsys.readouterr().out
-        assert main.main(['compare', *map(str, files), '--json']) == 0
-        return text, json.loads(capsys.readouterr().out)
+        return starcal('compare', *files).out, json.loads(starcal('compare', *files, '--json').out)
 
     return run
 
@@ -149,34 +146,6 @@ def test_a_reference_temperature_of_one_alone_is_noted(tiny: Calibration) -> Non
     for a, b, noted in ((tiny, at_20, True), (at_20, at_20, False), (at_20, at_25, True)):
         notes = compare(a, b).notes
         assert any('different temperatures' in note for note in notes) is noted
-
-
-@pytest.mark.slow
-def test_sigmas_are_those_of_chance(tiny: Calibration) -> None:
-    """B drawn from the covariance of A: chi2 has its degrees as mean, each map a square of 1."""
-    rng = np.random.default_rng(3)
-    count = 100
-    draws = rng.multivariate_normal(np.zeros(13), tiny.covariance, count)
-    certain = dataclasses.replace(tiny, covariance=np.zeros((13, 13)))
-    found = [
-        compare(
-            tiny,
-            moved(certain, tuple(draw[10:]), **dict(zip(PARAMETER_NAMES, draw[:10], strict=True))),
-        )
-        for draw in draws
-    ]
-    degrees = 13  # ten camera parameters and three angles
-    assert all(one.total.degrees_of_freedom == degrees for one in found)
-    # The mean of 100 draws of chi2: sigma sqrt(2 * 13 / 100) = 0.51; less than four of them.
-    assert np.mean([one.total.value for one in found]) == pytest.approx(degrees, abs=1.9)
-    assert np.mean([one.total.p_value < 0.5 for one in found]) == pytest.approx(0.5, abs=0.2)
-    for squares in (
-        [one.before.sigmas**2 for one in found],
-        [one.after.sigmas**2 for one in found],
-    ):
-        # E|d|^2 = trace C at every pixel.  A few directions rule the map, so that the mean over it
-        # scatters by up to sqrt(2) for one draw: 0.14 for a hundred, four of them.
-        assert np.mean(squares) == pytest.approx(1.0, abs=0.57)
 
 
 def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
@@ -261,17 +230,25 @@ def test_the_tool_compares(tiny: Calibration, compared: Compared) -> None:
 
 
 def test_the_truth_of_a_simulated_bag_has_no_sigma(
-    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Calibration, tmp_path: Path, starcal: Starcal
 ) -> None:
     write_calibration(tiny, tmp_path / 'calibration.json')
     truth = tmp_path / 'truth.json'
     shutil.copy(TINY / 'truth.json', truth)
-    command = ['compare', str(tmp_path), str(truth)]
-    assert main.main([*command, '--json']) == 0
-    made, true = json.loads(capsys.readouterr().out), json.loads(truth.read_text())
+    made = json.loads(starcal('compare', tmp_path, truth, '--json').out)
+    true = json.loads(truth.read_text())
     assert made['sigma'] == pytest.approx(tiny.sigma.tolist())
     assert made['b'] == [*true['k_true'], *true['d_true']] and made['p_value'] > 1e-3
     truth.write_text(json.dumps({**true, 'A_true': 1}))
-    assert main.main(command) == 2
-    error = capsys.readouterr().err
-    assert 'not the truth of a simulated bag' in error and error.count('\n') == 1
+    assert_refused(starcal('compare', tmp_path, truth), 'not the truth of a simulated bag')
+
+
+def test_chi_squared_leaves_out_what_has_no_variance_or_is_singular() -> None:
+    """Rows without a variance do not count; of two copies of one number, one does."""
+    copies = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0] * 4, [0.0] * 3 + [4e10]])
+    found = chi_squared(np.array([2.0, 2.0, 7.0, 6e5]), copies)
+    assert found.degrees_of_freedom == 2
+    assert found.value == pytest.approx(2.0**2 + 3.0**2, rel=1e-12)
+    assert found.p_value == pytest.approx(np.exp(-0.5 * found.value), rel=1e-9)  # of two degrees
+    copies[3, 3] = np.nan
+    assert chi_squared(np.array([2.0, 2.0, 7.0, 6e5]), copies).degrees_of_freedom == 1

@@ -147,13 +147,6 @@ def test_an_image_in_place_of_a_bag_is_named_with_the_commands_that_take_it(
     assert in_a_folder == ('no .mcap files in the folder, but' in said)
 
 
-def test_of_another_file_the_kinds_that_are_read_are_named(tmp_path: Path) -> None:
-    (tmp_path / 'rec.zip').write_bytes(b'PK\x03\x04' + bytes(40))
-    with pytest.raises(BagError) as error:
-        reader.topics([tmp_path / 'rec.zip'])
-    assert 'not an MCAP bag, nor images (FITS, TIFF, PNG, JPEG' in explained(error.value)
-
-
 @pytest.mark.parametrize('order', [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
 def test_files_are_read_in_the_order_of_their_first_messages(
     order: tuple[int, ...], tmp_path: Path

@@ -9,24 +9,21 @@ import json
 import math
 from pathlib import Path
 
-import cv2
-from mission_files import attitudes, params_with, TINY, write_tiny  # type: ignore[import-not-found]
+from mission_files import attitudes, params_with, TINY, write_compressed, write_tiny  # type: ignore[import-not-found]
 from mission_files import images as tiny_images
 import numpy as np
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import topics
 from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import Source
-from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_REFUSED
 from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.source_diagnosis import Contents, examine, without_setup
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.records import Image, refused_image
 
@@ -123,17 +120,16 @@ def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> 
     assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
 
 
-def test_an_attitude_gap_that_is_not_recorded_is_nan(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path: Path, starcal: Starcal) -> None:
     """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
     alone = [(0, np.array([0.0, 0.0, 0.0, 1.0]))]
     path = write_tiny(tmp_path / 'images.mcap', tiny_images()[:1], alone)
     assert math.isnan(contents_of(path).longest_attitude_gap_s)
-    assert main.main(['diagnose', str(path), '--json']) == EXIT_REFUSED
-    assert json.loads(capsys.readouterr().out)['contents']['longest_attitude_gap_s'] is None
-    assert main.main(['diagnose', str(path)]) == EXIT_REFUSED
-    assert 'longest attitude gap' not in capsys.readouterr().out
+    status, out, _ = starcal('diagnose', path, '--json')
+    assert json.loads(out)['contents']['longest_attitude_gap_s'] is None
+    assert status == EXIT_REFUSED
+    status, out, _ = starcal('diagnose', path)
+    assert status == EXIT_REFUSED and 'longest attitude gap' not in out
 
 
 def test_the_topics_are_told(tmp_path: Path) -> None:
@@ -169,22 +165,15 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
 def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / 'png.mcap'
     with BagWriter(path) as writer:
-        for k, ending in enumerate(('.png', '.jpg', '.bmp')):
-            pixels = tiny_images()[k].pixels
-            coded = cv2.imencode(ending, pixels if ending == '.png' else pixels.astype(np.uint8))
-            message = make_message(
-                COMPRESSED_TYPE,
-                header=make_header(tiny_images()[k].time_ns, 'camera', make_message),
-                format=ending[1:],
-                data=np.asarray(coded[1]).ravel(),
-            )
-            writer.write('/image', COMPRESSED_TYPE, tiny_images()[k].time_ns, message)
+        for image, ending in zip(tiny_images(), ('png', 'jpg', 'bmp'), strict=False):
+            pixels = image.pixels if ending == 'png' else image.pixels.astype(np.uint8)
+            write_compressed(writer, '/image', image, ending, pixels)
         for time_ns, xyzw in attitudes():
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
     found = contents_of(path)
-    (image,) = (t for t in found.topics if t.name == '/image')
+    (shown,) = (t for t in found.topics if t.name == '/image')
     kinds = {'PNG 640 x 512': 1, 'JPEG 640 x 512': 1, 'bmp, not a PNG or JPEG': 1}
-    assert image.kinds == kinds
+    assert shown.kinds == kinds
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 
@@ -199,46 +188,39 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     assert 0 < images < 10 and found.images == images
 
 
-def test_recorded_observations_need_no_parameters(
-    tiny_products: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recorded_observations_need_no_parameters(tiny_products: Path, starcal: Starcal) -> None:
     path = tiny_products / 'observations.mcap'
     found = contents_of(path)
     assert found.stars_per_image and found.images == 10 and not found.refused
     assert found.chosen == Topics(observations='/observations')
-    assert main.main(['diagnose', str(path), '--params', str(PARAMS)]) == 0
-    assert 'nothing to diagnose in recorded observations.' in capsys.readouterr().out
+    status, out, _ = starcal('diagnose', path, '--params', PARAMS)
+    assert status == 0 and 'nothing to diagnose in recorded observations.' in out
 
 
 @pytest.mark.slow
-def test_the_tool_says_it_to_people_and_programs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_tool_says_it_to_people_and_programs(tmp_path: Path, starcal: Starcal) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
-    assert main.main(['diagnose', str(path)]) == 0
-    out = capsys.readouterr().out
+    status, out, _ = starcal('diagnose', path)
+    assert status == 0
     assert '5 of 12 images' in out and 'attitude_gap' in out
     assert 'over 2 s' in out and 'too far apart' in out  # this image's, and what it means
-    assert main.main(['diagnose', str(path), '--json', '--params', str(PARAMS)]) == 0
-    made = json.loads(capsys.readouterr().out)['contents']
+    made = json.loads(starcal('diagnose', path, '--json', '--params', PARAMS).out)['contents']
     assert made['images'] == 12 and len(made['stars_per_image']) == 5
     assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
 
 
-def test_a_bag_that_cannot_be_calibrated_ends_with_3(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path: Path, starcal: Starcal) -> None:
     alone = [(5, np.array([0.0, 0.0, 0.0, 1.0]))]
     path = write_tiny(tmp_path / 'two.mcap', tiny_images()[:2], alone)
-    assert main.main(['diagnose', str(path)]) == 3
-    out = capsys.readouterr().out
+    status, out, _ = starcal('diagnose', path)
+    assert status == 3
     assert 'Cannot be calibrated: 2 different images, 3 are needed' in out and 'no_attitude' in out
     few = write_tiny(tmp_path / 'few.mcap', tiny_images()[:2])
-    assert main.main(['diagnose', str(few)]) == 3
-    assert '2 different images, 3 are needed' in capsys.readouterr().out
-    assert main.main(['diagnose', str(few), '--params', str(PARAMS)]) == 3
-    assert '1 more image (2 of 3 collected)' in capsys.readouterr().out
+    status, out, _ = starcal('diagnose', few)
+    assert status == 3 and '2 different images, 3 are needed' in out
+    status, out, _ = starcal('diagnose', few, '--params', PARAMS)
+    assert status == 3 and '1 more image (2 of 3 collected)' in out
 
 
 @pytest.mark.slow
@@ -250,13 +232,13 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
     ],
 )
 def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
-    direction: str, cause: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    direction: str, cause: str, words: str, tmp_path: Path, starcal: Starcal
 ) -> None:
     last = tiny_images()[-1]
     later = (Image(last.time_ns + k * 10**11, last.pixels) for k in (1, 2))
     path = write_tiny(tmp_path / 'more.mcap', later, ())
-    given = ['--params', str(params_with(tmp_path, attitude_direction=direction))]
-    assert main.main(['diagnose', str(TINY), str(path), *given]) == (3 if cause != 'none' else 0)
-    assert words in ' '.join(capsys.readouterr().out.split())
-    assert main.main(['diagnose', str(TINY), str(path), *given, '--json']) in (0, 3)
-    assert json.loads(capsys.readouterr().out)['cause'] == cause
+    params = params_with(tmp_path, attitude_direction=direction)
+    answer = starcal('diagnose', TINY, path, '--params', params)
+    assert answer.status == (3 if cause != 'none' else 0) and words in answer.words
+    answer = starcal('diagnose', TINY, path, '--params', params, '--json')
+    assert json.loads(answer.out)['cause'] == cause

@@ -11,7 +11,6 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap import stream_reader
 import numpy as np
 import pytest
 
@@ -21,7 +20,6 @@ from starcal_ground.bags import reader
 from starcal_ground.bags.frames import Frame, read_frames, read_telemetry, Telemetry
 from starcal_ground.bags.reader import read_images, Topics
 from starcal_ros.arrays import Floats
-from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import typestore
 from starcal_ros.records import Image
 from starcal_ros.sky.attitude import AttitudeOptions
@@ -88,28 +86,9 @@ def compared(paths: list[Path]) -> tuple[int, int, list[str]]:
 
 
 @pytest.fixture
-def chunks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes of the chunks that are decompressed; bags are written in small ones."""
-    sizes: list[int] = []
-    decompress = stream_reader.get_chunk_data_stream
-
-    def counted(chunk: Any, validate_crc: bool) -> Any:
-        sizes.append(chunk.uncompressed_size)
-        return decompress(chunk, validate_crc=validate_crc)
-
-    monkeypatch.setattr(reader, 'get_chunk_data_stream', counted)
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bags are written in many small chunks."""
     monkeypatch.setattr(typestore, '_CHUNK_BYTES', 600)
-    return sizes
-
-
-def test_a_bag_in_order_is_decompressed_once(tmp_path: Path, chunks: list[int]) -> None:
-    bag = write(tmp_path / 'bag', recording())
-    list(read_images([bag], '/image'))
-    once = list(chunks)
-    assert len(once) > 8
-    chunks.clear()
-    assert len(list(read_frames([bag], TOPICS, OPTIONS))) == IMAGES
-    assert chunks == once
 
 
 def test_attitudes_in_a_file_of_their_own_are_found(
@@ -184,21 +163,7 @@ def test_bad_velocities_are_left_out_and_reported_once(
         assert velocity_m_s is not None and velocity_m_s[1] == 7.0
 
 
-def test_late_samples_are_reported(tmp_path: Path) -> None:
-    """One of the attitudes about the second image comes three seconds late."""
-    messages = recording()
-    late = messages.pop(messages.index(('attitude', 11)))
-    messages.insert(messages.index(('attitude', 41)), late)
-    count, differ, said = compared([write(tmp_path / 'bag', messages)])
-    assert (count, differ) == (IMAGES, 1)
-    (sentence,) = said
-    assert sentence == (
-        'telemetry is recorded more than a second out of order, after'
-        ' 1 image that it belongs to; sort the messages of the bag by time'
-    )
-
-
-def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, chunks: list[int]) -> None:
+def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, small_chunks: None) -> None:
     """The frames of a damaged bag are its images, and the loss is reported as by `read_images`."""
     bag = write(tmp_path / 'bag', recording())
     (file,) = bag.glob('*.mcap')
@@ -221,12 +186,6 @@ def test_the_reading_thread_ends_with_its_reader(tmp_path: Path) -> None:
     assert any(thread.name.startswith('read-ahead') for thread in threading.enumerate())
     frames.close()  # type: ignore[attr-defined]
     assert not any(thread.name.startswith('read-ahead') for thread in threading.enumerate())
-
-
-def test_an_error_of_reading_reaches_the_caller(tmp_path: Path) -> None:
-    file = tmp_path / 'vanished.mcap'
-    with pytest.raises(BagError, match='no such file or folder'):
-        list(read_frames([file], TOPICS, OPTIONS))
 
 
 # Whether all that may be read ahead is in memory already after fifteen images, or later, depends
@@ -286,8 +245,14 @@ def rewritten(source: Path, path: Path, order: str, outside: str, is_logged_anew
 @pytest.mark.parametrize(('is_logged_anew', 'is_cut'), [(False, False), (True, True)])
 @pytest.mark.parametrize('outside', ['', '/image', '/attitude /velocity'])
 @pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.usefixtures('small_chunks')
 def test_an_image_is_read_wherever_it_is_in_the_file(
-    tmp_path: Path, chunks: list[int], order: str, outside: str, is_logged_anew: bool, is_cut: bool
+    tmp_path: Path,
+    small_chunks: None,
+    order: str,
+    outside: str,
+    is_logged_anew: bool,
+    is_cut: bool,
 ) -> None:
     """Each with its telemetry and pixels, in stamps that go back once at most."""
     source = write(tmp_path / 'bag', recording())

@@ -10,6 +10,7 @@ from attacks import many  # type: ignore[import-not-found]
 from mcap.writer import Writer
 import pytest
 
+from starcal_ground.bags import rosbag2
 from starcal_ground.cli import main
 from starcal_ros.formats.bag.typestore import described
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -145,3 +146,8 @@ def test_names_that_act_on_a_terminal_are_escaped(
         diagnose(path)
         printed = ''.join(capsys.readouterr())
         assert all(c.isprintable() or c == '\n' for c in printed)
+
+
+def test_a_bag_cannot_name_any_module_to_be_imported() -> None:
+    with pytest.raises(ValueError, match='no type of a message'):
+        rosbag2.decode(memoryview(b''), 'xml/sax/handler')

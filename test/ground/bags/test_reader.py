@@ -8,9 +8,6 @@ import io
 from pathlib import Path
 import re
 import shutil
-import subprocess
-import sys
-import threading
 from typing import Any
 
 from hypothesis import given, settings
@@ -29,16 +26,10 @@ from starcal_ground.bag_writer import BagWriter, image_to_message
 from starcal_ground.bags import reader as bag_reader
 from starcal_ground.bags.frames import read_telemetry
 from starcal_ground.bags.reader import Damage, Topics
-from starcal_ground.file_kinds import explained
-from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import typestore as typestore_module
 from starcal_ros.formats.bag.typestore import make_message, typestore
-from starcal_ros.formats.messages.message_codec import (
-    ATTITUDE_TYPE,
-    CALIBRATION_TYPE,
-    IMAGE_TYPE,
-    stamp_ns,
-)
+from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE, IMAGE_TYPE, stamp_ns
 from starcal_ros.formats.messages.sensor_messages import image_to_message as picture_to_message
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -167,19 +158,6 @@ def test_metadata_for_rosbag2(folder: Path) -> None:
     assert information['relative_file_paths'] == ['six_0.mcap']
 
 
-def test_topics_and_their_choice(folder: Path) -> None:
-    """The only topic of a type is chosen; otherwise the error lists the topics."""
-    listed = {t.name: (t.type_name, t.count) for t in bag_reader.topics([folder])}
-    assert listed['/image'] == (IMAGE_TYPE, 6)
-    assert listed['/attitude'] == (ATTITUDE_TYPE, 12)
-    assert bag_reader.choose_topic([folder], IMAGE_TYPE) == '/image'
-    assert bag_reader.choose_topic([folder], IMAGE_TYPE, 'image') == '/image'
-    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*available: /image\)'):
-        bag_reader.choose_topic([folder], IMAGE_TYPE, '/nope')
-    with pytest.raises(BagError, match='no topic of type starcal/msg/Calibration'):
-        bag_reader.choose_topic([folder], CALIBRATION_TYPE)
-
-
 def test_several_topics_of_a_type(tmp_path: Path) -> None:
     """Two topics of a type need an explicit choice."""
     with BagWriter(tmp_path / 'two') as writer:
@@ -187,34 +165,6 @@ def test_several_topics_of_a_type(tmp_path: Path) -> None:
             writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
     with pytest.raises(BagError, match='several topics of type .*: /a, /b'):
         bag_reader.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
-
-
-@pytest.mark.parametrize(
-    ('name', 'content', 'text'),
-    [
-        ('missing', None, 'no such file or folder'),
-        ('text.mcap', b'hello', 'not an MCAP bag'),
-        ('empty.mcap', b'', 'not an MCAP bag'),
-        ('folder/', None, 'no .mcap files'),
-        ('folder/x.db3', b'', 'an SQLite bag: rosbags-convert --src'),
-        ('x.db3', b'SQLite format 3\0 and more', 'an SQLite bag: rosbags-convert --src'),
-        ('x.bag', b'#ROSBAG V2.0\n', 'x.bag --dst'),
-    ],
-)
-def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) -> None:
-    """The error for a file that is not a bag is one line with its path."""
-    path = tmp_path / name
-    if '/' in name:
-        path.parent.mkdir(exist_ok=True)
-        (tmp_path / 'folder').mkdir(exist_ok=True)
-    if content is not None:
-        path.write_bytes(content)
-    path = tmp_path / name.split('/')[0]
-    with pytest.raises(BagError) as error:
-        bag_reader.topics([path])
-    said = explained(error.value)
-    assert str(path) in said and text in said
-    assert '\n' not in said
 
 
 @pytest.mark.parametrize(('content', 'kind'), [(b'', 'truncated'), (bytes(4096), 'damaged')])
@@ -275,64 +225,6 @@ def test_a_bad_message_of_observations_does_not_end_the_run(tmp_path: Path) -> N
     assert bad.detail == '/observations: cannot decode 11 bytes as starcal/msg/StarObservations'
 
 
-def test_invalid_attitude_sample(tmp_path: Path) -> None:
-    """An attitude that is not a unit quaternion gives the refusal bad_attitude."""
-    with BagWriter(tmp_path / 'b') as writer:
-        for k, w in enumerate([1.0, np.nan, 1.0]):
-            writer.write_attitude('/attitude', k, np.array([0, 0, 0, w]), 'icrf')
-    history = attitudes_of(tmp_path / 'b', print)
-    with pytest.raises(ImageRefused, match='bad_attitude'):
-        history.at(1, max_gap_s=1.0)
-
-
-def test_truncated_bag(tmp_path: Path, folder: Path) -> None:
-    """A bag truncated anywhere gives the images before the end and reports the truncation."""
-    whole = next(folder.glob('*.mcap')).read_bytes()
-    sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
-    file = tmp_path / 'cut.mcap'
-    most = 0
-    for size in np.linspace(len(whole) - 1, 20, 40).astype(int):
-        file.write_bytes(whole[:size])
-        said: list[str] = []
-        images = images_of(file, on_damage=said.append)
-        assert len(said) == 1, said
-        assert str(file) in said[0] and 'truncated' in said[0]
-        for image, pixels in zip(images, sound, strict=False):
-            assert isinstance(image, Image)
-            np.testing.assert_array_equal(image.pixels, pixels)
-        most = max(most, len(images))
-        names = [t.name for t in bag_reader.topics([file], lambda _: None)]
-        assert ('/image' in names) == bool(images)
-    assert most == 6
-
-
-def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
-    """A flipped bit in a chunk is reported, and no wrong pixel is read."""
-    whole = next(folder.glob('*.mcap')).read_bytes()
-    sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
-    with next(folder.glob('*.mcap')).open('rb') as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    random = np.random.default_rng(5)
-    file = tmp_path / 'flipped.mcap'
-    for chunk in summary.chunk_indexes:
-        head = chunk.chunk_start_offset
-        # The kind of the record, its checksum's last bytes, and some of its content.
-        content = random.integers(head + 60, head + chunk.chunk_length, 8)
-        for offset in [head, *content]:
-            damaged = bytearray(whole)
-            damaged[offset] ^= 1 << int(random.integers(8))
-            file.write_bytes(damaged)
-            said: list[str] = []
-            images = images_of(file, on_damage=said.append)
-            assert said, offset
-            assert all('\n' not in text for text in said)
-            for image in images:
-                assert isinstance(image, Image)
-                k = (image.time_ns - START_NS) // SECOND_NS
-                np.testing.assert_array_equal(image.pixels, sound[k])
-
-
 @pytest.mark.parametrize('is_stated', [True, False])
 def test_a_checksum_of_all_data_is_compared(tmp_path: Path, is_stated: bool) -> None:
     """A bit outside all messages: what a file states is checked, most recorders state none."""
@@ -356,26 +248,6 @@ def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(typestore_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
     return next(folder.glob('*.mcap'))
-
-
-def test_a_chunk_is_decompressed_while_the_one_before_it_is_in_use(
-    small_chunks: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One chunk ahead, not all of them: the memory is that of two."""
-    started, threads = threading.Semaphore(0), []
-    data_of = bag_reader._data_of
-
-    def recorded(chunk: Chunk) -> bytes:
-        threads.append(threading.current_thread())
-        started.release()
-        return data_of(chunk)
-
-    monkeypatch.setattr(bag_reader, '_data_of', recorded)
-    messages = bag_reader.read_messages(small_chunks, None, pytest.fail)
-    next(messages)
-    assert started.acquire(timeout=240.0) and started.acquire(timeout=240.0)
-    assert len(threads) == 2 and threading.current_thread() not in threads
-    messages.close()  # type: ignore[attr-defined]
 
 
 def test_what_follows_a_chunk_is_not_held_for_the_next(small_chunks: Path) -> None:
@@ -453,21 +325,6 @@ def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> N
         counted = [int(n) for text in said for n in re.findall(r'(\d+) of \d+ on ', text)]
         assert sum(counted) == missing
     bag_reader.topics([file], said.append)
-
-
-def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
-    """Reading a file with random bytes never raises an unexpected error."""
-    whole = np.frombuffer(next(folder.glob('*.mcap')).read_bytes(), np.uint8)
-    random = np.random.default_rng(6)
-    file = tmp_path / 'rubbish.mcap'
-    for _ in range(60):
-        damaged = whole.copy()
-        start = int(random.integers(8, len(damaged) - 64))
-        damaged[start : start + 64] = random.integers(0, 256, 64)
-        file.write_bytes(damaged.tobytes())
-        said: list[str] = []
-        images_of(file, on_damage=said.append)
-        bag_reader.topics([file], said.append)
 
 
 @pytest.mark.parametrize('indexed', [False, True])
@@ -548,30 +405,6 @@ def test_messages_compressed_one_by_one_are_read(
     # One that claims to be larger is not inflated.
     monkeypatch.setattr(bag_reader, 'ARCHIVE_BYTES', 600 * 602 * 2)
     assert not any(isinstance(image, Image) for image in images_of(tmp_path / 'bag'))
-
-
-MEMORY = """
-import resource, sys
-from starcal_ground.bags import reader as bag_reader
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-for k, image in enumerate(bag_reader.read_images([sys.argv[1]], '/image')):
-    if k == 10:
-        early = peak()
-print(k, peak() - early)
-"""
-
-
-@pytest.mark.skipif(sys.platform != 'linux', reason='ru_maxrss is in kB on Linux')
-@pytest.mark.slow
-def test_memory_is_flat(tmp_path: Path) -> None:
-    """Fifty images need no more memory than ten."""
-    path = write_bag(tmp_path / 'long', images=50, size=1000)
-    done = subprocess.run(
-        [sys.executable, '-c', MEMORY, str(path)], capture_output=True, text=True, check=True
-    )
-    last, growth_kb = map(int, done.stdout.split())
-    assert last == 49
-    assert growth_kb < 10_000  # the 39 images between are 78 MB
 
 
 def real(name: str) -> Path:

@@ -4,31 +4,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
-from mission_files import attitudes, images, TINY, write_tiny  # type: ignore[import-not-found]
+from mission_files import attitudes, images, TINY, write_encoded, write_tiny, write_unread  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
+import yaml
 
+from starcal_ground import calibrate_bag
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader, topics
 from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import Source
+from starcal_ground.cli.main import main
+from starcal_ground.simulation.simulated_bag import IMAGE_TOPIC
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     ATTITUDE_TYPE,
-    IMAGE_TYPE,
     IMU_TYPE,
     make_header,
     POSE_TYPE,
     quaternion_to_message,
     vector_to_message,
 )
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline.setup import load_setup, NODES, Setup
+from starcal_ros.pipeline.setup import load_setup, NODES, read_setup, Setup
+from starcal_ros.records import Image
 
 
 def setup_with(**others: object) -> Setup:
@@ -54,21 +59,10 @@ def bag(tmp_path: Path) -> Path:
             )
             writer.write('/attitude', ALIGNMENT_TYPE, time_ns, message)
         for image in images()[:2]:
-            height, width = image.pixels.shape
-            grey = image.pixels >> 4 if image.pixels.dtype == np.uint16 else image.pixels
-            grey = np.clip(grey, 0, 255).astype(np.uint8)
-            black = np.zeros_like(grey)
-            message = make_message(
-                IMAGE_TYPE,
-                header=make_header(image.time_ns, 'camera', make_message),
-                height=height,
-                width=width,
-                encoding='rgb8',
-                is_bigendian=0,
-                step=3 * width,
-                data=cv2.merge([black, grey, black]).reshape(-1),
-            )
-            writer.write('/image', IMAGE_TYPE, image.time_ns, message)
+            green = np.clip(image.pixels >> 4, 0, 255).astype(np.uint8)
+            black = np.zeros_like(green)
+            colours = cv2.merge([black, green, black])
+            write_encoded(writer, '/image', image, 'rgb8', colours)
     return tmp_path / 'bag'
 
 
@@ -91,14 +85,14 @@ NOT_READ = (
 )
 
 
-def with_topics(folder: Path, kinds: dict[str, str]) -> list[Path]:
-    """A bag of an image and of topics with a message each, which nobody decodes."""
-    with BagWriter(folder) as writer:
-        writer.write_image('/image', images()[0], 'camera')
+def with_topics(path: Path, kinds: dict[str, str], count: int = 1) -> list[Path]:
+    """A bag of some images and of topics with a message each, which nobody decodes."""
+    with BagWriter(path) as writer:
+        for image in images()[:count]:
+            writer.write_image(IMAGE_TOPIC, image, 'camera')
         for name, kind in kinds.items():
-            channel, _ = writer._open(name, kind)
-            writer._writer.add_message(channel, 1, b'', publish_time=1)
-    return [folder]
+            write_unread(writer, name, kind)
+    return [path]
 
 
 @pytest.mark.parametrize(
@@ -156,12 +150,7 @@ def test_attitudes_that_are_not_read_are_named_where_none_are_asked_for(
 ) -> None:
     """Without parameters the camera was found by its stars, and nothing was said of them."""
     reader.log_damage.cache_clear()
-    with BagWriter(tmp_path / 'bag') as writer:
-        writer.write_image('/image', images()[0], 'camera')
-        own: Any = writer._writer
-        schema = own.register_schema(kind, 'ros2msg', b'int8 x')
-        own.add_message(own.register_channel('/a', 'cdr', schema), 1, b'', 1)
-    assert topics.without_attitudes([tmp_path / 'bag'], Topics(), {})
+    assert topics.without_attitudes(with_topics(tmp_path / 'bag', {'/a': kind}), Topics(), {})
     said = f'/a is a {kind.rpartition("/")[2]}, which is not read: publish its orientation as a'
     assert (said in caplog.text) is is_named
 
@@ -217,3 +206,116 @@ def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
     assert not record.refusal and len(record) > 100
     said = [f'{stray}: 1 message of std_msgs/msg/String not read'] if stray else []
     assert caplog.messages == said
+
+
+ODOMETRY, POSE, TF = (
+    'nav_msgs/msg/Odometry',
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'tf2_msgs/msg/TFMessage',
+)
+
+
+def of_four_images(path: Path, kind: str) -> Path:
+    """A bag of four images and a message of a type that is not read; empty: none."""
+    return with_topics(path, {'/gnc/state': kind} if kind else {}, 4)[0]
+
+
+def params(folder: Path, **options: object) -> Path:
+    path = folder / 'params.yaml'
+    values = {'camera_info_url': str(TINY / 'camera.yaml'), **options}
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    return path
+
+
+STATED = {
+    'prior_alignment': [0.0, 0.0, 0.0, 1.0],
+    'star_tracker_sigma_arcsec': [10.0, 10.0, 20.0],
+}
+
+
+@pytest.mark.parametrize('stated', STATED)
+@pytest.mark.parametrize('kind', [ODOMETRY, POSE, TF, ''])
+def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_command(
+    kind: str, stated: str, tmp_path: Path, starcal: Starcal
+) -> None:
+    bag = of_four_images(tmp_path / 'bag.mcap', kind)
+    given = ['--params', str(params(tmp_path, **{stated: STATED[stated]}))]
+    for command, status in (
+        (['calibrate', bag, *given, '-o', tmp_path / 'out'], 2),
+        (['diagnose', bag, *given], 3),
+    ):
+        answer = starcal(*command)
+        said = ' '.join([answer.words, answer.err])
+        assert answer.status == status
+        assert 'record the attitudes of the star tracker' in said
+        assert 'starcal calibrate --camera-alone' in said
+        if kind:
+            name = kind.rpartition('/')[2]
+            assert f'/gnc/state is a {name}, which is not read: publish its orientation' in said
+
+
+@pytest.mark.parametrize(
+    ('kind', 'options'),
+    [
+        ('', []),
+        (ODOMETRY, []),
+        ('', ['PARAMS']),
+        (TF, ['PARAMS', '--camera-alone']),
+    ],
+)
+@pytest.mark.slow
+def test_diagnose_takes_images_without_attitudes_where_calibrate_does(
+    kind: str, options: list[str], tmp_path: Path, starcal: Starcal
+) -> None:
+    bag = of_four_images(tmp_path / 'bag.mcap', kind)
+    stated = STATED if '--camera-alone' in options else {}
+    words = {'PARAMS': ['--params', str(params(tmp_path, **stated))]}
+    given = [word for option in options for word in words.get(option, [option])]
+    status, said, _ = starcal('diagnose', bag, *given)
+    assert status == 0
+    assert '4 of 4 images' in said and 'the camera alone can be calibrated' in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('with_attitudes', [False, True])
+def test_the_camera_alone_is_calibrated_where_it_is_requested(
+    with_attitudes: bool, tmp_path: Path, starcal: Starcal
+) -> None:
+    bag = TINY if with_attitudes else of_four_images(tmp_path / 'bag.mcap', ODOMETRY)
+    given = ['--params', TINY / 'params.yaml']
+    answer = starcal('calibrate', bag, '--camera-alone', '-o', tmp_path / 'out', *given)
+    assert answer.status in (0, 3)
+    made = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert not made.has_alignment
+    assert 'not used, since the attitudes are those of the stars: prior' in answer.err
+    # Its observations say so: repeated from them, it gained the alignment to a star tracker.
+    out, again = str(tmp_path / 'out/observations.mcap'), str(tmp_path / 'again')
+    assert starcal('calibrate', out, *given, '-o', again).status in (0, 3)
+    repeated = read_calibration(tmp_path / 'again/calibration.json')
+    assert not repeated.has_alignment
+    name = 'observations_sha256'
+    assert repeated.provenance[name] == made.provenance[name]
+    assert calibrate_bag(out, TINY / 'params.yaml').provenance[name] == made.provenance[name]
+    recorded, setup = Topics(observations='/observations'), read_setup(TINY / 'params.yaml')
+    with pytest.raises(BagError, match='of a camera alone, where a star tracker is set up'):
+        list(topics.read([Path(out)], recorded, setup))
+
+
+@pytest.mark.parametrize('command', ['diagnose', 'diagnose --params', 'calibrate --params'])
+def test_a_clock_that_was_never_set_is_named(
+    command: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reader.log_damage.cache_clear()
+    bag = tmp_path / 'bag.mcap'
+    back_ns = images()[0].time_ns - 5 * 10**9
+    unset = (Image(image.time_ns - back_ns, image.pixels) for image in images()[:2])
+    samples = ((ns - back_ns, xyzw) for ns, xyzw in attitudes() if ns > back_ns)
+    write_tiny(bag, unset, samples)
+    name, *with_params = command.split()
+    given = [*with_params, str(TINY / 'params.yaml')] if with_params else []
+    out = ['-o', str(tmp_path / 'out'), '--no-report'] if name == 'calibrate' else []
+    main([name, str(bag), *given, *out])
+    words = [
+        record.message for record in caplog.records if 'the clock was not set' in record.message
+    ]
+    assert len(words) == 1 and 'stamp images and attitudes in UTC' in words[0]

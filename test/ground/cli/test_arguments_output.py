@@ -64,7 +64,13 @@ def _picture(folder: Path) -> Path:
     return folder
 
 
+def _frames(here: Path) -> Path:
+    write_frames(here / 'frames')
+    return here / 'frames'
+
+
 _OWN = '--params HERE/bag/params.yaml -o'
+_IMPORT = 'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
 PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
     'folder of the bag': (_nothing, f'calibrate HERE/bag {_OWN} HERE/bag'),
     'folder of the bag, by another name': (
@@ -122,6 +128,17 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda here: (here / 'bag').rename(here / 'night'),
         'simulate --scenario tiny -o HERE/night',
     ),
+    'import over its attitudes': (
+        lambda here: _frames(here).joinpath('attitude.csv').rename(here / 'frames/import.json'),
+        f'{_IMPORT} HERE/frames/import.json -o HERE/frames',
+    ),
+    'straight image over its original': (
+        _frames, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
+    ),
+    'straight images of one name': (
+        lambda here: shutil.copytree(_frames(here), here / 'others'),
+        'undistort HERE/out HERE/frames/0.png HERE/others/0.png -o HERE/straight',
+    ),
     'simulation beside a damaged truth': (
         lambda here: (here / 'bag/truth.json').write_text('[' * 10**6),
         'simulate --scenario tiny -o HERE/bag',
@@ -160,10 +177,12 @@ WRITING: dict[str, str] = {
         'o_0.mcap metadata.yaml truth.json params.yaml camera.yaml'
     ),
     'simulate --scenario tiny -o HERE/o/b.mcap': ('b.mcap b.json b_params.yaml b_camera.yaml'),
-    (
-        'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
-        ' HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o'
-    ): 'o_0.mcap metadata.yaml import.json params.yaml camera.yaml',
+    f'{_IMPORT} HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o': (
+        'o_0.mcap metadata.yaml import.json params.yaml camera.yaml'
+    ),
+    f'{_IMPORT} HERE/frames/attitude.csv --camera HERE/bag/camera.yaml -o HERE/o/b.mcap': (
+        'b.mcap b_import.json b_params.yaml b_camera.yaml'
+    ),
     'catalog HERE/gaia.csv -o HERE/o/deep.npz': 'deep.npz',
     'trend HERE/out -o HERE/o': 'trend.html',
     'undistort HERE/out HERE/frames/0.png -o HERE/o': '0.png camera_info.yaml',

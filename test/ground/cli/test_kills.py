@@ -1,16 +1,15 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Kills of each sub-command: inputs unchanged, outputs whole, old or absent.
+Kills and interrupts of each sub-command: inputs unchanged, outputs whole, old or absent.
 
-Instants are drawn from the processor time of a whole run, so that a busy machine does not move all
-of them to its start.  A kill at random seldom meets a write.  So the state of the output folder is
-also looked at just before each operation of a run on a file in it: that is what a SIGKILL at
-that instant would leave.
+A kill at random seldom meets a write.  So the output folder is looked at just before each
+operation of a run on a file in it: a SIGKILL at that instant would leave this.  Other runs are
+interrupted there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import dataclasses
 from dataclasses import dataclass
@@ -21,19 +20,16 @@ import os
 from pathlib import Path
 import random
 import shutil
-import signal
 import sys
-import time
-import traceback
+import threading
 
 from attacks import BAG, digests, many  # type: ignore[import-not-found]
-import cv2
 from mission_files import write_frames  # type: ignore[import-not-found]
 import pytest
 
-from bench import graph
 from starcal_ground.bags import reader
-from starcal_ground.cli import entry_point, main
+from starcal_ground.cli import main
+from starcal_ground.cli.arguments import EXIT_INTERRUPTED
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
@@ -41,12 +37,7 @@ from starcal_ros import files
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.products.product_files import read_calibration, write_atomically
 
-SLOWEST_S = 300.0
-pytestmark = [
-    pytest.mark.slow,
-    # Python 3.12 warns of the threads of a worker of pytest, which run on in the parent alone.
-    pytest.mark.filterwarnings('ignore:.* use of fork:DeprecationWarning'),
-]
+pytestmark = pytest.mark.slow
 
 
 @dataclass(frozen=True)
@@ -78,24 +69,41 @@ COMMANDS = (
         ),
     ),
     Command('trend', ('in', '-o', 'out'), is_repeatable=False),
-    Command('diagnose', ('in/bag', '--params', 'in/bag/params.yaml')),
 )
+_OPERATIONS = ('open', 'os.rename', 'os.remove', 'os.rmdir', 'os.mkdir', 'os.truncate', 'os.link')
+Look = Callable[[], None]
+_watched: list[tuple[str, Look]] = []
+_of_thread = threading.local()
 
 
-WRITING = [c for c in COMMANDS if 'out' in ' '.join(c.arguments)]
+def _before_operation(event: str, arguments: tuple[object, ...]) -> None:
+    """Audit hook of Python, which cannot be removed; it looks at a watched folder."""
+    is_looking = getattr(_of_thread, 'is_looking', False)  # a look opens files itself
+    if not _watched or is_looking or event not in _OPERATIONS:
+        return
+    folder, look = _watched[0]
+    if not str(arguments[0]).startswith(folder):
+        return
+    if event == 'open' and not int(str(arguments[2])) & (os.O_WRONLY | os.O_RDWR):
+        return
+    _of_thread.is_looking = True
+    try:
+        look()
+    finally:
+        _of_thread.is_looking = False
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the inputs in ``in/``: a bag, its images, two calibrations of it."""
+    """A folder with the inputs in ``in/``: a bag, its images, a calibration of it."""
     folder = tmp_path_factory.mktemp('kills')
-    cv2.setNumThreads(0)  # threads do not survive the fork of a child
+    sys.addaudithook(_before_operation)
     # With three images a run has fewer thumbnails than with ten, and the same other files.
     few = dataclasses.replace(scenario('tiny'), image_count=3)
     simulated_bag.write_bag(few, folder / 'in/bag')
     write_frames(folder / 'in/frames', 2)
     files = ['--params', str(folder / 'in/bag/params.yaml'), '-o', str(folder / 'in/a')]
-    with contextlib.redirect_stdout(io.StringIO()):  # in this process: it loads the modules
+    with contextlib.redirect_stdout(io.StringIO()):
         assert main.main(['calibrate', str(folder / 'in/bag'), *files]) == 0
     return folder
 
@@ -107,44 +115,65 @@ def _arguments(command: Command, folder: Path) -> list[str]:
     return [command.name, *words]
 
 
-@pytest.mark.parametrize('command', WRITING, ids=lambda command: command.name)
-def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder: Path) -> None:
-    """Look at the output folder before each operation on a file in it, in two whole runs."""
-    arguments = _arguments(command, folder)
-    old, expected, _ = _whole_run(command, folder)
-    looked = 0
-    for earlier in (old,) if command.name == 'report' else (old, None):
-        _restore(folder, earlier)
-        before = digests(folder / 'out')
-        states = folder / 'states'
-        Child(folder, arguments, states).wait()
-        for line in states.read_text().splitlines():
-            looked += 1
-            assert not _cut_outputs(command, folder / 'out', before, expected, json.loads(line))
-    assert looked > 1
+def _run(command: Command, folder: Path, look: Look) -> int:
+    """Exit status of a command that calls a function before each operation on its outputs."""
+    _watched.append((str(folder / 'out'), look))
+    try:
+        return main.main(_arguments(command, folder))
+    finally:
+        _watched.clear()
+
+
+def _is_main_thread() -> bool:
+    """True where Python handles signals."""
+    return threading.current_thread() is threading.main_thread()
+
+
+def _cut_in_run(
+    command: Command, folder: Path, earlier: Path | None, expected: Mapping[str, str]
+) -> list[str]:
+    """`_cut_outputs` before each operation of a run beside earlier products."""
+    _restore(folder, earlier)
+    before, cut = digests(folder / 'out'), list[str]()
+
+    def look() -> None:
+        with contextlib.suppress(FileNotFoundError):  # renamed by another thread, which looks too
+            cut.extend(_cut_outputs(command, folder, before, expected))
+
+    _run(command, folder, look)
+    return cut
 
 
 @pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.name)
-def test_kills_at_random(command: Command, folder: Path) -> None:
-    """
-    SIGINT and SIGKILL in turn: no traceback, no hang, inputs unchanged, outputs old or whole.
+def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder: Path) -> None:
+    old, expected, operations = _whole_run(command, folder)
+    assert operations > 1
+    assert not _cut_in_run(command, folder, old, expected)
+    if command.name != 'report':
+        assert not _cut_in_run(command, folder, None, expected)
 
-    Every second pair of runs replaces the products of an earlier one.
-    """
-    arguments = _arguments(command, folder)
-    old, expected, longest_s = _whole_run(command, folder)
-    inputs = _inputs(folder)
-    draw = random.Random(14)
-    for k in range(many(4)):
-        _restore(folder, old if k % 4 < 2 or command.name == 'report' else None)
+
+@pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.name)
+def test_an_interrupt_is_one_line_and_leaves_inputs_and_outputs_sound(
+    command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Runs that replace the products of an earlier one."""
+    old, expected, operations = _whole_run(command, folder)
+    inputs, draw = _inputs(folder), random.Random(14)
+    for _ in range(many(2)):
+        _restore(folder, old)
         before = digests(folder / 'out')
-        child = Child(folder, arguments)
-        if not child.wait_for_processor(draw.uniform(0.0, longest_s)):
-            child.send(signal.SIGKILL if k % 2 else signal.SIGINT)
-            assert child.wait() is not None
-        assert 'Traceback' not in child.said()
+        countdown = iter(range(draw.randrange(operations), -1, -1))
+
+        def interrupt(countdown: Iterator[int] = countdown) -> None:
+            if _is_main_thread() and next(countdown, None) == 0:
+                raise KeyboardInterrupt
+
+        capsys.readouterr()
+        assert _run(command, folder, interrupt) == EXIT_INTERRUPTED
+        assert capsys.readouterr().err == 'starcal: interrupted\n'
         assert _inputs(folder) == inputs
-        assert not _cut_outputs(command, folder / 'out', before, expected)
+        assert not _cut_outputs(command, folder, before, expected)
 
 
 def _old_outputs(command: Command, folder: Path) -> Path:
@@ -166,18 +195,13 @@ def _old_outputs(command: Command, folder: Path) -> Path:
 
 
 @functools.cache
-def _whole_run(command: Command, folder: Path) -> tuple[Path, Mapping[str, str], float]:
-    """Older products, digests of those of a run that is not killed, and its processor time, s."""
+def _whole_run(command: Command, folder: Path) -> tuple[Path, Mapping[str, str], int]:
+    """Older products, digests of those of a run that ends, and its operations in this thread."""
     old = _old_outputs(command, folder)
     _restore(folder, old)
-    before = os.times()
-    child = Child(folder, _arguments(command, folder))
-    status = child.wait(SLOWEST_S)
-    assert status in (0, 3), child.said()
-    after = os.times()
-    processor_s = after.children_user + after.children_system
-    processor_s -= before.children_user + before.children_system
-    return old, digests(folder / 'out'), processor_s
+    found: list[bool] = []
+    assert _run(command, folder, lambda: found.append(_is_main_thread())) in (0, 3)
+    return old, digests(folder / 'out'), sum(found)
 
 
 def _restore(folder: Path, old: Path | None) -> None:
@@ -189,20 +213,14 @@ def _restore(folder: Path, old: Path | None) -> None:
 
 
 def _cut_outputs(
-    command: Command,
-    out: Path,
-    before: Mapping[str, str],
-    expected: Mapping[str, str],
-    state: Mapping[str, str] | None = None,
+    command: Command, folder: Path, before: Mapping[str, str], expected: Mapping[str, str]
 ) -> list[str]:
-    """Files, now or in a recorded state, that are not old, as after a whole run, or absent."""
-    after = digests(out) if state is None else state
-    cut = []
+    """Outputs that are neither old, nor as after a whole run, nor absent."""
+    out, cut = folder / 'out', []
+    after = digests(out)
     for name, digest in after.items():
         if name.endswith(('.part', '.log', '-journal')) or digest == before.get(name):
             continue
-        if state is not None and not command.is_repeatable and not (out / name).exists():
-            continue  # merged into another file since: a kill at random reads it while it is there
         sound = digest == expected.get(name) if command.is_repeatable else _reads(out / name)
         cut += [] if sound else [f'{name} is neither old nor whole']
     # A thumbnail of an earlier calibration may be gone, a product never is.
@@ -234,89 +252,3 @@ def _reads(path: Path) -> bool:
 
 def _inputs(folder: Path) -> dict[str, str]:
     return {**digests(folder / 'in'), **digests(BAG)}
-
-
-class Child:
-    """The tool in a forked process of its own group, without the seconds that imports take."""
-
-    def __init__(self, folder: Path, arguments: list[str], states: Path | None = None) -> None:
-        self._log = folder / 'log'
-        sys.stdout.flush()
-        self._status: int | None = None
-        self._number = os.fork()
-        if self._number == 0:
-            _run(arguments, self._log, folder / 'out', states)
-        with contextlib.suppress(OSError):  # it has done so itself, or has ended
-            os.setpgid(self._number, self._number)
-
-    def wait(self, timeout_s: float = SLOWEST_S) -> int | None:
-        """Exit status, or None after a time."""
-        end_s = time.monotonic() + timeout_s
-        while self._status is None and time.monotonic() < end_s:
-            number, status = os.waitpid(self._number, os.WNOHANG)
-            if number:
-                self._status = os.waitstatus_to_exitcode(status)
-            else:
-                time.sleep(min(0.005, max(end_s - time.monotonic(), 0.0)))
-        return self._status
-
-    def wait_for_processor(self, processor_s: float) -> bool:
-        """Wait until it has used a processor for a time; True where it has ended before."""
-        while self.wait(0.005) is None:
-            if graph.processor_s(self._number) >= processor_s:
-                return False
-        return True
-
-    def send(self, number: int) -> None:
-        """Send a signal to the group."""
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._number, number)
-
-    def said(self) -> str:
-        """Return the output so far."""
-        return self._log.read_text(errors='replace') if self._log.exists() else ''
-
-
-def _run(arguments: list[str], log: Path, out: Path, states: Path | None) -> None:
-    """In the forked process: run the tool and end."""
-    status = 1
-    try:
-        if states is not None:
-            _record_states(out, states)
-        # SIGINT waits until the tool is called, as it does in a process of its own.
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-        os.setpgid(0, 0)
-        output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(output, 1)
-        os.dup2(output, 2)
-        sys.argv = ['starcal', *arguments]
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-        status = entry_point.main()
-    except BaseException:
-        traceback.print_exc()
-        sys.stderr.flush()
-    finally:
-        os._exit(status)
-
-
-def _record_states(out: Path, states: Path) -> None:
-    """Write the digests of a folder as a line of JSON before each operation on a file in it."""
-    lines = states.open('w')
-    looking = False
-
-    def look(event: str, arguments: tuple[object, ...]) -> None:
-        nonlocal looking
-        if looking or event not in _OPERATIONS or not str(arguments[0]).startswith(str(out)):
-            return
-        if event == 'open' and not int(str(arguments[2])) & (os.O_WRONLY | os.O_RDWR):
-            return
-        looking = True
-        lines.write(json.dumps(digests(out)) + '\n')
-        lines.flush()
-        looking = False
-
-    sys.addaudithook(look)
-
-
-_OPERATIONS = ('open', 'os.rename', 'os.remove', 'os.rmdir', 'os.mkdir', 'os.truncate', 'os.link')

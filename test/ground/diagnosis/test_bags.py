@@ -4,20 +4,15 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from starcal_ground.bags import reader
-from starcal_ground.bags.topics import Topics
-from starcal_ground.campaign import chosen, Source
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes
 from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ground.ros.setup_finder import Unmatched
-from starcal_ros.errors import OptionError
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
@@ -31,31 +26,10 @@ def unaligned() -> Setup:
     return load_setup({'camera_info_url': str(TINY / 'camera.yaml')})
 
 
-@pytest.mark.slow
-def test_an_alignment_not_given_is_found(unaligned: Setup) -> None:
-    assert not unaligned.is_aligned
-    found = chosen(Source((TINY,), Topics(), unaligned))
-    (sentence,) = found.notes
-    assert found.setup.is_aligned and 'prior_alignment is not given: found [' in sentence
-    assert 'from 8 images that agree' in sentence
-    true = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
-    shown = Rotation.from_quat(found.setup.prior.star_tracker_from_camera_xyzw)
-    # The mounting is off by 150 arcsec an axis, the principal point by up to its prior.
-    assert (shown.inv() * true).magnitude() < math.radians(0.2)
-
-
 def test_two_images_are_too_few_for_an_alignment() -> None:
     two = Diagnosis('prior_alignment', [0.0, 0.0, 0.0, 1.0], 'x', images=2)
     assert found_alignment(two) == (None, '2 images agree, 3 are needed.')
     assert found_alignment(dataclasses.replace(two, images=3))[0] == [0.0, 0.0, 0.0, 1.0]
-
-
-@pytest.mark.slow
-def test_an_alignment_not_found_is_said(unaligned: Setup) -> None:
-    options = dataclasses.replace(unaligned.attitude, attitude_direction='inertial_to_st')
-    wrong = dataclasses.replace(unaligned, attitude=options)
-    with pytest.raises(OptionError, match='prior_alignment: not given, and not found: The atti'):
-        chosen(Source((TINY,), Topics(), wrong))
 
 
 @pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])

@@ -69,8 +69,8 @@ def words_on(frames: list[Pixels]) -> dict[int, str]:
     return {time_ns // S - 1: words for time_ns, words in copies.items()}
 
 
-@pytest.mark.parametrize('shift_px', [0.0, 0.05, 0.5])
-@pytest.mark.parametrize('pattern', [0.0, 1.0, 5.0])
+@pytest.mark.parametrize('shift_px', [0.0, 0.5])
+@pytest.mark.parametrize('pattern', [0.0, 5.0])
 @pytest.mark.parametrize(('psf_px', 'faint'), [(0.5, 2500), (1.3, 2500), (1.0, 0)])
 def test_exposures_of_one_field_and_camera_are_no_copies(
     psf_px: float, faint: int, pattern: float, shift_px: float

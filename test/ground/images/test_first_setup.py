@@ -12,9 +12,9 @@ from mission_files import attitudes, frames_of, images, TINY, write_encoded, wri
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.cli.main import main
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 
@@ -36,18 +36,15 @@ def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
 def test_a_bag_of_which_nothing_is_stated(
-    tmp_path: Path,
-    direction: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, direction: str, starcal: Starcal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv('COLUMNS', str(COLUMNS))
     is_plain = direction == 'st_to_inertial'
     bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', -1)
     monkeypatch.chdir(tmp_path)
     out = Path('out')
-    assert main(['calibrate', str(bag), '-o', str(out)]) == 0
-    text, notes = capsys.readouterr()
+    status, text, notes = starcal('calibrate', bag, '-o', out)
+    assert status == 0
     assert f'attitudes of {ATTITUDES}: {direction}, 8 images agree' in notes
     assert 'images identified by their stars: focal length 1801.' in notes
     assert 'star_tracker_sigma_arcsec: assumed from the scatter of the images' in text
@@ -72,10 +69,9 @@ def test_a_bag_of_which_nothing_is_stated(
     assert ('observer' in (out / 'params.yaml').read_text()) is not is_plain  # it has velocities
 
     # The files repeat the calibration.
-    again, params = tmp_path / 'again', out / 'params.yaml'
-    command = ['calibrate', str(bag), '--params', str(params), '-o', str(again), '--quiet']
-    assert main(command) == 0
-    assert capsys.readouterr() == ('', '')
+    again = tmp_path / 'again'
+    given = ['--params', out / 'params.yaml', '-o', again]
+    assert starcal('calibrate', bag, *given, '--quiet') == (0, '', '')
     first, second = (read_calibration(place / 'calibration.json') for place in (out, again))
     np.testing.assert_allclose(
         second.geometry.camera.parameters, first.geometry.camera.parameters, rtol=1e-6, atol=1e-6
@@ -84,31 +80,26 @@ def test_a_bag_of_which_nothing_is_stated(
 
 
 @pytest.mark.slow
-def test_attitudes_that_do_not_fit_are_diagnosed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path: Path, starcal: Starcal) -> None:
     bag = with_attitudes(tmp_path / 'b.mcap', shift_s=5)
-    command = ['calibrate', str(bag), *LENS, '-o', str(tmp_path / 'out'), '--quiet']
-    assert main(command) == 2
-    error = capsys.readouterr().err
-    assert error.count('\n') == 1
-    assert 'prior_alignment: not given, and not found: The stamps of the images' in error
-    assert 'Set stamp_offset_s: ' in error and '(details: starcal diagnose); look at ' in error
-    assert main(['diagnose', str(bag), *LENS]) == 3
-    assert 'in the parameter file:\n  stamp_offset_s: ' in capsys.readouterr().out
+    assert_refused(
+        starcal('calibrate', bag, *LENS, '-o', tmp_path / 'out', '--quiet'),
+        'prior_alignment: not given, and not found: The stamps of the images',
+        'Set stamp_offset_s: ',
+        '(details: starcal diagnose); look at ',
+    )
+    status, out, _ = starcal('diagnose', bag, *LENS)
+    assert status == 3 and 'in the parameter file:\n  stamp_offset_s: ' in out
 
 
 @pytest.mark.slow
-def test_streaks_that_are_measured_are_identified_too(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_streaks_that_are_measured_are_identified_too(tmp_path: Path, starcal: Starcal) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    line = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--smear', '8', '--images', '5']
-    assert main(line) == 0
-    capsys.readouterr()
-    assert main(['calibrate', str(bag), *LENS, '-o', str(out), '--no-report']) == 0
-    assert '5 of 5 images identified by their stars' in capsys.readouterr().err
+    line = ['simulate', '-o', bag, '--scenario', 'tiny', '--smear', 8, '--images', 5]
+    assert starcal(*line).status == 0
+    status, _, notes = starcal('calibrate', bag, *LENS, '-o', out, '--no-report')
+    assert status == 0 and '5 of 5 images identified by their stars' in notes
     calibration = read_calibration(out / 'calibration.json')
     truth = json.loads((bag / 'truth.json').read_text())['k_true'][0]
     # One draw: 4 sigma are exceeded once in 16,000.
@@ -116,34 +107,32 @@ def test_streaks_that_are_measured_are_identified_too(
 
 
 @pytest.mark.slow
-def test_photographs_of_which_nothing_is_stated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_photographs_of_which_nothing_is_stated(tmp_path: Path, starcal: Starcal) -> None:
     night, out = write_pngs(tmp_path / 'night', frames_of(3)), tmp_path / 'out'
-    command = ['calibrate', str(night), '-o', str(out), '--no-report']
-    assert main([*command, '--focal-length-mm', '50', '--pixel-size-um', '10']) in (0, 3)
-    text, notes = capsys.readouterr()
+    command = ['calibrate', night, '-o', out, '--no-report']
+    status, text, notes = starcal(*command, '--focal-length-mm', 50, '--pixel-size-um', 10)
+    assert status in (0, 3)
     assert 'px (stated: 5000 px, which the stars contradict)' in notes
     assert 'observer: assumed by the stars' in text and 'star_tracker' not in text
     assert '# observer: by the stars' in (out / 'params.yaml').read_text()
-    assert main(['diagnose', str(night), *LENS]) == 0
-    text = capsys.readouterr().out
+    status, text, _ = starcal('diagnose', night, *LENS)
+    assert status == 0
     assert 'the camera alone can be calibrated' in text and '3 of 3 images' in text
     with (out / 'params.yaml').open('a') as file:
         file.write('    shutter: global\n')
-    assert main([*command, *LENS]) == 2
-    assert 'params.yaml: was not written by starcal, or was changed' in capsys.readouterr().err
+    changed = 'params.yaml: was not written by starcal, or was changed'
+    assert_refused(starcal(*command, *LENS), changed)
 
 
 @pytest.mark.slow
 def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
     """A bag in space: its stars contradict the ground, and the sigma holds half of the air."""
-    given = [str(TINY), '--params', str(TINY / 'params.yaml'), '--set', 'observer=ground']
-    for command in (['diagnose'], ['calibrate', '-o', str(tmp_path), '--no-report']):
-        assert main([*command, *given]) == 0
-        assert 'observer: ground: the stars do not show its air' in capsys.readouterr().err
+    given = [TINY, '--params', TINY / 'params.yaml', '--set', 'observer=ground']
+    for command in (['diagnose'], ['calibrate', '-o', tmp_path, '--no-report']):
+        status, _, notes = starcal(*command, *given)
+        assert status == 0 and 'observer: ground: the stars do not show its air' in notes
     calibration = read_calibration(tmp_path / 'calibration.json')
     truth = json.loads((TINY / 'truth.json').read_text())['k_true'][0]
     focal_px, sigma_px = calibration.geometry.camera.parameters[0], calibration.sigma[0]
@@ -153,19 +142,20 @@ def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air
 
 @pytest.mark.slow
 def test_a_requirement_is_answered_for_people_and_programs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
-    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '--no-report']
-    command += ['-o', str(tmp_path), '--set', 'star_tracker_slow_arcsec=5']
-    wanted = ['--require', 'line_of_sight=20arcsec@98%']
-    assert main([*command, *wanted, '--json']) == 0
-    answer = json.loads(capsys.readouterr().out)
+    command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '--no-report', '--json']
+    command += ['-o', tmp_path, '--set', 'star_tracker_slow_arcsec=5']
+    status, out, _ = starcal(*command, '--require', 'line_of_sight=20arcsec@98%')
+    answer = json.loads(out)
+    assert status == 0
     assert answer['accepted'] and [row['note'] for row in answer['requirements']] == ['met']
     assert answer['lens_model'] == 'plumb_bob' and answer['folder'] == str(tmp_path)
     assert answer['assumed'].keys() == {'stamp_offset_s'}
     # Now it is 1.1 of this.
-    assert main([*command, '--require', 'f=0.055px', '--json']) == 3
-    answer = json.loads(capsys.readouterr().out)
+    status, out, _ = starcal(*command, '--require', 'f=0.055px')
+    answer = json.loads(out)
+    assert status == 3
     (check,) = answer['requirements']
     words = r'missed by 0.00\d+ px; \d+ more images? reach(es)? it'
     assert re.match(words, check['note']) and check['found'] < 0.07
@@ -239,17 +229,11 @@ def test_a_wrong_input_ends_in_one_line(
     line: str,
     words: list[str],
     inputs: Path,
-    capsys: pytest.CaptureFixture[str],
+    starcal: Starcal,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(inputs)
-    try:
-        status = main(line.format(bag=TINY, stated=STATED).split())
-    except SystemExit as ended:  # argparse's way out
-        status = int(str(ended.code))
-    text, error = capsys.readouterr()
-    assert status == 2 and not text and error.startswith('starcal: ')
-    assert error.count('\n') == 1
-    for word in words:
-        assert word in error
-    assert error.lower().count('one channel') == 0  # no second remedy for colour
+    answer = starcal(*line.format(bag=TINY, stated=STATED).split())
+    assert_refused(answer, *words)
+    assert not answer.out
+    assert answer.err.lower().count('one channel') == 0  # no second remedy for colour

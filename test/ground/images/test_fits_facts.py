@@ -183,6 +183,10 @@ def test_the_focal_lengths_that_a_header_states(name: str, tmp_path: Path) -> No
         assert [f.focal_px for f in found] == pytest.approx(list(expected_px), rel=1e-4)
 
 
+def test_the_instrument_is_the_camera(tmp_path: Path) -> None:
+    assert look_at(file_of(tmp_path, START, EIGHT, "INSTRUME= 'ASI'")).camera == 'ASI'
+
+
 SITES: Mapping[str, tuple[tuple[str, ...], tuple[float, float, float] | None]] = {
     'SITELAT': (('SITELAT = 31.68', 'SITELONG= -110.88', 'SITEELEV= 1270.0'),
                 (31.68, -110.88, 1270.0)),

@@ -11,13 +11,25 @@ import pytest
 
 from bench.frames import load_set_up
 from starcal_ground.planning import plan
-from starcal_ground.planning.plan import Cone, Plan, plan_pointings, Pointing, Request, target
+from starcal_ground.planning.plan import (
+    Cone,
+    expected_noise_px2,
+    Plan,
+    plan_pointings,
+    Pointing,
+    prospect,
+    Request,
+    target,
+)
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import camera_from_icrf, Inertial, scenario
+from starcal_ros.assessment.requirements import MAP
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import Ensemble
+from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
 
 
 @pytest.fixture(scope='module')
@@ -158,3 +170,78 @@ def test_no_pointing_left_and_no_estimate(setup: Setup, ensemble: Ensemble) -> N
     few = dataclasses.replace(ensemble, images=ensemble.images[:1])
     with pytest.raises(TooFewObservations):
         plan_pointings(few, setup, Request(1, 'map'))
+
+
+_OPTIONS = CalibrationOptions()
+
+
+def _estimate(images: Ensemble) -> Estimate:
+    return estimate_calibration(images, scenario('tiny').prior, _OPTIONS)
+
+
+@pytest.fixture(scope='module')
+def first(ensemble: Ensemble) -> Estimate:
+    return _estimate(dataclasses.replace(ensemble, images=ensemble.images[:8]))
+
+
+def test_the_turn_of_a_camera_without_rates_stays_in_the_sigma(ensemble: Ensemble) -> None:
+    """All images share it: more of them do not take it away, as was promised before."""
+    nowhere = np.full(3, np.nan)
+    images = tuple(
+        dataclasses.replace(one, star_tracker_rate_rad_s=nowhere) for one in ensemble.images
+    )
+    few = _estimate(dataclasses.replace(ensemble, images=images[:8]))
+    found, wanted = prospect(few, images[8:], _OPTIONS), target(few, 'fy')
+    after = _estimate(dataclasses.replace(ensemble, images=images))
+    reported = target(after, 'fy').sigma(after.posterior.covariance)
+    expected = np.sqrt(found.variances([0, 1], wanted.squares))[2]
+    assert expected == pytest.approx(reported, rel=0.15)  # as above
+
+
+def test_the_best_candidate_is_the_one_whose_variance_is_least(
+    ensemble: Ensemble, first: Estimate
+) -> None:
+    found = prospect(first, ensemble.images, _OPTIONS)
+    wanted = target(first, MAP)
+    every = np.ones(10, bool)
+    each = [float(found.variances([k], wanted.squares)[-1]) for k in range(10)]
+    best = found.best([], every, wanted.squares)
+    assert best == int(np.argmin(each))
+    without = every.copy()
+    without[best] = False
+    assert found.best([], without, wanted.squares) == int(np.argsort(each)[1])
+
+
+def test_sigmas_have_the_names_and_units_of_requirements(first: Estimate) -> None:
+    """The map has a smaller one than lines of sight, which have the alignment."""
+    covariance = first.posterior.covariance
+
+    def planned(name: str, unit: str) -> float:
+        wanted = target(first, name)
+        assert wanted.name == name + unit
+        return wanted.sigma(covariance)
+
+    assert planned('map', '_arcsec') < planned('line_of_sight', '_arcsec')
+    assert planned('pointing', '_arcsec') == planned('line_of_sight', '_arcsec')
+    names = (*first.geometry.camera.parameter_names, *ALIGNMENT_NAMES)
+    sigma = dict(zip(names, np.sqrt(np.diag(first.covariance)), strict=True))
+    for name, unit, expected in (
+        ('k1', '', sigma['k1']),
+        ('fx', '_px', sigma['fx']),
+        ('f', '_px', np.hypot(sigma['fx'], sigma['fy']) / np.sqrt(2.0)),
+        ('alignment_y', '_arcsec', sigma['alignment_y'] / ARCSECOND_RAD),
+    ):
+        assert planned(name, unit) == pytest.approx(expected, rel=1e-9)  # rounding
+    allowed = 'one of: line_of_sight, map, pointing, f, fx, .*, alignment_z, k1, k2, k3, p1, p2$'
+    with pytest.raises(OptionError, match=f"^'k9' is not estimated; .* is {allowed}"):
+        target(first, 'k9')
+
+
+def test_expected_noise_is_that_of_stars_of_about_the_magnitude(first: Estimate) -> None:
+    table = first.table
+    expected = expected_noise_px2(first, table.magnitude.astype(float))
+    real = first.covariance_px2[:, [0, 2]].mean(axis=1)
+    # Their information in all, which decides: to 5 %, of the steps between the groups.
+    assert (1.0 / expected).sum() == pytest.approx((1.0 / real).sum(), rel=0.05)
+    faint_first = expected_noise_px2(first, np.array([9.0, 6.0, 4.0]))
+    assert (np.diff(faint_first) < 0).all()

@@ -13,17 +13,23 @@ import shutil
 import subprocess
 from typing import Any
 
+from attacks import CHANGES, drawn, with_changes  # type: ignore[import-not-found]
 from browser import BROWSER  # type: ignore[import-not-found]
+from hypothesis import given
 from markupsafe import Markup
 import numpy as np
 import pytest
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground import products
 from starcal_ground.bags.reader import read_observations
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
-from starcal_ground.products import prior_of, REPORT_FILE
+from starcal_ground.products import NotCalibrated, prior_of, REPORT_FILE
 from starcal_ground.report import page as report
+from starcal_ground.report import svg
+from starcal_ground.report.page import write_failure_page, write_report
+from starcal_ground.report.svg import light
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
     read_calibration,
@@ -235,16 +241,25 @@ def test_numbers_that_are_none_do_no_harm(
     assert '<html' in page_of(calibration, tmp_path, covariance=covariance, **none, **nan)
 
 
+@pytest.mark.slow
+@drawn(5)
+@given(CHANGES)
+def test_a_report_of_an_odd_calibration(folder: Path, changes: list[tuple[int, object]]) -> None:
+    content = json.loads((folder / CALIBRATION_FILE).read_text())
+    changed = folder.with_name('changed')
+    shutil.copytree(folder, changed, dirs_exist_ok=True)
+    (changed / CALIBRATION_FILE).write_text(json.dumps(with_changes(content, changes)))
+    assert main.main(['report', str(changed)]) in (EXIT_ACCEPTED, EXIT_BAD_INPUT)
+
+
 @pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])
 def test_damaged_files_are_named_in_one_line(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str
+    folder: Path, tmp_path: Path, starcal: Starcal, damage: str
 ) -> None:
     broken = tmp_path / 'broken'
     shutil.copytree(folder, broken)
     (broken / damage).write_bytes(b'no such thing')
-    assert main.main(['report', str(broken)]) == EXIT_BAD_INPUT
-    complaint = capsys.readouterr().err
-    assert complaint.count('\n') == 1 and damage in complaint
+    assert_refused(starcal('report', broken), damage)
 
 
 # Put first in the page: what goes wrong is kept from the start.
@@ -329,3 +344,26 @@ def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -
     assert measured['loaded'] and measured['unnamed'] == 0
     assert measured['titles'] == 10  # one for each image
     assert measured['contents'] == 'sticky' and measured['rows'] == (3 if width == 400 else 1)
+
+
+def test_a_remedy_is_a_sentence_and_only_a_parameter_is_code(tmp_path: Path) -> None:
+    mend = ('# no parameter mends this: record RAW images', 'search_radius_px: 40')
+    record = NotCalibrated('no image matched', ('bag',), {'no_match': 3}, mend=mend)
+    text = write_failure_page(record, tmp_path).read_text()
+    assert '<li>No parameter mends this: record RAW images</li>' in text
+    assert '<li><code>search_radius_px: 40</code></li>' in text
+
+
+def test_colours_are_those_of_the_light_palette(tiny_products: Path, tmp_path: Path) -> None:
+    shutil.copytree(tiny_products, tmp_path / 'out')
+    text = light(write_report(tmp_path / 'out').read_text())
+    assert 'stroke="#0b62a8"' in text and '"var(--' not in text
+
+
+def test_letters_of_printed_figures_have_six_points() -> None:
+    css = (Path(svg.__file__).parent / 'templates' / 'report.css').read_text()
+    rule = re.search(r'\.charts > figure \{ display: inline-block;[^}]*width: (\d+)%', css)
+    margins = re.search(r'size: A4; margin: \S+ (\d+)mm', css)
+    assert rule is not None and margins is not None
+    line_pt = (210 - 2 * int(margins[1])) / 25.4 * 72
+    assert line_pt * int(rule[1]) / 100 * svg.LETTER / svg.WIDTH >= 6

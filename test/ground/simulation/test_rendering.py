@@ -66,14 +66,6 @@ def test_noise_has_the_mean_and_variance_of_its_sources() -> None:
         assert abs(electrons.var() / variance - 1) < 5 * math.sqrt(2 / count)
 
 
-def test_background_noise_is_what_the_detector_says() -> None:
-    counts = expose(
-        np.full((500, 800), QUIET.background_electrons), QUIET, np.random.default_rng(4)
-    )
-    expected_dn = QUIET.noise_electrons / QUIET.electrons_per_dn
-    assert counts.std() == pytest.approx(expected_dn, rel=5 / math.sqrt(2 * counts.size))
-
-
 @pytest.mark.parametrize(('bits', 'dtype'), [(8, np.uint8), (12, np.uint16), (16, np.uint16)])
 def test_the_converter_saturates(bits: int, dtype: type) -> None:
     detector = dataclasses.replace(QUIET, bits=bits)

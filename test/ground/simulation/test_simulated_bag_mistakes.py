@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
 from tiny_campaign import image  # type: ignore[import-not-found]
 
-from starcal_ground.cli import main
 from starcal_ground.simulation.simulated_bag import Mistakes, NO_MISTAKES
 from starcal_ros.records import Image
 
@@ -33,16 +33,13 @@ pytestmark = pytest.mark.slow
         (['--gamma', '2.2'], 'not_linear'),
     ],
 )
-def test_each_is_named(
-    options: list[str], cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_is_named(options: list[str], cause: str, tmp_path: Path, starcal: Starcal) -> None:
     bag = tmp_path / 'bag'
-    made = ['simulate', '-o', str(bag), '--scenario', 'tiny', '--images', '4', *options]
-    assert main.main(made) == 0
+    made = starcal('simulate', '-o', bag, '--scenario', 'tiny', '--images', 4, *options)
+    assert made.status == 0
     assert json.loads((bag / 'truth.json').read_text())['images'] == 4
-    capsys.readouterr()
-    status = main.main(['diagnose', str(bag), '--params', str(bag / 'params.yaml'), '--json'])
-    found = json.loads(capsys.readouterr().out)
+    status, out, _ = starcal('diagnose', bag, '--params', bag / 'params.yaml', '--json')
+    found = json.loads(out)
     assert (found['cause'], found['also']) == (cause, [])
     assert status == (0 if cause == 'none' else 3)
 

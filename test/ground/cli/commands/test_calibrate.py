@@ -6,38 +6,41 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+import re
 import shutil
 
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from sample_records import calibration, without_field  # type: ignore[import-not-found]
+from scipy.spatial.transform import Rotation
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.reader import read_observations
-from starcal_ground.cli import main
+from starcal_ground.cli.commands.calibrate import print_calibration
 from starcal_ground.products import (
     NOT_CALIBRATED_FILE,
     OBSERVATIONS_FILE,
     OBSERVATIONS_TOPIC,
     write_observations,
 )
+from starcal_ros.camera.projection import convert
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.records import refused_image
+from starcal_ros.records import FOUND, refused_image, SigmaPart
 
 
 @pytest.mark.slow
 def test_a_failure_replaces_an_older_calibration(
-    tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_products: Path, tmp_path: Path, starcal: Starcal
 ) -> None:
     out = tmp_path / 'out'
     shutil.copytree(tiny_products, out)
     assert 'Accepted' in (out / 'report.html').read_text()
-    params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
-    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
-    complaint = capsys.readouterr().err
-    words = 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)'
-    assert words in complaint and complaint.count('\n') == 1
-    assert complaint.endswith(f'; look at {out}/report.html\n')
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    answer = starcal('calibrate', TINY, '--params', params, '-o', out)
+    assert_refused(answer, 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)')
+    assert answer.err.endswith(f'; look at {out}/report.html\n')
     record = json.loads((out / NOT_CALIBRATED_FILE).read_text())
     assert (record['calibrated'], record['cause']) == (False, 'attitude_direction')
     assert record['images_refused'] == {'no_match': 10}
@@ -49,16 +52,15 @@ def test_a_failure_replaces_an_older_calibration(
         assert 'Not calibrated' in page and 'Accepted' not in page
         assert page.count('<figure><img src="data:image/png;base64,') == 3
         assert 'attitude_direction: st_to_inertial' in page
-        assert main.main(['report', str(out)]) == 0
-    again = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
-    assert main.main(again) == 0
+        assert starcal('report', out).status == 0
+    assert starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', out).status == 0
     assert not (out / NOT_CALIBRATED_FILE).exists()
     assert 'Accepted' in (out / 'report.html').read_text()
 
 
 @pytest.mark.slow
 def test_the_reason_of_each_refusal_is_said(
-    tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_products: Path, tmp_path: Path, starcal: Starcal
 ) -> None:
     images = list(read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC))
     one, two, *others = images
@@ -68,10 +70,9 @@ def test_the_reason_of_each_refusal_is_said(
     ]
     (tmp_path / 'bag').mkdir()
     write_observations([*refused, *others], tmp_path / 'bag', 'camera')
-    command = ['calibrate', str(tmp_path / 'bag'), '--params', str(TINY / 'params.yaml')]
-    main.main([*command, '-o', str(tmp_path / 'out'), '--no-report'])
+    command = ['calibrate', tmp_path / 'bag', '--params', TINY / 'params.yaml']
+    said = starcal(*command, '-o', tmp_path / 'out', '--no-report').err
     words = '2 of 10 images refused, no_match: no rotation of the predicted stars explains'
-    said = capsys.readouterr().err
     assert words in said and '(in one part only)' in said
 
 
@@ -90,16 +91,14 @@ def broken(*_: object) -> None:
     ],
 )
 def test_a_drawing_that_fails_costs_the_drawing_only(
-    few_images: Path, tmp_path: Path, capsys, monkeypatch, place: str, missing: str
+    few_images: Path, tmp_path: Path, starcal: Starcal, monkeypatch, place: str, missing: str
 ) -> None:
     out = tmp_path / 'out'
     out.mkdir()
     write_atomically(out / 'report.html', 'of earlier products')
     monkeypatch.setattr(place, broken)
-    params = str(few_images / 'params.yaml')
-    assert main.main(['calibrate', str(few_images), '--params', params, '-o', str(out)]) == 0
-    said = capsys.readouterr()
-    assert 'accepted by the gate' in said.out
+    said = starcal('calibrate', few_images, '--params', few_images / 'params.yaml', '-o', out)
+    assert said.status == 0 and 'accepted by the gate' in said.out
     assert f'warning: no {missing}, ' in said.err and 'TypeError: another version' in said.err
     assert said.err.count('\n') == 1
     assert ('the products cannot be drawn' in said.err) == (missing == 'report')
@@ -108,26 +107,26 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
 
 
 @pytest.mark.slow
-def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monkeypatch) -> None:
+def test_a_failure_page_that_fails_hides_no_failure(
+    tmp_path: Path, starcal: Starcal, monkeypatch
+) -> None:
     monkeypatch.setattr('starcal_ground.report.page.write_failure_page', broken)
     monkeypatch.setattr('starcal_ground.report.thumbnails._expected_picture', broken)
-    params = str(params_with(tmp_path, attitude_direction='inertial_to_st'))
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
     out = tmp_path / 'out'
-    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
-    words = capsys.readouterr().err.splitlines()
+    answer = starcal('calibrate', TINY, '--params', params, '-o', out)
+    words = answer.err.splitlines()
+    assert answer.status == 2
     assert len(words) == 3 and 'no pictures of images' in words[0] and 'no report' in words[1]
     assert 'Set attitude_direction: st_to_inertial.' in words[2]
     assert (out / NOT_CALIBRATED_FILE).exists() and not (out / 'report.html').exists()
 
 
 @pytest.mark.slow
-def test_alignment_and_tracker_sigma_are_found_and_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    params = str(params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None))
+def test_alignment_and_tracker_sigma_are_found_and_said(tmp_path: Path, starcal: Starcal) -> None:
+    params = params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None)
     out = tmp_path / 'out'
-    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 0
-    said = capsys.readouterr()
+    said = starcal('calibrate', TINY, '--params', params, '-o', out)
     assert 'prior_alignment is not given: found [' in said.err
     assert 'star_tracker_sigma_arcsec: assumed from the scatter of the images' in said.out
     made = json.loads((out / 'calibration.json').read_text())
@@ -144,23 +143,78 @@ def test_alignment_and_tracker_sigma_are_found_and_said(
 
 @pytest.mark.parametrize('rate', [0.0, np.nan])
 def test_rates_that_no_image_has_are_said(
-    rate: float, tmp_path: Path, tiny_products: Path, capsys: pytest.CaptureFixture[str]
+    rate: float, tmp_path: Path, tiny_products: Path, starcal: Starcal
 ) -> None:
     recorded = read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC)
     rates = np.full(3, rate)
     images = [dataclasses.replace(image, star_tracker_rate_rad_s=rates) for image in recorded]
     write_observations(images, tmp_path, 'camera')
-    out, params = str(tmp_path / 'out'), str(params_with(tmp_path, shutter=None))
-    bag = str(tmp_path / OBSERVATIONS_FILE)
-    assert main.main(['calibrate', bag, '--params', params, '-o', out, '--no-report']) == 0
-    said = ' '.join(capsys.readouterr().out.split())
+    bag, params = tmp_path / OBSERVATIONS_FILE, params_with(tmp_path, shutter=None)
+    given = ['--params', params, '-o', tmp_path / 'out', '--no-report']
+    said = starcal('calibrate', bag, *given).words
     assert ('the turn of a low orbit in the sigma' in said) == np.isnan(rate)
     assert 'read out within 20 ms' in said
 
 
 @pytest.mark.slow
-def test_a_part_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / 'out'
-    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
-    main.main([*command, '--to', '+20'])  # six may be too few for the gate
-    assert 'images      6 used' in capsys.readouterr().out
+def test_a_part_of_a_bag(tmp_path: Path, starcal: Starcal) -> None:
+    command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
+    # Six may be too few for the gate.
+    assert 'images      6 used' in starcal(*command, '--to', '+20').out
+
+
+def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[str]) -> None:
+    budget = (
+        *calibration().sigma_budget,
+        SigmaPart('stamps', 0.01, 0.02, '5 ms assumed'),
+        SigmaPart('star tracker noise', 0.0, 12.0, 'estimated: 20, 20, 20″ about x, y, z'),
+    )
+    record = dataclasses.replace(calibration(), sigma_budget=budget)
+    print_calibration(record, record.geometry)
+    lines = capsys.readouterr().out.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith('1-sigma of lines'))
+    assert [line.split('  ')[0] for line in lines[first + 1 : first + 4]] == [
+        'total', 'star tracker noise', 'velocity'
+    ]  # fmt: skip
+    assert lines[first + 3].split() == ['velocity', '0.6″', '0.75″']
+    assert 'stamps' not in '\n'.join(lines) and max(map(len, lines)) <= 80
+
+
+def test_a_calibration_without_a_budget_has_no_table_of_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    record = dataclasses.replace(calibration(), sigma_budget=())
+    print_calibration(record, record.geometry)
+    assert '1-sigma of lines' not in capsys.readouterr().out
+
+
+def test_an_alignment_that_the_images_gave_is_not_compared_with_itself(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    record = calibration()
+    moved = record.geometry.star_tracker_from_camera * Rotation.from_rotvec([1e-4, 0.0, 0.0])
+    prior = dataclasses.replace(record.geometry, star_tracker_from_camera_xyzw=moved.as_quat())
+    rows = []
+    for provenance in ({}, {FOUND: 'alignment'}):
+        print_calibration(dataclasses.replace(record, provenance=provenance), prior)
+        (row,) = re.findall('^alignment x .*$', capsys.readouterr().out, re.MULTILINE)
+        rows.append(row.split())
+    assert len(rows[0]) == 6 and rows[1] == rows[0][:4]
+
+
+def test_a_lens_that_the_prior_did_not_have_has_no_changes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With ``lens_model: auto``."""
+    prior = calibration().geometry
+    camera, _ = convert(prior.camera, 'rational_polynomial')
+    record = dataclasses.replace(
+        without_field(),
+        geometry=dataclasses.replace(prior, camera=camera),
+        covariance=np.eye(len(camera.parameters) + 3),
+    )
+    print_calibration(record, prior)
+    said = capsys.readouterr().out
+    assert re.search(r'^k6 +\S+ +held, \S+ *$', said, re.MULTILINE)
+    print_calibration(dataclasses.replace(record, parent_frame=''), prior)  # no alignment either
+    assert 'from prior' in said and 'from prior' not in capsys.readouterr().out

@@ -9,29 +9,14 @@ from pathlib import Path
 
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import Starcal  # type: ignore[import-not-found]
 import yaml
 
-from starcal_ground.cli import main
-from starcal_ground.diagnosis.diagnose import CAUSES
 
-
-@pytest.fixture
-def wrong_params(tmp_path: Path) -> Path:
-    """The parameters of the tiny bag with the conjugate of the attitudes asked for."""
-    path: Path = params_with(tmp_path, attitude_direction='inertial_to_st')
-    return path
-
-
-def test_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:
-    status = main.main(['diagnose', str(TINY), '--params', str(TINY / 'params.yaml'), '--json'])
-    found = json.loads(capsys.readouterr().out)
-    assert (status, found['cause'], found['found'], found['mend']) == (0, 'none', None, [])
-    assert found['cause'] in CAUSES and len(found['evidence']) == 3
-
-
-def test_the_cause_and_its_remedy(wrong_params: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status = main.main(['diagnose', str(TINY), '--params', str(wrong_params)])
-    lines = capsys.readouterr().out.splitlines()
+def test_the_cause_and_its_remedy(tmp_path: Path, starcal: Starcal) -> None:
+    wrong_params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    status, out, _ = starcal('diagnose', TINY, '--params', wrong_params)
+    lines = out.splitlines()
     assert status == 3
     contents, diagnosis = lines[: lines.index('')], lines[lines.index('') + 1 :]
     assert any('10 refused as no_match' in line for line in contents)
@@ -68,21 +53,17 @@ def _of_camera(folder: Path, **numbers: float) -> list[str]:
     ],
 )
 def test_it_says_that_all_fits_only_of_what_calibrate_accepts(
-    given: Callable[[Path], list[str]],
-    cause: str | None,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    given: Callable[[Path], list[str]], cause: str | None, tmp_path: Path, starcal: Starcal
 ) -> None:
     arguments = given(tmp_path)
     if not Path(arguments[0]).exists():
         pytest.skip('the real sky is not here')
-    status = main.main(['diagnose', *arguments, '--json'])
-    found = json.loads(capsys.readouterr().out)
-    calibrated = main.main(['calibrate', *arguments, '-o', str(tmp_path / 'out'), '--no-report'])
-    error = capsys.readouterr().err
-    assert (status == 0) == (calibrated == 0), error
+    status, out, _ = starcal('diagnose', *arguments, '--json')
+    found = json.loads(out)
+    answer = starcal('calibrate', *arguments, '-o', tmp_path / 'out', '--no-report')
+    assert (status == 0) == (answer.status == 0), answer.err
     assert (found['cause'] == 'none') == (status == 0)
     assert cause in (None, found['cause'])
-    if cause is None and calibrated:
+    if cause is None and answer.status:
         assert found['cause'] in ('refused', 'not_linear')
         assert found['cause'] != 'refused' or 'but starcal calibrate refuses' in found['sentence']

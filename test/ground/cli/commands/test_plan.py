@@ -8,8 +8,7 @@ import json
 from pathlib import Path
 
 import pytest
-
-from starcal_ground.cli.main import main
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 _PARAMS = ['--params', str(TINY / 'params.yaml')]
@@ -25,21 +24,19 @@ def allowed(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_the_table_and_the_file_say_the_same(
-    allowed: Path, tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    allowed: Path, tiny_products: Path, tmp_path: Path, starcal: Starcal
 ) -> None:
     output = tmp_path / 'plan.csv'
     observed = [str(tiny_products / 'observations.mcap'), *_PARAMS]
     given = ['--pointings', str(allowed), '--images', '5', '--minimise', 'map']
-    assert main(['plan', *observed, *given, '-o', str(output)]) == 0
-    shown = capsys.readouterr().out.splitlines()
+    shown = starcal('plan', *observed, *given, '-o', output).out.splitlines()
     with output.open() as file:
         rows = list(csv.DictReader(file))
     assert sorted(float(row['ra_deg']) for row in rows) == [10.0, 100.0, 200.0]
     for line, row in zip(shown[2:], rows, strict=False):
         assert float(line.split()[-1]) == pytest.approx(float(row['map_arcsec']), rel=1e-3)
     assert 'no other pointing can be reached after image 3' in shown
-    assert main(['plan', *observed, *given[:2], '--images', '1', '--json']) == 0
-    content = json.loads(capsys.readouterr().out)
+    content = json.loads(starcal('plan', *observed, *given[:2], '--images', 1, '--json').out)
     assert content['name'] == 'line_of_sight_arcsec' and len(content['steps']) == 1
 
 
@@ -53,8 +50,7 @@ def test_the_table_and_the_file_say_the_same(
     ],
 )
 def test_a_file_of_pointings_with_a_mistake(
-    text: str, why: str, allowed: Path, capsys: pytest.CaptureFixture[str]
+    text: str, why: str, allowed: Path, starcal: Starcal
 ) -> None:
     allowed.write_text(text)
-    assert main(['plan', *_BAG, '--pointings', str(allowed)]) == 2
-    assert why in capsys.readouterr().err
+    assert_refused(starcal('plan', *_BAG, '--pointings', allowed), why)

@@ -10,21 +10,17 @@ from pathlib import Path
 import re
 from typing import Any
 
-import cv2
-from mission_files import params_with, TINY, write_encoded  # type: ignore[import-not-found]
+from mission_files import params_with, TINY, write_compressed, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-import yaml
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
-from starcal_ground.cli import main
 from starcal_ground.mission.ingest.deep_catalog import write_deep_catalog
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
-from starcal_ros.formats.bag.typestore import make_message
-from starcal_ros.formats.messages.message_codec import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
@@ -41,14 +37,7 @@ def _as(encoding: str, pixels: Callable[[Any], Any]) -> Write:
 
 
 def _bmp(writer: BagWriter, image: Image) -> None:
-    coded = cv2.imencode('.bmp', (image.pixels >> 4).astype(np.uint8))[1]
-    message = make_message(
-        COMPRESSED_TYPE,
-        header=make_header(image.time_ns, 'camera', make_message),
-        format='bmp',
-        data=np.asarray(coded).ravel(),
-    )
-    writer.write(IMAGE_TOPIC, COMPRESSED_TYPE, image.time_ns, message)
+    write_compressed(writer, IMAGE_TOPIC, image, 'bmp', (image.pixels >> 4).astype(np.uint8))
 
 
 def _raw(writer: BagWriter, image: Image) -> None:
@@ -83,18 +72,8 @@ def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None =
     return path
 
 
-def rescaled_camera(folder: Path, scale: float) -> Path:
-    """Write the prior camera of the tiny bag with another focal length."""
-    content = yaml.safe_load((TINY / 'camera.yaml').read_text())
-    for k in (0, 4):
-        content['camera_matrix']['data'][k] *= scale
-    path = folder / 'camera.yaml'
-    path.write_text(yaml.safe_dump(content))
-    return path
-
-
 def said(
-    capsys: pytest.CaptureFixture[str],
+    starcal: Starcal,
     tmp_path: Path,
     path: Path,
     parameters: Path,
@@ -104,16 +83,13 @@ def said(
     more = {'calibrate': ['-o', str(tmp_path / 'out'), '--no-report']}
     found = {}
     for command in commands:
-        given = [command, str(path), '--params', str(parameters)]
-        status = main.main([*given, *more.get(command, ['--json'])])
-        text = capsys.readouterr()
-        assert status in (2, 3) and 'Traceback' not in text.err
-        if status == 2:
-            found[command] = text.err
-            assert text.err.count('\n') == 1
-        else:
-            content = json.loads(text.out)
+        answer = starcal(command, path, '--params', parameters, *more.get(command, ['--json']))
+        if answer.status == 3:
+            content = json.loads(answer.out)
             found[command] = ' '.join([content['sentence'], *content['mend']])
+        else:
+            assert_refused(answer)
+            found[command] = answer.err
     return found
 
 
@@ -138,36 +114,21 @@ def test_a_mistake_of_the_bag(
     shift_s: float | None,
     words: list[str],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    starcal: Starcal,
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', write, shift_s)
-    for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
+    for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():
         for word in words:
             assert word.lower() in text.lower(), text
 
 
 @pytest.mark.slow
-def test_clocks_that_cannot_be_matched_are_two_clocks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_clocks_that_cannot_be_matched_are_two_clocks(tmp_path: Path, starcal: Starcal) -> None:
     """With the attitudes of one image only no shift can be found."""
     path = bag(tmp_path / 'bag.mcap', _raw, 7200.0, cut=4)
-    for text in said(capsys, tmp_path, path, params_with(tmp_path)).values():
+    for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():
         assert 'two clocks' in text and '2026-05-15 09:19:59.250 UTC' in text
         assert 'stamp_offset_s' in text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('scale', 'command'), [(2.0, 'diagnose'), (0.5, 'calibrate')])
-def test_a_focal_length_of_other_pixels(
-    scale: float, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The search takes a command 7 s."""
-    parameters = params_with(tmp_path, camera_info_url=str(rescaled_camera(tmp_path, scale)))
-    path = bag(tmp_path / 'bag.mcap', _raw)
-    for text in said(capsys, tmp_path, path, parameters, [command]).values():
-        assert ('100 % too long' if scale > 1 else '50 % too short') in text
-        assert 'fx = fy = 180' in text
 
 
 @pytest.mark.parametrize(
@@ -179,15 +140,15 @@ def test_a_focal_length_of_other_pixels(
     ],
 )
 def test_a_mistake_of_the_parameters(
-    changes: dict[str, Any], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    changes: dict[str, Any], words: list[str], tmp_path: Path, starcal: Starcal
 ) -> None:
-    for text in said(capsys, tmp_path, TINY, params_with(tmp_path, **changes)).values():
+    for text in said(starcal, tmp_path, TINY, params_with(tmp_path, **changes)).values():
         for word in words:
             assert word in text
 
 
 def test_an_uncertainty_of_the_mounting_that_is_too_small(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
     """A field of half a degree, off by another one, and stated to be known to 0.01 degrees."""
     given = dataclasses.replace(scenario('narrow'), image_count=6)
@@ -196,72 +157,34 @@ def test_an_uncertainty_of_the_mounting_that_is_too_small(
     write_deep_catalog(tmp_path / 'bag' / 'gaia.csv', tmp_path / 'bag' / 'gaia.npz')
     text = made.params.read_text()
     made.params.write_text(re.sub(r'(alignment_sigma_deg): .*', r'\1: 0.01', text))
-    found = said(capsys, tmp_path, made.bag, made.params, ['calibrate'])['calibrate']
+    found = said(starcal, tmp_path, made.bag, made.params, ['calibrate'])['calibrate']
     assert re.search(r'points 0\.[45]\d+ degrees away .* prior_alignment_sigma_deg: 0\.01', found)
     assert 'Set prior_alignment: [' in found
 
 
-def test_the_remedy_is_named_without_parameters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_remedy_is_named_without_parameters(tmp_path: Path, starcal: Starcal) -> None:
     path = bag(tmp_path / 'bag.mcap', _bmp)
-    assert main.main(['diagnose', str(path)]) == 3
-    assert 'is not a PNG or JPEG' in capsys.readouterr().out.partition('Cannot be calibrated')[2]
+    status, out, _ = starcal('diagnose', path)
+    assert status == 3
+    assert 'is not a PNG or JPEG' in out.partition('Cannot be calibrated')[2]
 
 
 @pytest.mark.parametrize('start', ['2030-01-01T00:00:00', '+5000'])
-def test_no_image_is_chosen(
-    start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '--from', start]
-    assert main.main([*command, '-o', str(tmp_path / 'out')]) == 2
-    error = capsys.readouterr().err
-    assert '2026-05-15 07:20:00.000 UTC to 2026-05-15 07:20:36.000 UTC, +0 to +36 s' in error
+def test_no_image_is_chosen(start: str, tmp_path: Path, starcal: Starcal) -> None:
+    command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '--from', start]
+    span = '2026-05-15 07:20:00.000 UTC to 2026-05-15 07:20:36.000 UTC, +0 to +36 s'
+    assert_refused(starcal(*command, '-o', tmp_path / 'out'), span)
 
 
-def test_a_folder_of_image_files_is_imported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_image_files_is_imported(tmp_path: Path, starcal: Starcal) -> None:
     night = tmp_path / 'night'
     night.mkdir()
     (night / '001.fits').write_bytes(b'SIMPLE  =                    T')
-    for command in (['calibrate', '-o', str(tmp_path / 'out')], ['diagnose']):
+    for command in (['calibrate', '-o', tmp_path / 'out'], ['diagnose']):
         for path in (night, night / '001.fits'):
             # What is stated of a star tracker has to be there.
-            stated = [*command, str(path), '--params', str(TINY / 'params.yaml')]
-            assert main.main(stated) == 2
-            assert 'a bag that has them (starcal import)' in capsys.readouterr().err
+            stated = starcal(*command, path, '--params', TINY / 'params.yaml')
+            assert_refused(stated, 'a bag that has them (starcal import)')
             # By the stars alone: a file that is none is named.
-            assert main.main([*command, str(path)]) == 2
-            error = capsys.readouterr().err
-            assert 'no image can be read; left out: 1 file (001.fits): not' in error
-
-
-def test_a_bag_without_attitudes_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = bag(tmp_path / 'bag.mcap', _raw, None)
-    main.main(['diagnose', str(path), '--params', str(params_with(tmp_path))])
-    text = ' '.join(capsys.readouterr())
-    assert 'attitudes of the star tracker' in text and 'starcal import' in text
-
-
-@pytest.mark.parametrize('top', [False, True])
-def test_parameters_outside_a_section(
-    top: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    values = {'camera_info_url': str(TINY / 'camera.yaml')}
-    path = tmp_path / 'params.yaml'
-    path.write_text(yaml.safe_dump({'ros__parameters': values} if top else values))
-    assert main.main(['diagnose', str(TINY), '--params', str(path)]) == 2
-    wanted = 'write /**: above' if top else 'write /**: and ros__parameters: above'
-    assert wanted in capsys.readouterr().err
-
-
-def test_a_clock_error_that_shows_nothing_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ['simulate', '-o', str(tmp_path / 'bag'), '--scenario', 'tiny']
-    assert main.main([*command, '--clock-error', '-0.5']) == 2
-    assert '--clock-error: -0.5 s changes no result' in capsys.readouterr().err
-    assert not (tmp_path / 'bag').exists()
+            alone = starcal(*command, path)
+            assert_refused(alone, 'no image can be read; left out: 1 file (001.fits): not')

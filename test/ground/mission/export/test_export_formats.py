@@ -26,7 +26,6 @@ from starcal_ground.mission.export.export_formats import export, Format, FORMATS
 from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.spice import SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid, project
-from starcal_ros.camera.projection import nearest_camera
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Calibration, SigmaPart
@@ -199,13 +198,6 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
         subprocess.run(command, cwd=tmp_path, check=True)
 
 
-def test_an_unknown_format_is_refused_with_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r'did you mean opencv'):
-        export(calibration(), 'opencvv', tmp_path, Request())
-    with pytest.raises(OptionError, match=r'--spacecraft-id'):
-        export(calibration(), 'spice', tmp_path, Request())
-
-
 def test_a_format_is_added_by_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,12 +219,6 @@ def test_a_format_is_added_by_a_row(
     with pytest.raises(SystemExit):
         main(['export', '--help'])
     assert 'focal: focal lengths as text' in ' '.join(capsys.readouterr().out.split())
-
-
-def test_a_camera_with_nothing_to_leave_out_stays_as_it_is() -> None:
-    camera = calibration(skew=0.0).geometry.camera
-    found, cost_px = nearest_camera(camera, camera.model, ('skew',))
-    assert cost_px == 0.0 and (found.parameters == camera.parameters).all()
 
 
 @pytest.mark.parametrize('kind', ['ros', 'spice'])

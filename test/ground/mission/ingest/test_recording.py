@@ -174,43 +174,6 @@ def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, f
     assert found in error and error.count('\n') == 1
 
 
-def test_no_input_is_replaced(night: Path, tmp_path: Path, capsys) -> None:
-    aem = write_aem(tmp_path / 'import.json')
-    before = aem.read_bytes()
-    assert run(aem, night / '0.fits', bag=tmp_path) == 2
-    assert 'would be replaced' in capsys.readouterr().err and aem.read_bytes() == before
-
-
-def tree(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
-
-
-@pytest.mark.parametrize(
-    ('bag', 'name'),
-    [
-        ('there', 'metadata.yaml'),
-        ('there', 'params.yaml'),
-        ('there', 'camera.yaml'),
-        ('there', 'tiny_0.mcap'),
-        ('there/bag.mcap', 'bag_params.yaml'),
-        ('there/bag.mcap', 'bag_camera.yaml'),
-        ('there/bag.mcap', 'bag.mcap'),
-    ],
-)
-def test_no_file_of_another_origin_is_replaced(
-    night: Path, tmp_path: Path, capsys, bag: str, name: str
-) -> None:
-    folder = tmp_path / 'there'
-    folder.mkdir()
-    (folder / name).write_bytes(b'of another program')
-    before = tree(folder)
-    aem, more = write_aem(tmp_path / 'a.aem'), ['--camera', TINY / 'camera.yaml']
-    assert run(aem, night / '[0-3].fits', bag=tmp_path / bag, more=more) == 2
-    error = capsys.readouterr().err
-    assert 'was not written by starcal' in error and error.count('\n') == 1
-    assert tree(folder) == before
-
-
 def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
     night: Path, tmp_path: Path, capsys
 ) -> None:

@@ -16,8 +16,8 @@ from xml.sax.saxutils import escape
 import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
-from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.trend_table import Row, Table
 
@@ -155,21 +155,21 @@ def store(server: Store) -> Iterator[Store]:
     gc.collect()
 
 
-def trend(folder: Path, *more: str, root: str = _FLEET) -> int:
-    return main(['trend', root, '-o', str(folder), '--params', str(TINY / 'params.yaml'), *more])
+@pytest.fixture
+def trend(tmp_path: Path, starcal: Starcal) -> Starcal:
+    given = ['-o', tmp_path, '--params', TINY / 'params.yaml']
+    return lambda *more, root=_FLEET: starcal('trend', root, *given, *more)
 
 
 def test_bags_are_fetched_by_workers_and_read_once(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    store: Store, tmp_path: Path, trend: Starcal
 ) -> None:
-    assert trend(tmp_path, '--workers', '2') == 0
-    assert '2 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert '2 new, 0 known, 0 failed' in trend('--workers', 2).out
     assert sum('GET' in line and 'mcap' in line for line in store.requests) == 2
     paths = sorted(row.path for row in Table(tmp_path).rows())
     assert paths == [f'{_FLEET}/{k}' for k in range(2)]
     store.requests.clear()
-    assert trend(tmp_path) == 0
-    assert '0 new, 2 known, 0 failed' in capsys.readouterr().out
+    assert '0 new, 2 known, 0 failed' in trend().out
     assert not any('mcap' in line for line in store.requests)
 
 
@@ -185,12 +185,10 @@ PLACES = {  # faults of requests, root, what the one line names
 
 @pytest.mark.parametrize('case', PLACES)
 def test_a_store_that_cannot_be_listed_is_one_line(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
+    store: Store, trend: Starcal, case: str
 ) -> None:
     store.faults, root, words = PLACES[case]
-    assert trend(tmp_path, root=root) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count('\n') == 1
+    assert_refused(trend(root=root), words)
 
 
 FAULTS = {  # of requests of one bag, and the reason of its row
@@ -205,22 +203,21 @@ FAULTS = {  # of requests of one bag, and the reason of its row
 
 @pytest.mark.parametrize('fault', FAULTS)
 def test_a_bag_that_cannot_be_fetched_fails_and_passes(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: str
+    store: Store, tmp_path: Path, trend: Starcal, fault: str
 ) -> None:
     store.faults, reason = FAULTS[fault]
-    assert trend(tmp_path) == 0
-    out = capsys.readouterr().out
+    status, out, _ = trend()
+    assert status == 0
     assert '1 new, 0 known, 1 failed' in out
     (line,) = [line for line in out.splitlines() if line.startswith('failed: ')]
     assert f'{_FLEET}/0: ' in line and 'cannot be read: ' in line and reason in line
     store.faults = {}
-    assert trend(tmp_path) == 0
-    assert '1 new, 1 known, 0 failed' in capsys.readouterr().out
+    assert '1 new, 1 known, 0 failed' in trend().out
     assert [row.error for row in Table(tmp_path).rows()] == ['', '']
 
 
 def test_a_store_that_falls_silent_ends_the_run(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+    store: Store, tmp_path: Path, trend: Starcal, monkeypatch
 ) -> None:
     """A file that a store does not give, where it gives others, holds up no run."""
     compute = fleet.compute
@@ -231,13 +228,9 @@ def test_a_store_that_falls_silent_ends_the_run(
 
     with monkeypatch.context() as patch:
         patch.setattr(fleet, 'compute', while_silent)
-        assert trend(tmp_path) == 2
-    said = capsys.readouterr().err
-    assert f'{_FLEET}: cannot be read: ReadTimeoutError: ' in said and said.count('\n') == 1
+        assert_refused(trend(), f'{_FLEET}: cannot be read: ReadTimeoutError: ')
     assert Table(tmp_path).rows() == []
     store.faults = {'GET /archive/fleet/0/.*mcap': -1}
-    assert trend(tmp_path) == 0
-    assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
+    assert '1 new, 0 known, 1 failed' in trend().out
     store.faults = {}
-    assert trend(tmp_path) == 0
-    assert '1 new, 1 known, 0 failed' in capsys.readouterr().out
+    assert '1 new, 1 known, 0 failed' in trend().out

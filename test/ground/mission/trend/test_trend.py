@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import json
 import os
@@ -15,12 +16,14 @@ from fleet_tasks import kill_on_poison, kill_once  # type: ignore[import-not-fou
 import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
-from trend_missions import make_mission, trend, write  # type: ignore[import-not-found]
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from trend_missions import make_mission, write  # type: ignore[import-not-found]
 
-from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras, Task
-from starcal_ground.mission.trend.trend_table import COMPUTED, Row, Table
+from starcal_ground.mission.trend.trend_table import COMPUTED, RECORDED, Row, Table
+
+Trend = Callable[..., str]
 
 
 @pytest.fixture
@@ -29,9 +32,20 @@ def mission(tmp_path: Path) -> Path:
     return path
 
 
-def test_only_what_is_new_is_computed(mission: Path, capsys, monkeypatch) -> None:
-    assert trend(mission) == 0
-    out = ' '.join(capsys.readouterr().out.split())
+@pytest.fixture
+def trend(starcal: Starcal) -> Trend:
+    """The output of a trend of a mission that succeeds."""
+
+    def run(mission: Path, *more: object) -> str:
+        answer = starcal('trend', mission, '-o', mission.parent / 'out', *more)
+        assert answer.status == 0, answer
+        return str(answer.words)
+
+    return run
+
+
+def test_only_what_is_new_is_computed(mission: Path, trend: Trend, monkeypatch) -> None:
+    out = trend(mission)
     assert '8 new, 0 known, 0 failed' in out
     assert 'plumb_bob: sound. The active calibration is the newest one. No step or drift' in out
     write(mission / 'later/deep', 100)
@@ -43,41 +57,36 @@ def test_only_what_is_new_is_computed(mission: Path, capsys, monkeypatch) -> Non
         return compute(task)
 
     monkeypatch.setattr(fleet, 'compute', counted)
-    assert trend(mission) == 0
-    assert '1 new, 8 known' in capsys.readouterr().out and len(called) == 1
+    assert '1 new, 8 known' in trend(mission) and len(called) == 1
     page = (mission.parent / 'out/trend.html').read_text()
     assert '9 calibrations' in page
     assert not re.search(r'(src|href)="(?!data:|#)', page)  # it needs no network
 
 
-def test_the_tree_may_move_and_a_copy_has_a_row(mission: Path, capsys) -> None:
-    assert trend(mission) == 0
-    capsys.readouterr()
+def test_the_tree_may_move_and_a_copy_has_a_row(mission: Path, trend: Trend) -> None:
+    trend(mission)
     moved = mission.rename(mission.parent / 'elsewhere')
     shutil.copytree(moved / '1', moved / 'copy')
-    assert trend(moved) == 0
-    assert '1 new, 8 known, 0 failed' in capsys.readouterr().out
+    assert '1 new, 8 known, 0 failed' in trend(moved)
     page = (mission.parent / 'out/trend.html').read_text()
     assert '9 calibrations' in page and '<p class="sub">8 calibrations' in page
 
 
 @pytest.mark.slow
-def test_a_bad_calibration_costs_itself_until_it_is_repaired(mission: Path, capsys) -> None:
+def test_a_bad_calibration_costs_itself_until_it_is_repaired(mission: Path, trend: Trend) -> None:
     (mission / '3/calibration.json').write_text('{"schema": 1}')
-    assert trend(mission) == 0
-    out = capsys.readouterr().out
+    out = trend(mission)
     assert '7 new' in out and '1 failed' in out and 'mission/3/calibration.json' in out
     assert 'Not calibrated' in (mission.parent / 'out/trend.html').read_text()
     write(mission / '3', 3)
-    assert trend(mission) == 0
-    out = capsys.readouterr().out
+    out = trend(mission)
     assert '1 new, 7 known, 0 failed' in out and 'calibration.json' not in out
     assert 'Not calibrated' not in (mission.parent / 'out/trend.html').read_text()
 
 
 @pytest.mark.slow
 def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(
-    few_images: Path, tmp_path: Path, capsys
+    few_images: Path, tmp_path: Path, starcal: Starcal
 ) -> None:
     """The parameters name files that decide as well, and so does the metadata of a bag."""
     shutil.copytree(few_images, tmp_path / 'fleet/one')
@@ -85,38 +94,29 @@ def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(
     camera, params = tmp_path / 'setup/camera.yaml', tmp_path / 'setup/params.yaml'
     good = camera.read_text()
     camera.write_text(re.sub('image_width: [0-9]+', 'image_width: 500', good))
-    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out'), '--params', str(params)]
-    assert main(line) == 3 and '1 failed' in capsys.readouterr().out
-    assert main(line) == 3 and '0 failed' in capsys.readouterr().out
+    line = ['trend', tmp_path / 'fleet', '-o', tmp_path / 'out', '--params', params]
+    for words in ('1 failed', '0 failed'):
+        status, out, _ = starcal(*line)
+        assert status == 3 and words in out
     camera.write_text(good)
-    assert main(line) == 0 and '1 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert '1 new, 0 known, 0 failed' in starcal(*line).out
     camera.write_text('image_width: wide')
-    assert main(line) == 2 and capsys.readouterr().err.count('\n') == 1
+    assert_refused(starcal(*line))
 
 
-def test_refused_calibrations_alone_have_a_page(mission: Path, capsys) -> None:
-    for day in range(3):
-        folder = mission / f'refused/{day}'
-        write(folder, day, child_frame='other_camera', accepted=False, reasons=('bad',))
-    assert trend(mission) == 0
-    page = (mission.parent / 'out/trend.html').read_text()
-    assert 'other_camera' in page and '11 calibrations' in page
-
-
-def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, capsys) -> None:
+def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, trend: Trend) -> None:
     (mission / '3').rename(os.fsdecode(os.fsencode(mission) + b'/caf\xe9'))
     bad = write(Path(os.fsdecode(os.fsencode(mission) + b'/\xff')), 9)
     (bad / 'calibration.json').write_text('')
     moved = mission.rename(os.fsdecode(os.fsencode(mission) + b'\xe9'))
-    assert trend(moved) == 0
-    out = capsys.readouterr().out
+    out = trend(moved)
     assert '8 new, 0 known, 1 failed' in out and '\\udcff/calibration.json' in out
-    assert trend(moved) == 0 and '0 new, 9 known, 0 failed' in capsys.readouterr().out
-    assert trend(moved, '--cameras', '{spacecraft}/*') == 0  # which names a camera
-    assert '8 new, 0 known, 1 failed' in capsys.readouterr().out
+    assert '0 new, 9 known, 0 failed' in trend(moved)
+    named = trend(moved, '--cameras', '{spacecraft}/*')  # which names a camera
+    assert '8 new, 0 known, 1 failed' in named
 
 
-def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:
+def test_what_is_no_file_costs_itself(mission: Path, trend: Trend) -> None:
     made = (('pipe', 'x.mcap'), ('pipe', 'calibration.json'))
     links = ((target, 'x.mcap') for target in ('/dev/zero', '/dev/tty', 'nowhere', 'x.mcap'))
     folders = (('folder', name) for name in ('x.mcap', 'calibration.json'))
@@ -129,45 +129,30 @@ def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:
             path.mkdir()
         else:
             path.symlink_to(kind)
-    assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
+    out = trend(mission, '--params', TINY / 'params.yaml')
     # A folder in place of a file is one without a bag or a calibration in it.
-    assert '8 new, 0 known, 6 failed' in capsys.readouterr().out
+    assert '8 new, 0 known, 6 failed' in out
 
 
 @pytest.mark.slow
 def test_a_link_to_no_file_costs_itself_and_not_its_bag(
-    mission: Path, few_images: Path, capsys
+    mission: Path, few_images: Path, trend: Trend
 ) -> None:
     for k, target in enumerate(('/dev/zero', '/dev/tty', 'nowhere', 'x.mcap')):
         (mission / f'odd{k}').mkdir()
         (mission / f'odd{k}/x.mcap').symlink_to(target)
         (mission / f'odd{k}/metadata.yaml').write_text('')
         shutil.copy(few_images / 'tiny_0.mcap', mission / f'odd{k}/good.mcap')
-    assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
-    assert '12 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert '12 new, 0 known, 0 failed' in trend(mission, '--params', TINY / 'params.yaml')
 
 
-def test_a_number_that_no_page_can_show_is_left_out(mission: Path, capsys) -> None:
+def test_a_number_that_no_page_can_show_is_left_out(mission: Path, trend: Trend) -> None:
     path = mission / '3/calibration.json'
     wild = json.loads(path.read_text())
     wild['covariance'][0][0] = 1e300
     path.write_text(json.dumps(wild))
-    assert trend(mission) == 0
-    assert '8 new, 0 known, 0 failed' in capsys.readouterr().out
+    assert '8 new, 0 known, 0 failed' in trend(mission)
     assert '<b>fx</b>Not tested' not in (mission.parent / 'out/trend.html').read_text()
-
-
-@pytest.mark.slow
-def test_bags_are_calibrated_with_parameters(few_images: Path, tmp_path: Path, capsys) -> None:
-    shutil.copytree(few_images, tmp_path / 'fleet/one')
-    (tmp_path / 'fleet/two').mkdir()
-    (tmp_path / 'fleet/two/poison.mcap').write_bytes(b'\x89MCAP0\r\n' + bytes(1000))
-    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out')]
-    assert main([*line, '--params', str(TINY / 'params.yaml')]) == 0
-    assert '1 new, 0 known, 1 failed' in capsys.readouterr().out
-    good = [row for row in Table(tmp_path / 'out').rows() if not row.error]
-    assert [row.kind for row in good] == [COMPUTED]
-    assert good[0].calibration and good[0].calibration.accepted
 
 
 @pytest.mark.parametrize(
@@ -178,10 +163,8 @@ def test_bags_are_calibrated_with_parameters(few_images: Path, tmp_path: Path, c
         ('trend nowhere://fleet -o {t}', 'nowhere'),
     ],
 )
-def test_bad_input_is_one_line(tmp_path: Path, capsys, line: str, words: str) -> None:
-    assert main(line.format(t=tmp_path).split()) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count('\n') == 1
+def test_bad_input_is_one_line(tmp_path, starcal: Starcal, line: str, words: str) -> None:
+    assert_refused(starcal(*line.format(t=tmp_path).split()), words)
 
 
 @pytest.mark.slow
@@ -211,28 +194,14 @@ def test_a_worker_killed_in_the_run_loses_and_doubles_nothing(mission, monkeypat
 
 @pytest.mark.slow
 def test_a_worker_killed_while_it_starts_is_one_line_and_the_next_run_goes_on(
-    mission, tmp_path, capsys
+    mission: Path, tmp_path: Path, starcal: Starcal, trend: Trend
 ) -> None:
     killing = tmp_path / 'killing.py'
     killing.write_text('import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n')
     with dask.config.set({'distributed.worker.preload': [str(killing)]}):
-        assert trend(mission, '--workers', '1') == 2
-    said = capsys.readouterr().err
-    assert said.count('\n') == 1 and '--workers: 1: Dask ended' in said and 'run again' in said
-    assert trend(mission) == 0 and '8 new, 0 known, 0 failed' in capsys.readouterr().out
-
-
-def test_a_second_run_reads_no_file(mission: Path, monkeypatch, capsys) -> None:
-    shutil.copytree(mission / '1', mission / 'copy')
-    assert trend(mission) == 0
-    capsys.readouterr()
-
-    def unread(*_: object) -> None:
-        raise AssertionError('a file is read')
-
-    monkeypatch.setattr(fleet, 'compute', unread)
-    assert trend(mission) == 0
-    assert '0 new, 9 known, 0 failed' in capsys.readouterr().out
+        answer = starcal('trend', mission, '-o', mission.parent / 'out', '--workers', 1)
+    assert_refused(answer, '--workers: 1: Dask ended', 'run again')
+    assert '8 new, 0 known, 0 failed' in trend(mission)
 
 
 def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(mission: Path) -> None:
@@ -245,26 +214,27 @@ def test_a_file_that_a_worker_cannot_see_is_tried_again_by_the_next_run(mission:
     assert fleet.update(Table(mission.parent), found) == fleet.Done(computed=8)
 
 
-def test_relative_paths_are_made_absolute(mission: Path, monkeypatch) -> None:
+def test_relative_paths_are_made_absolute(mission: Path, starcal: Starcal, monkeypatch) -> None:
     monkeypatch.chdir(mission.parent)
-    assert main(['trend', 'mission', '-o', 'out']) == 0
+    assert starcal('trend', 'mission', '-o', 'out').status == 0
     assert all(Path(row.path).is_absolute() for row in Table('out').rows())
 
 
 @pytest.mark.slow
-def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, capsys) -> None:
+def test_bags_and_products_by_url(few_images: Path, tmp_path: Path, starcal: Starcal) -> None:
     memory = fsspec.filesystem('memory')
     memory.rm('/fleet', recursive=True) if memory.exists('/fleet') else None
     memory.put(str(few_images), '/fleet/bag', recursive=True)
     write(tmp_path / 'one', 3)
     memory.put(str(tmp_path / 'one'), '/fleet/one', recursive=True)
-    line = ['trend', 'memory://fleet', '-o', str(tmp_path)]
-    line += ['--params', str(TINY / 'params.yaml')]
-    assert main(line) == 0
-    assert '2 new, 0 known, 0 failed' in capsys.readouterr().out
-    assert main(line) == 0
-    assert '0 new, 2 known, 0 failed' in capsys.readouterr().out
-    paths = sorted(row.path for row in Table(tmp_path).rows())
-    assert paths == ['memory://fleet/bag', 'memory://fleet/one/calibration.json']
-    assert main([*line[:3], 'memory://fleet/out']) == 2
-    assert 'results are written to a local folder, no URL' in capsys.readouterr().err
+    line = ['trend', 'memory://fleet', '--params', TINY / 'params.yaml', '-o']
+    for words in ('2 new, 0 known, 0 failed', '0 new, 2 known, 0 failed'):
+        status, out, _ = starcal(*line, tmp_path)
+        assert status == 0 and words in out
+    kinds = {row.path: row.kind for row in Table(tmp_path).rows()}
+    assert kinds == {
+        'memory://fleet/bag': COMPUTED,
+        'memory://fleet/one/calibration.json': RECORDED,
+    }
+    no_folder = starcal(*line, 'memory://fleet/out')
+    assert_refused(no_folder, 'results are written to a local folder, no URL')

@@ -41,11 +41,6 @@ def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
     assert verdict.word == {None: 'too few to tell', True: 'sound', False: 'changed'}[expected]
 
 
-def test_steps_are_looked_for_in_many() -> None:
-    rows = [made(day) for day in range(1, 8)]
-    assert verdict_of('camera', rows, []).found == 'No step or drift was found.'
-
-
 @pytest.mark.parametrize(('count', 'words'), [(5, 'Not tested: 5 of the 6'), (6, 'No change')])
 def test_a_series_that_is_too_short_is_not_tested(tmp_path: Path, count: int, words: str) -> None:
     write_page([[made(day) for day in range(1, count + 1)]], 1, tmp_path, 'fleet')

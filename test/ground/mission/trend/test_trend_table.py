@@ -155,11 +155,6 @@ def replaced_by(make: Callable[[Path], object]) -> Callable[[Path], object]:
     return lambda path: (path.rename(path.with_suffix('.old')), make(path))
 
 
-def with_value(key: str, value: str) -> Callable[[Path], object]:
-    """Another value in a calibration."""
-    return changed_by(f"{SET} calibration = json_set(calibration, '$.{key}', {value})")
-
-
 SET = 'update calibration set'
 HOSTILE = {
     'binary': content(lambda _: np.random.default_rng(1).bytes(10_000)),
@@ -175,15 +170,10 @@ HOSTILE = {
     'a trigger': changed_by(
         'create trigger t after insert on calibration begin delete from calibration; end'
     ),
-    'null': with_value('intrinsics.fx', 'null'),
     'no object': changed_by(f"{SET} calibration = '7'"),
     'no JSON': changed_by(f"{SET} calibration = '[1'"),
     'nested': changed_by(f"{SET} calibration = '{'[' * 100}{']' * 100}'"),
-    'too few': with_value('covariance', "json('[[1.0]]')"),
-    'no quaternion': with_value('alignment.quaternion_xyzw', "json('[0, 0, 0, 0]')"),
-    'huge': with_value('intrinsics.fx', '1e300'),
-    'negative size': with_value('image.width', '-1'),
-    'unknown lens': with_value('model', "'fish'"),
+    'unknown lens': changed_by(f"{SET} calibration = json_set(calibration, '$.model', 'fish')"),
     'out of the calendar': changed_by(f'{SET} time_ns = {2**63 - 1}'),
     'long text': changed_by(f"{SET} path = '{'x' * 1_000_000}'"),
     'no text': changed_by(f"{SET} path = cast(x'fffe' as text)"),

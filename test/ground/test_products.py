@@ -11,6 +11,7 @@ from starcal_ground.products import (
     NOT_CALIBRATED_FILE,
     NotCalibrated,
     read_not_calibrated,
+    same_as_one_of,
     write_not_calibrated,
 )
 from starcal_ros.errors import ProductError
@@ -39,3 +40,15 @@ def test_damage_is_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / NOT_CALIBRATED_FILE).write_text(text)
     with pytest.raises(ProductError, match='not a record of a failure: |not JSON: '):
         read_not_calibrated(tmp_path)
+
+
+def test_a_file_is_recognised_by_any_name(tmp_path: Path) -> None:
+    path = tmp_path / 'a'
+    path.write_text('')
+    (tmp_path / 'link').symlink_to(path)
+    (tmp_path / 'hard').hardlink_to(path)
+    (tmp_path / 'other').write_text('')
+    for name in ('a', 'link', 'hard', '../' + tmp_path.name + '/a'):
+        assert same_as_one_of(tmp_path / name, [tmp_path / 'none', path])
+    assert not same_as_one_of(tmp_path / 'other', [path])
+    assert not same_as_one_of(tmp_path / 'none', [tmp_path / 'none'])
