@@ -11,7 +11,7 @@ from pathlib import Path
 import shutil
 import time
 
-from kept_state import activation, collect, full_disk, images, opened  # type: ignore[import-not-found]
+from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_records import assert_same  # type: ignore[import-not-found]
@@ -104,15 +104,6 @@ def test_what_goes_from_the_ensemble_goes_from_the_disk(tmp_path: Path) -> None:
         assert archive.saved(Ensemble(images()[:2])) == 1
     with opened(tmp_path) as archive:  # it has come again after a reset
         assert len(archive.read_ensemble().images) == 1
-
-
-def test_history_is_bounded_by_what_is_handed_over(tmp_path: Path) -> None:
-    history = tuple(activation(event) for event in range(1, 6))
-    with opened(tmp_path) as archive:
-        for k in range(1, 6):
-            archive.keep(Ensemble(), history[max(0, k - 3) : k])
-    with opened(tmp_path) as archive:
-        assert numbers(archive.read_history()) == [(3, 3), (4, 4), (5, 5)]
 
 
 @pytest.mark.slow
@@ -236,20 +227,3 @@ def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / 'file', tmp_path / 'file' / 'below'):
         with pytest.raises(ArchiveError, match=f'state_dir: {path}'):
             Archive(path, 'camera')
-
-
-def test_a_full_disk_is_told_and_tried_again(tmp_path: Path) -> None:
-    whole = Ensemble(images()[:3], {'no_stars': 1})
-    with opened(tmp_path) as archive:
-        archive.keep(Ensemble(images()[:2]), (activation(1),))
-        with full_disk():
-            for history in ((activation(1),), (activation(1), activation(2))):
-                with pytest.raises(ArchiveError, match=r'^state_dir: .*cannot be written'):
-                    archive.keep(whole, history)
-            assert archive.saved(whole) == 2
-        assert not list(tmp_path.glob('*/.*'))
-        archive.keep(whole, (activation(1), activation(2)))
-        assert archive.saved(whole) == 3
-    with opened(tmp_path) as archive:
-        assert len(archive.read_ensemble().images) == 3
-        assert numbers(archive.read_history()) == [(1, 1), (2, 2)]

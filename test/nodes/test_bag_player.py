@@ -30,6 +30,7 @@ from std_msgs.msg import String
 
 from starcal.msg import StarObservations
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.ros import bag_player
 from starcal_ros.formats.bag import typestore
 from starcal_ros.formats.bag.typestore import make_message
@@ -39,6 +40,7 @@ from starcal_ros.formats.messages.message_codec import (
     OBSERVATIONS_TYPE,
     POSE_TYPE,
     quaternion_to_message,
+    stamp_ns,
     TEMPERATURE_TYPE,
 )
 from starcal_ros.formats.messages.record_messages import (
@@ -80,7 +82,7 @@ def bag(tmp_path: Path) -> Path:
 def test_compressed_images_are_paced(
     client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
 ) -> None:
-    """A queue of twenty overflows where they are not."""
+    """A queue of twenty overflows where they are not; each is answered once, in order."""
     found: list[Any] = client.collect(StarObservations, 'observations')
     given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
     start_node('star_observer', ros=(*given, '-r', 'image:=image/compressed'))
@@ -90,6 +92,10 @@ def test_compressed_images_are_paced(
     assert player.wait() == 0, player.said()
     client.until(lambda: len(found) == IMAGES)
     assert [one.refusal for one in found] == [''] * len(found)
+    assert all(len(one.catalog_id) > 50 for one in found)
+    stamps_ns = [stamp_ns(one.header.stamp) for one in found]
+    sent = reader.read_raw([bag], ['/image/compressed'])
+    assert stamps_ns == [raw.log_time_ns for raw in sent]
     assert 'playing anyway' not in player.said()
 
 

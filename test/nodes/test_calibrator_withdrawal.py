@@ -77,6 +77,16 @@ def test_consumers_return_to_the_prior(
         'calibrator', ros=(*parameters(tiny_bag, place, *values), '-r', '__node:=heir')
     )
     client.until_value('calibration', 'prior')
+    client.until(lambda: 'images' in client.health('heir')[2])
+    level, text, values = client.health('heir')
+    withheld = str(int(bool(why)))
+    assert (values['active'], values['state_refused_calibrations']) == ('none', withheld)
+    if why:
+        assert level == b'\x01' and text.startswith(f'{why} refuses it now: largest change')
+        assert 'max_change_px' in text and text in heir.said()
+        assert values['last_gate'] == f'refused: {text}'
+    where = f'{tmp_path}/{folder}' if folder else 'not given'
+    assert f'state_dir {where}; no calibration active; 0 images' in heir.said()
     client.until(lambda: client.health()[0] == b'\x01')
     assert 'the prior predicts the stars' in client.health()[1] and why in client.health()[1]
     client.until(lambda: monitor.received.active is None)

@@ -99,6 +99,7 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
     first = client.publisher(QuaternionStamped, '/attitude')
     other = client.publisher(QuaternionStamped, '/other/attitude')
     shown = client.publisher(Image, '/image', 10)
+    client.until_listened()
     sent = 0
 
     def send(publisher: Any, *messages: Any) -> None:

@@ -92,6 +92,47 @@ ACTIVATIONS = {
     # The limits change, and with them what is active.
     'withheld': ('activate a 0.25; limit 0.01; open A; rollback', 'no calibration is active', ''),
     'relaxed': ('activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 0.5', 'act', 'b'),
+    'withheld with another mounting': (
+        'activate a; turn 90; open A; rollback',
+        'no calibration is active',
+        '',
+    ),
+    'relaxed again': (
+        'activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 2',
+        'refused by the gate: largest change',
+        'a',
+    ),
+    'withheld in memory': (
+        'open -; activate a 0.25; limit 0.01; open -; rollback',
+        'no calibration is active',
+        '',
+    ),
+    'relaxed again in memory': (
+        'open -; activate a 0.25; limit .01; open -; limit 0.3; open -; solve b 2; open A',
+        'refused by the gate: largest change',
+        'a',
+    ),
+    'during a solve': (
+        'activate a; limit 0.2; solve b 0 while open A',
+        'not activated: the node was cleaned up meanwhile',
+        'a',
+    ),
+    'during a solve in memory': (
+        'open -; activate a; limit 0.2; solve b 0 while open -; open A',
+        'not activated: the node was cleaned up meanwhile',
+        'a',
+    ),
+    # The answer has the requirements.
+    'met': (
+        'require line_of_sight=1000arcsec@98%; open A; solve a',
+        'activated: .* arcsec, at most 1000 arcsec required: met',
+        'a',
+    ),
+    'missed': (
+        'require f=1e-6px; open A; solve a',
+        r'over the limit of 0.000001 px \(requirements\); missed by',
+        '',
+    ),
     # A clock that no stamp holds: nothing is written that its reader sets aside.
     'before 1970': ('activate a; clock -1; solve b', 'not activated, nobody could read', 'a'),
     'after 2038': (
@@ -119,6 +160,8 @@ def test_what_is_activated_passes_the_gate_of_that_moment(
     calibrators.run('limit 0.3; open A')
     state = calibrators.run(steps)
     answer = calibrators.answer
+    times_ns = [record.calibration.active_since_ns for record in state._history]
+    assert times_ns == sorted(times_ns)
     assert re.search(words, answer.message), answer.message
     for _ in range(2):
         found = state.active
@@ -126,3 +169,13 @@ def test_what_is_activated_passes_the_gate_of_that_moment(
         calibrators.run('kill')
         state = calibrators.run('open A')
         assert state.damage == ()
+
+
+def test_history_is_bounded(calibrators: Calibrators, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('starcal_ros.ros.state.HISTORY', 2)
+    calibrators.run('open A; activate a; activate b; activate c')
+    assert len(list((calibrators.disk / 'A' / 'calibrations').iterdir())) == 2
+    state = calibrators.run('rollback; rollback')
+    gone = 'there is no calibration before the active one on record'
+    assert calibrators.answer.message == gone
+    assert state.active is not None and state.active.weakest_direction == 'b'

@@ -5,12 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import dataclasses
-import hashlib
 import json
 import os
 from pathlib import Path
-import shutil
 from typing import Any
 
 from attacks import drawn, spoilt_text  # type: ignore[import-not-found]
@@ -40,8 +37,7 @@ from starcal_ros.formats.products.product_files import (
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODES
-from starcal_ros.records import Activation, Calibration, Ensemble, Image
-from starcal_ros.ros.archive import Archive
+from starcal_ros.records import Calibration, Ensemble, Image
 
 SCENARIO = scenario('tiny')
 pytestmark = pytest.mark.slow
@@ -135,41 +131,6 @@ def test_calibration_files(calibration: Calibration, tmp_path: Path) -> None:
             line_of_sight_table(camera, back.map_covariance, pixel_grid(camera, 3, 3))
 
     spoils(path.read_text(), path, read)
-
-
-def test_state_files_with_new_checksums(calibration: Calibration, tmp_path: Path) -> None:
-    """Other records are not read in place of those of the folder."""
-    sound, copy = tmp_path / 'sound', tmp_path / 'copy'
-    first = Activation(1, 0, dataclasses.replace(calibration, number=1))
-    ensemble = Ensemble(true_observations(SCENARIO).images[:1], {'no_match': 3})
-    with contextlib.closing(Archive(sound, 'camera')) as archive:
-        archive.keep(ensemble, (first,))
-
-    for file in sorted(sound.rglob('*.json')):
-
-        def read(path: Path, file: Path = file) -> None:
-            shutil.rmtree(copy, ignore_errors=True)
-            shutil.copytree(sound, copy)
-            (copy / file.relative_to(sound)).write_bytes(sealed_again(path.read_bytes()))
-            with contextlib.closing(Archive(copy, 'camera')) as archive:
-                images, history = archive.read_ensemble(), archive.read_history()
-                assert len(images.images) == 1 and len(history) <= 1
-                archive.keep(images, history)
-                assert all('\n' not in text for text in archive.damage)
-
-        spoils(file.read_text(), tmp_path / 'content', read, 30)
-
-
-def sealed_again(content: bytes) -> bytes:
-    """The content with its checksum made right, where it is a JSON object."""
-    try:
-        fields = json.loads(content)
-        del fields['sha256']
-        text = json.dumps(fields, sort_keys=True, separators=(',', ':'))
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        return json.dumps({**fields, 'sha256': digest}).encode()
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return content
 
 
 @pytest.mark.nodes
