@@ -92,32 +92,6 @@ def test_every_field_of_a_record_has_its_field_in_the_message() -> None:
     assert len(definitions) <= 15
 
 
-@pytest.mark.parametrize(
-    ('record', 'field', 'text'),
-    [
-        ('maps', 'stars', 'stars: 1 numbers, not 2 x 3'),
-        ('maps', 'line_of_sight_sigma_arcsec', 'sigma_arcsec: 1 numbers, not 4 x 3'),
-        ('maps', 'shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
-        ('correlation', 'matrix', 'matrix: 1 numbers, not 2 x 2'),
-        ('field', 'coefficients', 'coefficients: 1 numbers, not 2 x 6'),
-        ('field', 'covariance_factor', 'covariance_factor: 1 numbers, not 25 x 2'),
-        ('field', 'remainder', 'remainder: 1 numbers, not 78'),
-        ('temperature', 'focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
-        (
-            'temperature',
-            'alignment_rate_rad_per_degc_sigma',
-            'alignment_rate_rad_per_degc_sigma: 1 numbers, not 3',
-        ),
-    ],
-)
-def test_numbers_of_another_count_are_refused(record: str, field: str, text: str) -> None:
-    message = calibration_to_message(calibration(), plain)
-    held = getattr(message, record)[0]
-    setattr(held, field, np.zeros(1, getattr(held, field).dtype))
-    with pytest.raises(ValueError, match=text):
-        calibration_from_message(message)
-
-
 def test_a_rate_has_three_numbers_or_none() -> None:
     message = calibration_to_message(calibration(), plain)
     message.temperature[0].alignment_rate_rad_per_degc = np.zeros(1)
