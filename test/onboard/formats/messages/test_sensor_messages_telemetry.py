@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 
-from starcal_ground.bag_writer import (
-    attitude_to_message,
-    temperature_to_message,
-    velocity_to_message,
-)
+from starcal_ground.bag_writer import temperature_to_message, velocity_to_message
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
@@ -33,13 +29,8 @@ from starcal_ros.formats.messages.sensor_messages import (
 )
 
 
-def test_attitude_and_velocity_round_trip() -> None:
+def test_velocity_round_trip() -> None:
     """Components come back in their own places."""
-    message = attitude_to_message(5, np.array([0.1, 0.2, 0.3, 0.4]), 'icrf', plain)
-    assert (message.quaternion.w, message.header.frame_id) == (0.4, 'icrf')
-    time_ns, xyzw = attitude_from_message(message)
-    assert time_ns == 5
-    np.testing.assert_array_equal(xyzw, [0.1, 0.2, 0.3, 0.4])
     message = velocity_to_message(6, np.array([1.0, -2.0, 3e4]), 'icrf', plain)
     time_ns, velocity = velocity_from_message(message)
     assert time_ns == 6
