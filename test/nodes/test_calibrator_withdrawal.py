@@ -13,16 +13,13 @@ import pytest
 if TYPE_CHECKING:
     from conftest import Client, StartNode
 
-    from starcal_ros.records import Ensemble
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from geometry_msgs.msg import TransformStamped
-from node_inputs import IMAGES, in_this_process, parameters, REMAPS  # type: ignore[import-not-found]
-from rclpy.parameter import Parameter
+from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 from sensor_msgs.msg import CameraInfo, Image
-from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration
 from starcal_ground.bags import reader
@@ -31,7 +28,6 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_ca
 from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
-from starcal_ros.ros.calibrator import Calibrator
 
 pytestmark = pytest.mark.nodes
 
@@ -113,35 +109,3 @@ def test_consumers_return_to_the_prior(
     start_node('calibrator', ros=(*ros, '-r', '__node:=third'))
     client.until_value('calibration', '1')
     client.until(lambda: 'the prior predicts the stars' not in client.health()[1])
-
-
-def test_diagnostics_are_of_the_limits_of_today(
-    client: Client, tiny_bag: Path, tiny_observations: Ensemble
-) -> None:
-    """Cleaned up, configured with a tighter limit, and back, in one process."""
-    with in_this_process(Calibrator, tiny_bag) as node:
-        for image in tiny_observations.images:
-            node._state.add(image)
-        assert node._on_calibrate(None, Trigger.Response()).success
-        latched: list[Any] = client.latched(CameraInfo, 'camera_info')
-
-        def configure(max_change_px: float) -> dict[str, object]:
-            node.trigger_deactivate()
-            node.trigger_cleanup()
-            parameter = Parameter('max_change_px', Parameter.Type.DOUBLE, max_change_px)
-            assert node.set_parameters([parameter])[0].successful
-            node.trigger_configure()
-            node.trigger_activate()
-            return dict(node.health()[2])
-
-        strict = configure(1e-6)
-        assert strict['active'] == 'none' and str(strict['last_gate']).startswith('refused: calib')
-        client.until(lambda: latched and latched[-1].k[0] == 0)
-        assert not node._on_calibrate(None, Trigger.Response()).success
-        relaxed = configure(10.0)
-        assert (relaxed['active'], relaxed['last_gate'], relaxed['last_answer']) == (
-            1,
-            'accepted',
-            '',
-        )
-        client.until(lambda: latched[-1].k[0] > 0)

@@ -340,19 +340,6 @@ def test_make_knows_the_target(target: str) -> None:
     assert run('make', '--dry-run', target).returncode == 0
 
 
-def test_scripts_that_are_named_exist() -> None:
-    lines = [
-        line.words
-        for line in (*lines_of('python'), *lines_of('python3'))
-        if line.words[1:2] == ('-m',)
-    ]
-    assert lines
-    for words in lines:
-        module = ROOT / words[2].replace('.', '/')
-        ours = module.with_suffix('.py').is_file() or (module / '__main__.py').is_file()
-        assert ours or words[2] in ('pytest', 'cProfile', 'pip'), words
-
-
 def interface(directions: str) -> dict[str, str]:
     """Types of topics or services by name, from the tables of the interface document."""
     text = (ROOT / 'docs' / 'icd.md').read_text()
