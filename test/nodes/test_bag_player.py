@@ -178,10 +178,11 @@ def test_messages_of_another_version_are_played_as_those_of_this_one(
             for k in range(3):
                 writer.add_message(channel, k, bytes(data), publish_time=k)
         writer.finish()
-    found: list[Any] = client.collect(StarObservations, '/older')
+    found, other = (client.collect(StarObservations, topic) for topic in ('/older', '/other'))
     player = start_node('bag_player', ros=('-p', f'bag:={bag}'))
     assert player.wait() == 0, player.said()
     client.until(lambda: len(found) == 3)
+    assert other == []
     for one in found:
         assert_same(observations_from_message(one), replace(observations(), detail=''))
     assert (
