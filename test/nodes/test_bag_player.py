@@ -11,17 +11,10 @@ import time
 from typing import Any, TYPE_CHECKING
 
 import cv2
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import PoseStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
 from node_inputs import parameters  # type: ignore[import-not-found]
+import pytest
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from sample_records import assert_same, observations  # type: ignore[import-not-found]
@@ -47,6 +40,9 @@ from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

@@ -9,16 +9,9 @@ import threading
 from types import SimpleNamespace
 from typing import Any, TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import TransformStamped
 from node_inputs import in_this_process  # type: ignore[import-not-found]
+import pytest
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
@@ -33,6 +26,9 @@ from starcal_ros.records import Ensemble
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.state import Answer
+
+if TYPE_CHECKING:
+    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 

@@ -11,21 +11,17 @@ import subprocess
 import sys
 from typing import Any, TYPE_CHECKING
 
+from node_inputs import parameters  # type: ignore[import-not-found]
 import pytest
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
+from std_srvs.srv import Trigger
 
 if TYPE_CHECKING:
     from conftest import Client, StartNode
 
     from starcal_ros.records import Ensemble
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
-from node_inputs import parameters  # type: ignore[import-not-found]
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo
-from sensor_msgs.srv import SetCameraInfo
-from std_srvs.srv import Trigger
 
 pytestmark = pytest.mark.nodes
 

@@ -8,17 +8,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import TransformStamped
 from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import pytest
 from sensor_msgs.msg import CameraInfo, Image
 
 from starcal.msg import Calibration
@@ -28,6 +20,9 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_ca
 from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

@@ -10,16 +10,9 @@ from pathlib import Path
 import re
 from typing import TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import QuaternionStamped, Twist, TwistStamped
 from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import pytest
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
@@ -30,6 +23,9 @@ from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Ensemble, IMAGE_REFUSALS
 from starcal_ros.ros.node import make_message
 from starcal_ros.sky.astrometry import earth_velocity_c
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

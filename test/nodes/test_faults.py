@@ -9,23 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-import numpy as np
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from diagnostic_msgs.msg import DiagnosticArray
 from node_inputs import BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 
 from starcal.msg import EnsembleStatus
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ros.formats.messages.message_codec import stamp_ns
 from starcal_ros.records import Image
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 ROOT = Path(__file__).parents[2]
 

@@ -13,15 +13,6 @@ from typing import Any, TYPE_CHECKING
 
 from attacks import BAG, calibration, many, observations  # type: ignore[import-not-found]
 import cv2
-import numpy as np
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, NodeProcess, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from flight import Flight  # type: ignore[import-not-found]
 from geometry_msgs.msg import QuaternionStamped, TransformStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -29,6 +20,8 @@ from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: 
 from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
 from node_campaign import Campaign  # type: ignore[import-not-found]
 from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -46,6 +39,9 @@ from starcal_ros.formats.messages.record_messages import (
 )
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, NodeProcess, StartNode
 
 pytestmark = [pytest.mark.nodes, pytest.mark.slow]
 

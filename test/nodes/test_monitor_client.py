@@ -10,17 +10,10 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-import pytest
-from sample_records import calibration, observations, status  # type: ignore[import-not-found]
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sample_records import calibration, observations, status  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.ros.monitor_client import Monitor
@@ -30,6 +23,9 @@ from starcal_ros.formats.messages.record_messages import (
     status_to_message,
 )
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

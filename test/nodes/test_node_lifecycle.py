@@ -13,22 +13,18 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from lifecycle_msgs.msg import Transition
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager, NO_TRANSITION  # type: ignore[import-not-found]
 from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
+import pytest
 import rclpy
 from std_msgs.msg import Empty
 
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import Executor
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

@@ -12,27 +12,17 @@ import subprocess
 import sys
 from typing import Any, TYPE_CHECKING
 
-import numpy as np
-import pytest
-import yaml
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-    from starcal_ros.records import Calibration as CalibrationRecord
-    from starcal_ros.records import Ensemble
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import QuaternionStamped
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, Imu, Temperature
 from std_srvs.srv import Trigger
+import yaml
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
@@ -64,6 +54,12 @@ from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.records import refused_image
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+    from starcal_ros.records import Calibration as CalibrationRecord
+    from starcal_ros.records import Ensemble
 
 pytestmark = pytest.mark.nodes
 
@@ -228,6 +224,7 @@ def test_gate_refusal_and_force(
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_change_px:=1e-6'))
     client.fill(tiny_observations.images)
     found = client.latched(Calibration, 'calibration')
+    client.until(lambda: found)
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert not answer.success and answer.message.startswith('refused by the gate')
     solved = client.call(Calibrate, '/calibrator/solve')
@@ -338,7 +335,6 @@ def test_camera_info_per_image(
     client.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
     assert [info.header for info in infos] == [headers[0], *headers[2:]]
-    assert lossy[0].header in headers
     expected = camera_info_to_message(active, make_message)
     for info in infos:
         expected.header = info.header
@@ -349,6 +345,9 @@ def test_camera_info_per_image(
     header = show(8)
     client.until(lambda: len(infos) == 4)
     assert infos[-1].header == header
+    # Best effort may lose some of them, also all of a few.
+    client.until(lambda: lossy or not show(9))
+    assert lossy[0].k[0] > 0
 
 
 def test_calibrator_collects_while_it_solves(

@@ -6,22 +6,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import pytest
-import yaml
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import QuaternionStamped
 from node_inputs import ATTITUDES, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 from sensor_msgs.msg import Image
+import yaml
 
 from starcal.msg import SetupDiagnosis
 from starcal_ground.bags import reader
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

@@ -6,20 +6,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-import pytest
-from scipy.spatial.transform import Rotation
-import yaml
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import QuaternionStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
+import pytest
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
+import yaml
 
 from starcal.msg import Calibration, StarObservations
 from starcal_ground.bag_writer import attitude_to_message, BagWriter, image_to_message
@@ -27,6 +20,9 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND as SECOND_NS
 from starcal_ros.formats.messages.record_messages import calibration_from_message
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
