@@ -40,7 +40,7 @@ def bag_messages(folder: Path) -> Iterator[Any]:
         # The velocity of the observer is not in the contract of this client.
         wanted = [one for one in reader.connections if 'Twist' not in one.msgtype]
         for connection, _, data in reader.messages(wanted):
-            found = reader.deserialize(data, connection.msgtype)
+            found: Any = reader.deserialize(data, connection.msgtype)
             made: Any
             if connection.msgtype == 'sensor_msgs/msg/Image':
                 made = Image(height=found.height, width=found.width, encoding=found.encoding)

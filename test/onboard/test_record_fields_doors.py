@@ -1,5 +1,10 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Each door with wrong values in each of its fields: refused in one line that names the field."""
+"""
+Each door with wrong values in each of its fields: refused in one line that names the field.
+
+The values are drawn from the descriptions of the fields; that these are right is tested beside
+each door, by values that are written out.
+"""
 
 from __future__ import annotations
 
@@ -12,27 +17,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sample_records import calibration, observations, plain  # type: ignore[import-not-found]
+from sample_records import calibration, plain  # type: ignore[import-not-found]
 
 from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     calibration_to_message,
-    checked_observations,
-    observations_to_message,
 )
 from starcal_ros.formats.products.product_files import calibration_from_content, calibration_text
 from starcal_ros.options import from_mapping, option_fields
 from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 from starcal_ros.record_fields import fields_of, FieldType
-from starcal_ros.records import Calibration, StarObservations
-
-Wrong = Iterator[tuple[Any, str]]
+from starcal_ros.records import Calibration
 
 
-def wrong_values(kind: FieldType, sound: Any) -> Wrong:
+def wrong_values(kind: FieldType, sound: Any) -> Iterator[tuple[Any, str]]:
     """Plain values that a field must not have, each with words of its refusal."""
+    low, high = kind.low, kind.high
     if kind.kind is str:
         yield 3, 'is not a text'
     elif kind.kind is bool:
@@ -43,12 +45,6 @@ def wrong_values(kind: FieldType, sound: Any) -> Wrong:
         yield '1', 'is not a whole number' if kind.kind is int else 'is not a number'
     else:
         yield 3, 'is not a list'
-    yield from wrong_in_messages(kind, sound)
-
-
-def wrong_in_messages(kind: FieldType, sound: Any) -> Wrong:
-    """Those of the type of the field, which a message can hold."""
-    low, high = kind.low, kind.high
     if kind.kind is str and kind.choices:
         yield 'magic', 'is not one of'
     elif kind.kind is str and kind.most_characters:
@@ -56,8 +52,7 @@ def wrong_in_messages(kind: FieldType, sound: Any) -> Wrong:
     elif kind.kind is float and (kind.is_finite or low is not None):
         yield math.inf, 'is not a finite number'
     if kind.kind in (int, float) and low is not None and high is not None:
-        # -1 stands for a velocity that is exact.
-        outside = [low - 2] * (low > -1e300) + [high + 2] * (high < 1e300)
+        outside = [low - 1] * (low > -1e300) + [high + 1] * (high < 1e300)
         yield from ((value, f'is not {kind.allowed}') for value in outside)
     if isinstance(sound, list) and isinstance(kind.dimensions[0], int):
         yield sound[:-1], 'numbers, not'
@@ -126,37 +121,3 @@ def test_arrays_in_the_message_of_a_calibration() -> None:
             tried.add(name)
             setattr(held, name, sound)
     assert tried >= {'stars', 'matrix', 'coefficients', 'covariance'}, tried
-
-
-def test_the_message_of_observations() -> None:
-    """A refusal with the name of the field, and without stars."""
-    message, tried = observations_to_message(observations(), 'cam', plain), set()
-    for kind in fields_of(StarObservations).values():
-        field = kind.in_messages
-        if not hasattr(message, field):
-            continue
-        sound = getattr(message, field)
-        is_array = isinstance(sound, np.ndarray)
-        cases = wrong_arrays(kind, sound) if is_array else wrong_in_messages(kind, sound)
-        for wrong, words in cases:
-            setattr(message, field, wrong)
-            record = checked_observations(message)
-            assert (record.refusal, len(record)) == ('bad_observations', 0), (field, wrong)
-            assert re.match(rf'{field}.*{words}', record.detail), record.detail
-            assert len(record.detail) <= 500
-            tried.add(field)
-        setattr(message, field, sound)
-    assert tried >= {'measured_px', 'direction_icrf', 'snr', 'background_dn', 'refusal'}, tried
-
-
-def wrong_arrays(kind: FieldType, sound: np.ndarray) -> Wrong:
-    """Flat arrays that a field of a message must not have, each with words of its refusal."""
-    if len(kind.dimensions) > 1 or isinstance(kind.dimensions[0], int):
-        yield sound[:-1], 'numbers, not'
-    if sound.dtype.kind == 'f' and (kind.is_finite or kind.low is not None):
-        yield np.r_[np.inf, sound[1:]].astype(sound.dtype), 'inf is not a finite number'
-    if kind.is_finite:
-        yield np.r_[np.nan, sound[1:]].astype(sound.dtype), 'nan is not a finite number'
-    if kind.unit_tolerance is not None:
-        for factor in (0.5, 1e300):
-            yield factor * sound, 'length .* is not 1'

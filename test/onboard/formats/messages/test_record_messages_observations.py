@@ -44,6 +44,16 @@ def first(column: str, value: float) -> Any:
         ('header.stamp.nanosec', 2**32 - 1, ''),  # a carry that the stamp can hold
         ('attitude.w', 0.0, 'attitude: length 0.714143 is not 1'),
         ('temperature_degc', 1e300, r'temperature_degc: 1e\+300 is not within -273.15 to 1000'),
+        ('velocity_sigma_m_s', -2.0, 'velocity_sigma_m_s: -2.0 is not at least 0'),
+        ('velocity_sigma_m_s', np.inf, 'velocity_sigma_m_s: inf is not a finite number'),
+        (
+            'star_tracker_rate_rad_s',
+            np.array([0, 0, np.inf]),
+            r'star_tracker_rate_rad_s\[2\]: inf',
+        ),
+        ('attitude_gap_s', -1.0, 'attitude_gap_s: -1.0 is not at least 0'),
+        ('background_dn', np.inf, 'background_dn: inf is not a finite number'),
+        ('width', 2**32 - 1, 'width: 4294967295 is not within 0 to 65536'),
         ('refusal', 'x' * 10**6, "refusal: 'x{50,60}[.]{3} is not one of bad_encoding, "),
         ('catalog_digest', 'x' * 10**6, "catalog_digest: 'x.* is not a text of at most 100 char"),
         # Columns of the stars, and of the refused ones.
@@ -52,6 +62,14 @@ def first(column: str, value: float) -> Any:
         ('covariance_px2', np.zeros(15), 'covariance_px2: not positive definite'),
         ('covariance_px2', first('covariance_px2', 1e300), 'covariance_px2: '),
         ('covariance_px2', first('covariance_px2', 1e-300), 'covariance_px2: '),
+        ('measured_px', np.full(10, np.nan), r'measured_px\[0\]\[0\]: nan is not a finite number'),
+        (
+            'direction_icrf',
+            first('direction_icrf', 0.0),
+            r'direction_icrf\[0\]: length 0.785404 is not 1',
+        ),
+        ('snr', first('snr', np.inf), r'snr\[0\]: inf is not a finite number'),
+        ('refused_star_px', np.full(8, np.inf), r'refused_star_px\[0\]\[0\]: inf is not a finite'),
         ('refused_star_counts', np.zeros(1, np.uint32), '.*: 2 reasons but 1 counts'),
         ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is not one of 2 reasons'),
     ],
