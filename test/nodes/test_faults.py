@@ -96,23 +96,6 @@ def test_the_policies_name_what_the_nodes_have(
         assert of_graph(client, name) == allowed, name
 
 
-@pytest.mark.parametrize(
-    ('node', 'option', 'name'),
-    [
-        ('star_observer', 'more_star_trackers', 'FRAME/attitude'),
-        ('star_observer', 'use_sim_time', '/clock'),
-        ('calibrator', 'set_camera_info_service', 'that service'),
-        ('calibrator', 'use_sim_time', '/clock'),
-        ('bag_player', 'use_sim_time', '/clock'),
-        ('bag_player', 'clock', '/clock'),
-    ],
-)
-def test_policies_name_what_an_option_adds(node: str, option: str, name: str) -> None:
-    text = (ROOT / 'config' / 'security' / f'{node}.policy.xml').read_text()
-    comment = text.partition('<!--')[2].partition('-->')[0]
-    assert option in comment and name in comment
-
-
 WAIT = ('-p', 'wait_for_subscribers_s:=100.0')
 
 

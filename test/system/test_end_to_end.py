@@ -178,34 +178,10 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
             assert abs(row - 5) <= 2 and abs(column - 5) <= 2
 
 
-def test_eight_bit_images_give_the_truth(tmp_path: Path) -> None:
-    scenario = synthetic.scenario('tiny', 3)
-    detector = dataclasses.replace(
-        scenario.detector, bits=8, electrons_per_dn=16.0, offset_dn=10.0
-    )
-    scenario = dataclasses.replace(scenario, detector=detector)
-    made = simulated_bag.write_bag(scenario, tmp_path / 'bag')
-    calibration = calibrated(made, tmp_path / 'out')
-    assert_close_to_truth(calibration, read_truth(made.truth))
-
-
 def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
     scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
     made = simulated_bag.write_bag(scenario, tmp_path / 'bag.mcap')
     calibration = calibrated(made, tmp_path / 'out')
-    assert_close_to_truth(calibration, read_truth(made.truth))
-
-
-def test_a_launch_shift_of_a_degree_is_found(tmp_path: Path) -> None:
-    scenario = synthetic.scenario('tiny', 4)
-    mounting = Rotation.from_quat(scenario.prior.star_tracker_from_camera_xyzw)
-    shift = Rotation.from_rotvec(np.radians([0.8, -0.7, 0.6]))  # 1.2 degrees; 1.5 is the limit
-    prior = dataclasses.replace(
-        scenario.prior, star_tracker_from_camera_xyzw=(mounting * shift).as_quat()
-    )
-    made = simulated_bag.write_bag(dataclasses.replace(scenario, prior=prior), tmp_path / 'bag')
-    calibration = calibrated(made, tmp_path / 'out')
-    assert calibration.images_used == 10
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 

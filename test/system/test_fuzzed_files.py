@@ -8,7 +8,6 @@ import contextlib
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 from attacks import drawn, spoilt_text  # type: ignore[import-not-found]
 from hypothesis import given
@@ -27,7 +26,6 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.bag.typestore import observations_bag
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
@@ -37,7 +35,7 @@ from starcal_ros.formats.products.product_files import (
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODES
-from starcal_ros.records import Calibration, Ensemble, Image
+from starcal_ros.records import Calibration, Image
 
 SCENARIO = scenario('tiny')
 pytestmark = pytest.mark.slow
@@ -131,37 +129,6 @@ def test_calibration_files(calibration: Calibration, tmp_path: Path) -> None:
             line_of_sight_table(camera, back.map_covariance, pixel_grid(camera, 3, 3))
 
     spoils(path.read_text(), path, read)
-
-
-@pytest.mark.nodes
-def test_observations() -> None:
-    """Mutants of a message are refused, or saved, read again and counted."""
-    pytest.importorskip('rclpy')
-    from mutants import mutants  # type: ignore[import-not-found]
-
-    from starcal_ros.formats.messages.record_messages import (
-        checked_observations,
-        observations_to_message,
-    )
-    from starcal_ros.ros.node import make_message
-
-    images = true_observations(SCENARIO).images
-    brightest = images[0].select(np.argsort(np.argsort(-images[0].flux_dn)) < 20)
-    setup = load_setup({}, SCENARIO.prior)
-    answers = {'refused': 0, 'saved': 0}
-
-    @drawn(60)
-    @given(mutants(observations_to_message(brightest, 'camera', make_message)))
-    def mutate(message: Any) -> None:
-        with read_or_refused():
-            record = checked_observations(message)
-            observations_bag('/observations', record, 'camera')
-            ensemble = solve.add_to_ensemble(Ensemble(images[1:4]), record, setup)
-            assert not np.isnan(solve.ensemble_status(ensemble, setup).predicted_sigma).any()
-            answers['refused' if record.refusal else 'saved'] += 1
-
-    mutate()
-    assert answers['saved'] and answers['refused']
 
 
 def test_pipes_in_a_folder_are_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
