@@ -81,8 +81,10 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         monitor.destroy_node()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('after', ['start', 'view', 'both'])
+@pytest.mark.parametrize(
+    ('number', 'after'),
+    [(signal.SIGTERM, 'start'), (signal.SIGINT, 'view'), (signal.SIGINT, 'both')],
+)
 def test_a_signal_ends_it_without_a_traceback(
     client: Client, number: signal.Signals, after: str
 ) -> None:
@@ -117,8 +119,11 @@ def until_ros(pid: int) -> None:
     raise AssertionError('the process does not handle SIGTERM')
 
 
-@pytest.mark.parametrize('client_name', ['monitor_client', 'calibrate_client'])
-@pytest.mark.parametrize('remap', ['__ns:=bad name', '__node:=3', ':='])
+@pytest.mark.parametrize(
+    ('client_name', 'remap'),
+    [('monitor_client', '__ns:=bad name'), ('calibrate_client', '__node:=3'),
+     ('monitor_client', ':='), ('calibrate_client', ':=')],
+)  # fmt: skip
 def test_a_bad_remap_is_answered_without_a_traceback(
     start_node: StartNode, client_name: str, remap: str
 ) -> None:

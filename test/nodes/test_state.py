@@ -63,31 +63,6 @@ def test_a_restart_goes_on_where_it_stood(tmp_path: Path) -> None:
     second.close()
 
 
-@pytest.mark.slow
-def test_what_is_forced_says_so_and_stays_for_its_own_reasons_only(tmp_path: Path) -> None:
-    gate = dataclasses.replace(setup().gate, max_change_px=1e-6)
-    given = dataclasses.replace(setup(), gate=gate)
-    state = filled(observations(), tmp_path, given)
-    refused = state.solve()
-    assert not refused.success and refused.calibration is not None
-    assert (refused.calibration.number, refused.calibration.forced) == (0, False)
-    assert state.active is None
-    assert state.solve(dry_run=True, force=True).success and state.active is None
-    assert state.solve(force=True).success
-    state.close()
-    for again in (given, setup()):
-        state = started(tmp_path, again)
-        active = state.active
-        assert active is not None and active.forced and not active.accepted
-        assert active.reasons[-1] == 'activated by request despite the gate'
-        state.close()
-    tighter = dataclasses.replace(gate, requirements=('map=1e-6px',))
-    state = started(tmp_path, dataclasses.replace(setup(), gate=tighter))
-    assert state.active is None and 'requirements' in state.withheld[0]
-    assert 'max_change_px' not in state.withheld[0]
-    state.close()
-
-
 # Refused images, and what the answer of a request says of them.
 REFUSED = {
     'none': ([], '', False),
@@ -285,6 +260,12 @@ ACTIVATIONS = {
         'activate a 0.2; limit 0.01; open A; activate b 0.25 force; limit 0.3; open A; rollback',
         'activated again: ',
         'a',
+    ),
+    'forced dry run': ('activate a; solve b 2 dry_run force', 'would be activated: ', 'a'),
+    'a forced one that misses a new requirement': (
+        'activate a 2 force; require map=1e-6px; open A; rollback',
+        'no calibration is active',
+        '',
     ),
     'past one that is refused today': (
         'activate a; activate b 0.2; activate c 0.45; activate d 0.3; limit .08; open A; rollback',

@@ -9,19 +9,16 @@ import json
 import os
 from pathlib import Path
 
-from attacks import drawn, spoilt_text  # type: ignore[import-not-found]
+from attacks import BAG, calibration, drawn, setup, spoilt_text  # type: ignore[import-not-found]
 from hypothesis import given
 import numpy as np
 import pytest
 
-from bench.frames import write_set_up
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
 from starcal_ground.products import prior_of
-from starcal_ground.simulation.centroids import true_observations
-from starcal_ground.simulation.scenario import scenario
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import ros_fit
@@ -33,11 +30,9 @@ from starcal_ros.formats.products.product_files import (
     write_calibration,
 )
 from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODES
-from starcal_ros.records import Calibration, Image
+from starcal_ros.records import Image
 
-SCENARIO = scenario('tiny')
 pytestmark = pytest.mark.slow
 
 
@@ -53,20 +48,6 @@ def read_or_refused() -> Iterator[None]:
     assert len(refusal.splitlines()) <= 1 and len(refusal) < 5000
 
 
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the parameter file and the camera file of the scenario."""
-    path = tmp_path_factory.mktemp('set_up')
-    write_set_up(SCENARIO, path)
-    return path
-
-
-@pytest.fixture(scope='module')
-def calibration(folder: Path) -> Calibration:
-    setup = load_setup(read_parameter_file(folder / 'params.yaml', NODES))
-    return solve.solve(true_observations(SCENARIO), setup)
-
-
 def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60) -> None:
     """Write spoilt copies of a text to a file, and read each."""
 
@@ -80,27 +61,25 @@ def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60)
     spoil()
 
 
-def test_parameter_files(folder: Path, tmp_path: Path) -> None:
-    values = read_parameter_file(folder / 'params.yaml', NODES)
-    setup = load_setup(values)
-    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup.options().items()}
+def test_parameter_files(tmp_path: Path) -> None:
+    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup().options().items()}
     lines = [f'    {name}: {json.dumps(value)}' for name, value in flow.items()]
 
     def read(path: Path) -> None:
-        load_setup(read_parameter_file(path, NODES), setup.prior)
+        load_setup(read_parameter_file(path, NODES), setup().prior)
 
     text = '\n'.join(['/**:', '  ros__parameters:', *lines])
     spoils(text, tmp_path / 'params.yaml', read)
 
 
-def test_camera_files(folder: Path, tmp_path: Path) -> None:
+def test_camera_files(tmp_path: Path) -> None:
     def read(path: Path) -> None:
         camera = read_camera_info(path)
         project(camera, line_of_sight(camera, pixel_grid(camera, 5, 5)))
         field_radius_rad(camera)
         ros_fit(camera)
 
-    spoils((folder / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
+    spoils((BAG / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
 
 
 def test_metadata_of_bags(tmp_path: Path) -> None:
@@ -116,15 +95,15 @@ def test_metadata_of_bags(tmp_path: Path) -> None:
     spoils(path.read_text(), path, read)
 
 
-def test_calibration_files(calibration: Calibration, tmp_path: Path) -> None:
+def test_calibration_files(tmp_path: Path) -> None:
     path = tmp_path / CALIBRATION_FILE
-    write_calibration(calibration, path)
+    write_calibration(calibration(), path)
 
     def read(path: Path) -> None:
         back = read_calibration(path)
         prior_of(back)
         if back.accepted or back.forced:
-            compare(calibration, back)
+            compare(calibration(), back)
             camera = back.geometry.camera
             line_of_sight_table(camera, back.map_covariance, pixel_grid(camera, 3, 3))
 

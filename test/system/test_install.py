@@ -165,14 +165,6 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_a_demo_without_ros_names_it(flight_install: Path, tmp_path: Path) -> None:
-    refused = run(flight_install / 'bin/starcal', 'demo', cwd=tmp_path)
-    assert refused.returncode == 2 and refused.stderr.count('\n') == 1
-    assert 'rclpy is not installed' in refused.stderr and not any(tmp_path.iterdir())
-
-
-@pytest.mark.packaging
-@pytest.mark.slow
 def test_pip_lines_of_the_tutorial(sources: Path) -> None:
     """Pip accepts each line that installs from the clone, with every extra that it names."""
     lines = re.findall(r'`pip install ([^`]+)`', TUTORIAL.read_text())
@@ -182,17 +174,6 @@ def test_pip_lines_of_the_tutorial(sources: Path) -> None:
         tried = run(*pip, *offline, *shlex.split(line), cwd=sources)
         assert tried.returncode == 0, tried.stderr
         assert 'does not provide the extra' not in tried.stderr
-
-
-@pytest.mark.packaging
-@pytest.mark.slow
-def test_python_lines_of_the_tutorial(flight_install: Path, tmp_path: Path) -> None:
-    """The calibration in three lines runs without ROS and without extras."""
-    (block,) = re.findall(r'```python\n(.*?)```', TUTORIAL.read_text(), re.DOTALL)
-    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
-    done = run(flight_install / 'bin/python', '-c', block, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.startswith('True [')
 
 
 @pytest.mark.packaging
