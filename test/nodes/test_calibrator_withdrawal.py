@@ -34,7 +34,6 @@ HEIRS = {
         'calibration 1 is not active, the gate',
     ),
     'an empty folder': ((), 'empty', ''),
-    'memory alone': ((), '', ''),
 }
 
 
@@ -63,7 +62,7 @@ def test_consumers_return_to_the_prior(
     client._executor.add_node(monitor)
     client.until(lambda: monitor.received.active is not None)
     first.stop()
-    place = f'state_dir:={tmp_path}/{folder}' if folder else 'state_dir:=""'
+    place = f'state_dir:={tmp_path}/{folder}'
     heir = start_node(
         'calibrator', ros=(*parameters(tiny_bag, place, *values), '-r', '__node:=heir')
     )
@@ -76,8 +75,7 @@ def test_consumers_return_to_the_prior(
         assert level == b'\x01' and text.startswith(f'{why} refuses it now: largest change')
         assert 'max_change_px' in text and text in heir.said()
         assert values['last_gate'] == f'refused: {text}'
-    where = f'{tmp_path}/{folder}' if folder else 'not given'
-    assert f'state_dir {where}; no calibration active; 0 images' in heir.said()
+    assert f'state_dir {tmp_path}/{folder}; no calibration active; 0 images' in heir.said()
     client.until(lambda: client.health()[0] == b'\x01')
     assert 'the prior predicts the stars' in client.health()[1] and why in client.health()[1]
     client.until(lambda: monitor.received.active is None)
