@@ -86,6 +86,7 @@ def test_a_request_without_images_is_answered_with_the_cause(name: str) -> None:
     state = started()
     for k, (reason, detail) in enumerate(images):
         state.add(refused_image(k, 640, 512, reason, detail))
+    assert state.disk_free_bytes() is None
     message = state.solve().message
     assert message.startswith('too few observations') and ('refused' in message) is expected
     assert words in message and '\n' not in message and not message.endswith(': ')
@@ -115,6 +116,7 @@ def test_a_full_disk_costs_nothing_that_memory_holds(tmp_path: Path) -> None:
     assert answer.success and 'not on disk: state_dir:' in answer.message
     assert (status.images, status.images_saved) == (len(observations()), len(observations()) - 1)
     assert 'cannot be written: File too large' in state.trouble
+    assert (state.disk_free_bytes() or 0) > 0
     # The folder is let go of and taken up again before the disk has room: nothing is lost.
     state.close()
     state.open(setup(), CalibratorOptions(state_dir=str(tmp_path)))
