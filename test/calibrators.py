@@ -14,6 +14,7 @@ import shutil
 from attacks import calibration, observations, setup  # type: ignore[import-not-found]
 from kept_state import full_disk  # type: ignore[import-not-found]
 import pytest
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.pipeline import solve as solving
@@ -113,6 +114,17 @@ class Calibrators:
         gate = dataclasses.replace(self.setup.gate, max_change_px=float(max_change_px))
         self.setup = dataclasses.replace(self.setup, gate=gate)
 
+    def turn(self, _process: str, degrees: str) -> None:
+        """Turn the mounting of the prior about the boresight."""
+        prior, turn = self.setup.prior, Rotation.from_euler('z', float(degrees), degrees=True)
+        mounting = (prior.star_tracker_from_camera * turn).as_quat()
+        prior = dataclasses.replace(prior, star_tracker_from_camera_xyzw=mounting)
+        self.setup = dataclasses.replace(self.setup, prior=prior)
+
+    def require(self, _process: str, requirement: str) -> None:
+        gate = dataclasses.replace(self.setup.gate, requirements=(requirement,))
+        self.setup = dataclasses.replace(self.setup, gate=gate)
+
     def clock(self, _process: str, time_ns: str) -> None:
         self._times = itertools.repeat(int(time_ns))
 
@@ -129,8 +141,12 @@ class Calibrators:
         for path in self.disk.glob(pattern):
             path.write_bytes(path.read_bytes()[:-100])
 
+    def touch(self, _process: str, place: str) -> None:
+        (self.disk / place).touch()
+
     def remove(self, _process: str, place: str) -> None:
-        shutil.rmtree(self.disk / place)
+        path = self.disk / place
+        path.unlink() if path.is_file() else shutil.rmtree(path)
 
 
 def kept(state: CalibratorState) -> tuple[str, str]:

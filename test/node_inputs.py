@@ -24,8 +24,8 @@ def parameters(folder: Path, *values: str) -> tuple[str, ...]:
 
 
 @contextlib.contextmanager
-def in_this_process(kind: Any, folder: Path, is_active: bool = True) -> Iterator[Any]:
-    """A configured node with the parameter file of a bag, in this process."""
+def in_this_process(kind: Any, folder: Path) -> Iterator[Any]:
+    """An active node with the parameter file of a bag, in this process."""
     import rclpy
 
     with contextlib.ExitStack() as stack:
@@ -35,7 +35,6 @@ def in_this_process(kind: Any, folder: Path, is_active: bool = True) -> Iterator
         stack.callback(node.destroy_node)
         node.trigger_configure()
         stack.callback(node.cleanup)
-        if is_active:
-            node.trigger_activate()
-            stack.callback(node.deactivate)
+        node.trigger_activate()
+        stack.callback(node.deactivate)
         yield node

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The state folder: what was kept comes back, through kills, damage and a full disk."""
+"""The state folder: what was kept comes back, through kills and damage; seals of its files."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ import contextlib
 import dataclasses
 import json
 import multiprocessing
+import os
 from pathlib import Path
 import shutil
 import time
 
-from kept_state import activation, collect, full_disk, images, opened  # type: ignore[import-not-found]
+from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_records import assert_same  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader as bag_reader
-from starcal_ros.errors import ArchiveError
+from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.records import Activation, Ensemble
-from starcal_ros.ros.archive import Archive, Seal, TOPIC
+from starcal_ros.ros.archive import Archive, CHECKSUMS, read_seal, Seal, TOPIC
+
+KEYED = Seal(b'sixteen bytes...')
+CONTENT = {'number': 3, 'list': [0.1, None, 'µ'], 'schema': 1}
 
 
 def numbers(history: tuple[Activation, ...]) -> list[tuple[int, int]]:
@@ -104,15 +108,6 @@ def test_what_goes_from_the_ensemble_goes_from_the_disk(tmp_path: Path) -> None:
         assert archive.saved(Ensemble(images()[:2])) == 1
     with opened(tmp_path) as archive:  # it has come again after a reset
         assert len(archive.read_ensemble().images) == 1
-
-
-def test_history_is_bounded_by_what_is_handed_over(tmp_path: Path) -> None:
-    history = tuple(activation(event) for event in range(1, 6))
-    with opened(tmp_path) as archive:
-        for k in range(1, 6):
-            archive.keep(Ensemble(), history[max(0, k - 3) : k])
-    with opened(tmp_path) as archive:
-        assert numbers(archive.read_history()) == [(3, 3), (4, 4), (5, 5)]
 
 
 @pytest.mark.slow
@@ -238,18 +233,49 @@ def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
             Archive(path, 'camera')
 
 
-def test_a_full_disk_is_told_and_tried_again(tmp_path: Path) -> None:
-    whole = Ensemble(images()[:3], {'no_stars': 1})
-    with opened(tmp_path) as archive:
-        archive.keep(Ensemble(images()[:2]), (activation(1),))
-        with full_disk():
-            for history in ((activation(1),), (activation(1), activation(2))):
-                with pytest.raises(ArchiveError, match=r'^state_dir: .*cannot be written'):
-                    archive.keep(whole, history)
-            assert archive.saved(whole) == 2
-        assert not list(tmp_path.glob('*/.*'))
-        archive.keep(whole, (activation(1), activation(2)))
-        assert archive.saved(whole) == 3
-    with opened(tmp_path) as archive:
-        assert len(archive.read_ensemble().images) == 3
-        assert numbers(archive.read_history()) == [(1, 1), (2, 2)]
+@pytest.mark.parametrize('seal', [CHECKSUMS, KEYED])
+def test_a_sealed_object_comes_back(seal: Seal) -> None:
+    assert seal.opened(seal.sealed(CONTENT).encode()) == CONTENT
+
+
+def test_a_checksum_can_be_made_again_and_an_hmac_only_with_the_key() -> None:
+    forged = {**CONTENT, 'number': 4}
+    text = CHECKSUMS.sealed(forged).encode()
+    assert CHECKSUMS.opened(text) == forged
+    with pytest.raises(ValueError, match='the HMAC is missing'):
+        KEYED.opened(text)
+    other = Seal(b'another sixteen.').sealed(forged).encode()
+    with pytest.raises(ValueError, match='the HMAC is wrong'):
+        KEYED.opened(other)
+    assert CHECKSUMS.opened(KEYED.sealed(CONTENT).encode()) == CONTENT  # the key was taken away
+
+
+@pytest.mark.parametrize('data', [b'', b'[]', b'{}', b'3', b'\xff', b'[' * 10**5, b'{"a": 1}'])
+def test_other_content_is_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match="checksum|not JSON|not a JSON object|codec can't decode"):
+        CHECKSUMS.opened(data)
+
+
+def test_the_mark_of_a_file_is_of_its_number_and_bytes() -> None:
+    mark = KEYED.mark(7, b'bytes')
+    assert len(mark) == 64
+    KEYED.check_mark(mark, 7, b'bytes')
+    for found, number, data in ((mark, 8, b'bytes'), (mark, 7, b'byte'), ('', 7, b'bytes')):
+        with pytest.raises(ValueError, match='HMAC'):
+            KEYED.check_mark(found, number, data)
+    assert CHECKSUMS.mark(7, b'bytes') == ''
+    CHECKSUMS.check_mark('anything', 7, b'bytes')
+
+
+def test_the_key_file(tmp_path: Path) -> None:
+    path = tmp_path / 'key'
+    path.write_bytes(KEYED.key + b'\n')
+    assert read_seal(str(path)) == KEYED
+    assert read_seal('') == CHECKSUMS
+    path.write_bytes(b'short')
+    with pytest.raises(OptionError, match='holds 5 bytes, at least 16'):
+        read_seal(str(path))
+    os.mkfifo(tmp_path / 'fifo')
+    for name in ('fifo', 'none', '.'):
+        with pytest.raises(OptionError, match='state_key_file'):
+            read_seal(str(tmp_path / name))

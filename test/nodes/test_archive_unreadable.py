@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import json
 import os
 from pathlib import Path
-import subprocess
-import sys
 import tempfile
 
+from kept_state import activation, images, opened  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ros.errors import ArchiveError
@@ -71,62 +69,39 @@ def start(folder: Path) -> tuple[str, list[str]]:
         return str(error), []
 
 
-def main(place: Path) -> None:
-    """In a process of its own: make each case, and start as a user who owns none of its files."""
-    import kept_state  # type: ignore[import-not-found]
-
-    answers = {}
-    for k, (change, name, _) in enumerate(CASES.values()):
-        folder = place / str(k)
-        with kept_state.opened(folder) as archive:
-            history = (kept_state.activation(1), kept_state.activation(2, before=1))
-            archive.keep(Ensemble(kept_state.images()[:2], {'no_stars': 1}), history)
-        if not k:
-            start(folder)  # loads all that a start needs while this user may
-        change(folder / name)
-        for path in (place, folder, *folder.iterdir()):
-            if path.stat().st_mode & 0o777:
-                path.chmod(0o777)  # anybody may rename the files
-    with contextlib.suppress(PermissionError):  # of a user whom modes stop already
-        os.setuid(NOBODY)
-    for k, case in enumerate(CASES):
-        answers[case] = start(place / str(k))
-    print(json.dumps(answers))
-
-
-@pytest.fixture(scope='module')
-def started() -> Iterator[tuple[Path, dict[str, tuple[str, list[str]]]]]:
-    with tempfile.TemporaryDirectory() as folder:  # others have no access to that of pytest
-        done = subprocess.run(
-            [sys.executable, __file__, folder], capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        yield Path(folder), json.loads(done.stdout)
-        for path in Path(folder).glob('*/*'):
-            path.chmod(0o700)
+@contextlib.contextmanager
+def as_nobody() -> Iterator[None]:
+    """The process as a user who owns none of the files; as it is where it may not change that."""
+    with contextlib.ExitStack() as stack:
+        if os.geteuid() == 0:  # modes stop any other user already
+            os.seteuid(NOBODY)
+            stack.callback(os.seteuid, 0)
+        yield
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('case', CASES)
-def test_only_what_was_read_and_is_wrong_is_set_aside(
-    started: tuple[Path, dict[str, tuple[str, list[str]]]], case: str
-) -> None:
+def test_only_what_was_read_and_is_wrong_is_set_aside(case: str) -> None:
     """The start ends where a file may be sound; nothing is renamed then."""
-    place, answers = started
-    _, name, outcome = CASES[case]
-    folder = place / str(list(CASES).index(case))
-    (folder / name).parent.chmod(0o700)
-    error, damage = answers[case]
-    aside = [path for path in names(folder) if '.damaged' in path]
+    change, name, outcome = CASES[case]
+    with tempfile.TemporaryDirectory() as place:  # others have no access to that of pytest
+        folder = Path(place) / 'state'
+        with opened(folder) as archive:
+            history = (activation(1), activation(2, before=1))
+            archive.keep(Ensemble(images()[:2], {'no_stars': 1}), history)
+        start(folder)  # loads all that a start needs while this user may
+        change(folder / name)
+        for path in (Path(place), folder, *folder.iterdir()):
+            if path.stat().st_mode & 0o777:
+                path.chmod(0o777)  # anybody may rename the files
+        with as_nobody():
+            error, damage = start(folder)
+        for path in folder.iterdir():
+            path.chmod(0o700)
+        aside = [path for path in names(folder) if '.damaged' in path]
     if outcome == STOPS:
         assert f'{folder / name} cannot be read: Permission denied; start the' in error
         assert aside == [] and error.count('\n') == 0
     else:
         assert error == '' and len(damage) == 1 and outcome in damage[0]
         assert aside == ([f'{name}.damaged'] if outcome == SET_ASIDE else [])
-
-
-if __name__ == '__main__':
-    test = Path(__file__).parents[1]
-    sys.path[:0] = [str(test.parent), str(test)]
-    main(Path(sys.argv[1]))

@@ -11,17 +11,10 @@ import time
 from typing import Any, TYPE_CHECKING
 
 import cv2
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import PoseStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
 from node_inputs import parameters  # type: ignore[import-not-found]
+import pytest
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from sample_records import assert_same, observations  # type: ignore[import-not-found]
@@ -30,6 +23,7 @@ from std_msgs.msg import String
 
 from starcal.msg import StarObservations
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags import reader
 from starcal_ground.ros import bag_player
 from starcal_ros.formats.bag import typestore
 from starcal_ros.formats.bag.typestore import make_message
@@ -39,12 +33,16 @@ from starcal_ros.formats.messages.message_codec import (
     OBSERVATIONS_TYPE,
     POSE_TYPE,
     quaternion_to_message,
+    stamp_ns,
     TEMPERATURE_TYPE,
 )
 from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -80,7 +78,7 @@ def bag(tmp_path: Path) -> Path:
 def test_compressed_images_are_paced(
     client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
 ) -> None:
-    """A queue of twenty overflows where they are not."""
+    """A queue of twenty overflows where they are not; each is answered once, in order."""
     found: list[Any] = client.collect(StarObservations, 'observations')
     given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
     start_node('star_observer', ros=(*given, '-r', 'image:=image/compressed'))
@@ -90,6 +88,10 @@ def test_compressed_images_are_paced(
     assert player.wait() == 0, player.said()
     client.until(lambda: len(found) == IMAGES)
     assert [one.refusal for one in found] == [''] * len(found)
+    assert all(len(one.catalog_id) > 50 for one in found)
+    stamps_ns = [stamp_ns(one.header.stamp) for one in found]
+    sent = reader.read_raw([bag], ['/image/compressed'])
+    assert stamps_ns == [raw.log_time_ns for raw in sent]
     assert 'playing anyway' not in player.said()
 
 
@@ -172,10 +174,11 @@ def test_messages_of_another_version_are_played_as_those_of_this_one(
             for k in range(3):
                 writer.add_message(channel, k, bytes(data), publish_time=k)
         writer.finish()
-    found: list[Any] = client.collect(StarObservations, '/older')
+    found, other = (client.collect(StarObservations, topic) for topic in ('/older', '/other'))
     player = start_node('bag_player', ros=('-p', f'bag:={bag}'))
     assert player.wait() == 0, player.said()
     client.until(lambda: len(found) == 3)
+    assert other == []
     for one in found:
         assert_same(observations_from_message(one), replace(observations(), detail=''))
     assert (

@@ -8,21 +8,10 @@ import dataclasses
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-    from starcal_ros.records import Ensemble
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import TransformStamped
-from node_inputs import IMAGES, in_this_process, parameters, REMAPS  # type: ignore[import-not-found]
-from rclpy.parameter import Parameter
+from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import pytest
 from sensor_msgs.msg import CameraInfo, Image
-from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration
 from starcal_ground.bags import reader
@@ -31,7 +20,9 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_ca
 from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
-from starcal_ros.ros.calibrator import Calibrator
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -43,7 +34,6 @@ HEIRS = {
         'calibration 1 is not active, the gate',
     ),
     'an empty folder': ((), 'empty', ''),
-    'memory alone': ((), '', ''),
 }
 
 
@@ -72,11 +62,20 @@ def test_consumers_return_to_the_prior(
     client._executor.add_node(monitor)
     client.until(lambda: monitor.received.active is not None)
     first.stop()
-    place = f'state_dir:={tmp_path}/{folder}' if folder else 'state_dir:=""'
+    place = f'state_dir:={tmp_path}/{folder}'
     heir = start_node(
         'calibrator', ros=(*parameters(tiny_bag, place, *values), '-r', '__node:=heir')
     )
     client.until_value('calibration', 'prior')
+    client.until(lambda: 'images' in client.health('heir')[2])
+    level, text, values = client.health('heir')
+    withheld = str(int(bool(why)))
+    assert (values['active'], values['state_refused_calibrations']) == ('none', withheld)
+    if why:
+        assert level == b'\x01' and text.startswith(f'{why} refuses it now: largest change')
+        assert 'max_change_px' in text and text in heir.said()
+        assert values['last_gate'] == f'refused: {text}'
+    assert f'state_dir {tmp_path}/{folder}; no calibration active; 0 images' in heir.said()
     client.until(lambda: client.health()[0] == b'\x01')
     assert 'the prior predicts the stars' in client.health()[1] and why in client.health()[1]
     client.until(lambda: monitor.received.active is None)
@@ -103,35 +102,3 @@ def test_consumers_return_to_the_prior(
     start_node('calibrator', ros=(*ros, '-r', '__node:=third'))
     client.until_value('calibration', '1')
     client.until(lambda: 'the prior predicts the stars' not in client.health()[1])
-
-
-def test_diagnostics_are_of_the_limits_of_today(
-    client: Client, tiny_bag: Path, tiny_observations: Ensemble
-) -> None:
-    """Cleaned up, configured with a tighter limit, and back, in one process."""
-    with in_this_process(Calibrator, tiny_bag) as node:
-        for image in tiny_observations.images:
-            node._state.add(image)
-        assert node._on_calibrate(None, Trigger.Response()).success
-        latched: list[Any] = client.latched(CameraInfo, 'camera_info')
-
-        def configure(max_change_px: float) -> dict[str, object]:
-            node.trigger_deactivate()
-            node.trigger_cleanup()
-            parameter = Parameter('max_change_px', Parameter.Type.DOUBLE, max_change_px)
-            assert node.set_parameters([parameter])[0].successful
-            node.trigger_configure()
-            node.trigger_activate()
-            return dict(node.health()[2])
-
-        strict = configure(1e-6)
-        assert strict['active'] == 'none' and str(strict['last_gate']).startswith('refused: calib')
-        client.until(lambda: latched and latched[-1].k[0] == 0)
-        assert not node._on_calibrate(None, Trigger.Response()).success
-        relaxed = configure(10.0)
-        assert (relaxed['active'], relaxed['last_gate'], relaxed['last_answer']) == (
-            1,
-            'accepted',
-            '',
-        )
-        client.until(lambda: latched[-1].k[0] > 0)

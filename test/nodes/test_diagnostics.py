@@ -4,24 +4,15 @@
 from __future__ import annotations
 
 import array
-import contextlib
-import dataclasses
 import itertools
 import math
 from pathlib import Path
 import re
 from typing import TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import QuaternionStamped, Twist, TwistStamped
 from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import pytest
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
@@ -29,11 +20,12 @@ from std_srvs.srv import Trigger
 from starcal.msg import Calibration, StarObservations
 from starcal_ground.bags import reader
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
-from starcal_ros.records import Activation, Ensemble, IMAGE_REFUSALS
-from starcal_ros.ros.archive import Archive
+from starcal_ros.records import Ensemble, IMAGE_REFUSALS
 from starcal_ros.ros.node import make_message
 from starcal_ros.sky.astrometry import earth_velocity_c
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -130,30 +122,6 @@ def test_calibrator_diagnostics_match_the_document(
     # On this machine's clock, within the time a test may take.
     assert 0 <= float(values['calibration_age_s']) < 600
     assert math.isfinite(float(values['disk_free_mb']))
-
-
-def test_a_stored_calibration_that_the_gate_refuses_is_not_active(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
-) -> None:
-    """With a tighter limit at the restart; without it, it is active again."""
-    stored = read_calibration(tiny_products / CALIBRATION_FILE)
-    stored = dataclasses.replace(stored, number=1, active_since_ns=1)
-    with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
-        archive.keep(Ensemble(), (Activation(1, 0, stored),))
-    ros = parameters(tiny_bag, f'state_dir:={tmp_path}/state')
-    first = start_node('calibrator', ros=(*ros, '-p', 'max_change_px:=1e-6'))
-    client.until(lambda: 'images' in client.health('calibrator')[2])
-    level, text, values = client.health('calibrator')
-    assert level == b'\x01'
-    assert text.startswith('calibration 1 is not active, the gate refuses it now: largest change')
-    assert 'max_change_px' in text and text in first.said()
-    assert f'state_dir {tmp_path}/state; no calibration active; 0 images' in first.said()
-    assert values['active'] == 'none' and values['last_gate'] == f'refused: {text}'
-    assert values['state_refused_calibrations'] == '1'
-    first.stop()
-    start_node('calibrator', ros=(*ros, '-r', '__node:=second'))
-    client.until(lambda: client.health('second')[2].get('active') == '1')
-    assert client.health('second')[2]['state_refused_calibrations'] == '0'
 
 
 def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_bag: Path) -> None:

@@ -9,23 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-import numpy as np
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from diagnostic_msgs.msg import DiagnosticArray
 from node_inputs import BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 
 from starcal.msg import EnsembleStatus
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ros.formats.messages.message_codec import stamp_ns
 from starcal_ros.records import Image
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 ROOT = Path(__file__).parents[2]
 
@@ -98,23 +94,6 @@ def test_the_policies_name_what_the_nodes_have(
             allowed -= {('publish', '/tf_static'), ('subscribe', '/tf_static')}
         client.until(functools.partial(shows, client, name, allowed))
         assert of_graph(client, name) == allowed, name
-
-
-@pytest.mark.parametrize(
-    ('node', 'option', 'name'),
-    [
-        ('star_observer', 'more_star_trackers', 'FRAME/attitude'),
-        ('star_observer', 'use_sim_time', '/clock'),
-        ('calibrator', 'set_camera_info_service', 'that service'),
-        ('calibrator', 'use_sim_time', '/clock'),
-        ('bag_player', 'use_sim_time', '/clock'),
-        ('bag_player', 'clock', '/clock'),
-    ],
-)
-def test_policies_name_what_an_option_adds(node: str, option: str, name: str) -> None:
-    text = (ROOT / 'config' / 'security' / f'{node}.policy.xml').read_text()
-    comment = text.partition('<!--')[2].partition('-->')[0]
-    assert option in comment and name in comment
 
 
 WAIT = ('-p', 'wait_for_subscribers_s:=100.0')

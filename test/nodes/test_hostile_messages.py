@@ -13,15 +13,6 @@ from typing import Any, TYPE_CHECKING
 
 from attacks import BAG, calibration, many, observations  # type: ignore[import-not-found]
 import cv2
-import numpy as np
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, NodeProcess, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from flight import Flight  # type: ignore[import-not-found]
 from geometry_msgs.msg import QuaternionStamped, TransformStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -29,6 +20,8 @@ from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: 
 from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
 from node_campaign import Campaign  # type: ignore[import-not-found]
 from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -46,6 +39,9 @@ from starcal_ros.formats.messages.record_messages import (
 )
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, NodeProcess, StartNode
 
 pytestmark = [pytest.mark.nodes, pytest.mark.slow]
 
@@ -209,9 +205,11 @@ def test_the_star_observer_measures_images_after_hostile_messages(
 
 
 def test_the_calibrator_calibrates_after_hostile_messages(
-    client: Client, start_node: StartNode, tiny_bag: Path
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:
-    node = start_node('calibrator', ros=parameters(tiny_bag, 'max_images:=30'))
+    """Those that pass for observations are saved as well."""
+    state = f'state_dir:={tmp_path}/state'
+    node = start_node('calibrator', ros=parameters(tiny_bag, 'max_images:=30', state))
     published = [
         client.statuses(),
         *(client.latched(Calibration, t) for t in ('calibration', 'candidate_calibration')),
@@ -223,7 +221,10 @@ def test_the_calibrator_calibrates_after_hostile_messages(
     brightest = observations()[0]
     brightest = brightest.select(np.argsort(np.argsort(-brightest.flux_dn)) < 40)
     template = observations_to_message(brightest, 'camera', make_message)
-    received.send(publisher, mutated(template, 20))
+    received.send(publisher, mutated(template, 60))
+    statuses = published[0]
+    client.until(lambda: statuses and 0 < statuses[-1].images == statuses[-1].images_saved)
+    assert {entry.reason for entry in statuses[-1].refused} >= {'bad_observations'}
     request = Calibrate.Request(method='magic', estimate=['fx', 'fz'])
     assert_requests_are_answered(client, Calibrate, '/calibrator/solve', request, node)
     assert_common_requests_are_answered(client, 'calibrator', node)

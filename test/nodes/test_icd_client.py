@@ -13,24 +13,21 @@ import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped, TransformStamped
+from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from rosbags import highlevel as rosbags
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration, StarObservations
+from starcal.srv import Calibrate
 
 if TYPE_CHECKING:
     from conftest import Client, StartNode
-
-rosbags = pytest.importorskip('rosbags.highlevel')
-pytest.importorskip('starcal.msg')
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import QuaternionStamped, TransformStamped  # noqa: E402
-from node_inputs import BOTH, parameters  # type: ignore[import-not-found]  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
-
-from starcal.msg import Calibration, StarObservations  # noqa: E402
-from starcal.srv import Calibrate  # noqa: E402
 
 pytestmark = pytest.mark.nodes
 
@@ -43,7 +40,7 @@ def bag_messages(folder: Path) -> Iterator[Any]:
         # The velocity of the observer is not in the contract of this client.
         wanted = [one for one in reader.connections if 'Twist' not in one.msgtype]
         for connection, _, data in reader.messages(wanted):
-            found = reader.deserialize(data, connection.msgtype)
+            found: Any = reader.deserialize(data, connection.msgtype)
             made: Any
             if connection.msgtype == 'sensor_msgs/msg/Image':
                 made = Image(height=found.height, width=found.width, encoding=found.encoding)

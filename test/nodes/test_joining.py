@@ -124,6 +124,12 @@ JOINS = {
         '2',
         '',
     ),
+    'reset on A that cannot be emptied, A': (
+        ('open A; images 0 1; activate a; touch A/ensemble.emptied; reset; images 2; close; '
+         'remove A/ensemble.emptied; open A'),
+        '2',
+        'a',
+    ),
     'reset in memory, A': ('open A; images 0 1; open -; reset; images 2; open A', '2', ''),
     'reset in B, A': ('open A; images 0 1; open B; reset; open A', '', ''),
     'reset in B, restart, B, A': (

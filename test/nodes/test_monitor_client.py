@@ -10,17 +10,10 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-import pytest
-from sample_records import calibration, observations, status  # type: ignore[import-not-found]
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sample_records import calibration, observations, status  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.ros.monitor_client import Monitor
@@ -30,6 +23,9 @@ from starcal_ros.formats.messages.record_messages import (
     status_to_message,
 )
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -85,8 +81,10 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         monitor.destroy_node()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('after', ['start', 'view', 'both'])
+@pytest.mark.parametrize(
+    ('number', 'after'),
+    [(signal.SIGTERM, 'start'), (signal.SIGINT, 'view'), (signal.SIGINT, 'both')],
+)
 def test_a_signal_ends_it_without_a_traceback(
     client: Client, number: signal.Signals, after: str
 ) -> None:
@@ -121,8 +119,11 @@ def until_ros(pid: int) -> None:
     raise AssertionError('the process does not handle SIGTERM')
 
 
-@pytest.mark.parametrize('client_name', ['monitor_client', 'calibrate_client'])
-@pytest.mark.parametrize('remap', ['__ns:=bad name', '__node:=3', ':='])
+@pytest.mark.parametrize(
+    ('client_name', 'remap'),
+    [('monitor_client', '__ns:=bad name'), ('calibrate_client', '__node:=3'),
+     ('monitor_client', ':='), ('calibrate_client', ':=')],
+)  # fmt: skip
 def test_a_bad_remap_is_answered_without_a_traceback(
     start_node: StartNode, client_name: str, remap: str
 ) -> None:

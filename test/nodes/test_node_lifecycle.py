@@ -13,22 +13,18 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from lifecycle_msgs.msg import Transition
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager, NO_TRANSITION  # type: ignore[import-not-found]
 from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
+import pytest
 import rclpy
 from std_msgs.msg import Empty
 
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import Executor
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -97,109 +93,106 @@ def run(code: str, *arguments: str) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
-SIGNALLED = """
-import os, signal, sys, time
-import rclpy
-from starcal_ros.ros.node import end_quietly, until_told_to_end
-
-def work():
-    if 'told' in sys.argv:
-        os.kill(os.getpid(), signal.SIGTERM)
-        while rclpy.ok():
-            time.sleep(0.01)
-    raise RuntimeError('the context\\nis invalid\x1b[2J')
-
-sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
-"""
-
-
-@pytest.mark.parametrize(
-    ('argument', 'status', 'said'),
-    [('', 2, 'maker: the context is invalid\\x1b[2J\n'), ('told', 0, '')],
-)
-def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said: str) -> None:
-    """Errors after a signal give status 0; other errors give one line and status 2."""
-    assert run(SIGNALLED, argument) == (status, '', said)
-
-
-SIGNALLED_AGAIN = """
-import os, signal, sys, time
-import rclpy
-from starcal_ros.ros.node import end_quietly, until_told_to_end
-
-def tell():
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
-        os.kill(os.getpid(), number)
-    time.sleep(0)  # where Python runs the handlers
-
-def work():
-    tell()
-    while rclpy.ok():
-        time.sleep(0.01)
-
-def end():
-    tell()
-    end_quietly(None)
-    tell()
-    print('ended')
-
-sys.exit(until_told_to_end('maker', [], work, end))
-"""
-
-
-def test_signals_do_not_cut_the_end_short() -> None:
-    assert run(SIGNALLED_AGAIN) == (0, 'ended\n', '')
-
-
-SIGNALLED_AT_AN_ENTRY = """
-import os, signal, sys, time
-import rclpy
-from starcal_ros.ros.node import end_quietly, until_told_to_end
-
-class Lock:
-    def __enter__(self):
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(0)  # where Python runs the handlers
-    def __exit__(self, *_):
-        print('released')
-
-def work():
-    with Lock():
-        pass
-    while rclpy.ok():
-        time.sleep(0.01)
-    return 0
-
-if 'early' in sys.argv:
-    init = rclpy.init
-    rclpy.init = lambda args: (os.kill(os.getpid(), signal.SIGTERM), init(args=args))
-sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
-"""
-
-
-@pytest.mark.parametrize(('argument', 'said'), [('', 'released\n'), ('early', '')])
-def test_a_signal_leaves_no_lock_taken(argument: str, said: str) -> None:
-    """A KeyboardInterrupt at the entry of a lock would, and the threads that need it never end."""
-    assert run(SIGNALLED_AT_AN_ENTRY, argument) == (0, said, '')
-
-
-NEVER_LET_GO = """
-import ctypes
+# Each is a process of its own, which has these.
+OF_A_NODE = """
+import ctypes, os, signal, sys, time
 import rclpy
 from starcal_ros.ros import node
 
+def tell(*numbers):
+    for number in numbers:
+        os.kill(os.getpid(), number)
+    time.sleep(0)  # where Python runs the handlers
+
+def until_shut_down():
+    while rclpy.ok():
+        time.sleep(0.01)
+
+def run(work, end=lambda: node.end_quietly(None)):
+    sys.exit(node.until_told_to_end('maker', [], work, end))
+"""
+FAILS = """
+def work():
+    if 'told' in sys.argv:
+        tell(signal.SIGTERM)
+        until_shut_down()
+    raise RuntimeError('the context\\nis invalid\x1b[2J')
+run(work)
+"""
+TOLD_AGAIN = """
+several = signal.SIGINT, signal.SIGTERM, signal.SIGINT
+def work():
+    tell(*several)
+    until_shut_down()
+def end():
+    tell(*several)
+    node.end_quietly(None)
+    tell(*several)
+    print('ended')
+run(work, end)
+"""
+AT_AN_ENTRY = """
+class Lock:
+    def __enter__(self):
+        tell(signal.SIGTERM)
+    def __exit__(self, *_):
+        print('released')
+def work():
+    with Lock():
+        pass
+    until_shut_down()
+    return 0
+if 'early' in sys.argv:
+    init = rclpy.init
+    rclpy.init = lambda args: (tell(signal.SIGTERM), init(args=args))
+run(work)
+"""
+NEVER_LET_GO = """
 class Held:
     def destroy_node(self):
         ctypes.PyDLL(None).sleep(60)  # keeps the lock of the interpreter, as the middleware does
-
 node._END_S = 1
 rclpy.init()
 node.end_quietly(Held())
 """
+EXECUTOR_AFTER_THE_SHUTDOWN = """
+rclpy.init()
+rclpy.shutdown()
+try:
+    node.Executor(2)
+except Exception:
+    print('refused')
+"""
+SHUT_DOWN_TWICE = """
+signal.signal(signal.SIGTERM, lambda *_: None)
+for _ in range(10_000):
+    rclpy.init()
+    os.kill(os.getpid(), signal.SIGTERM)
+    node.shut_down()
+"""
+# Code, an argument, and exit status, output and error of the process.
+ENDS = {
+    'an error is one line': (
+        FAILS, '', (2, '', 'maker: the context is invalid\\x1b[2J\n'),
+    ),
+    'what fails after a signal is no error': (FAILS, 'told', (0, '', '')),
+    'further signals do not cut the end short': (TOLD_AGAIN, '', (0, 'ended\n', '')),
+    # A KeyboardInterrupt there would leave it taken, and the threads that need it never end.
+    'a signal leaves no lock taken': (AT_AN_ENTRY, '', (0, 'released\n', '')),
+    'a signal before ROS has started': (AT_AN_ENTRY, 'early', (0, '', '')),
+    'the middleware never lets a node go': (NEVER_LET_GO, '', (-signal.SIGALRM, '', '')),
+    'a signal while the executor is constructed': (
+        EXECUTOR_AFTER_THE_SHUTDOWN, '', (0, 'refused\n', ''),
+    ),
+    # `rclpy.try_shutdown` alone fails once in some hundred times: the signal was faster.
+    'a signal shuts ROS down at the same time': (SHUT_DOWN_TWICE, '', (0, '', '')),
+}  # fmt: skip
 
 
-def test_a_node_that_the_middleware_never_lets_go_ends() -> None:
-    assert run(NEVER_LET_GO) == (-signal.SIGALRM, '', '')
+@pytest.mark.parametrize('name', ENDS)
+def test_a_node_ends_by_signals_and_errors(name: str) -> None:
+    code, argument, expected = ENDS[name]
+    assert run(OF_A_NODE + code, argument) == expected
 
 
 EXECUTOR_OF_A_NODE = """
@@ -237,23 +230,6 @@ def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_ba
     lines = [line for line in out.splitlines() if line]
     assert (status, error) == (0, '')
     assert lines.index('executor destroyed') > lines.index('signals answered no more')
-
-
-EXECUTOR_AFTER_THE_SHUTDOWN = """
-import rclpy
-from starcal_ros.ros.node import Executor
-
-rclpy.init()
-rclpy.shutdown()
-try:
-    Executor(2)
-except Exception:
-    print('refused')
-"""
-
-
-def test_a_signal_while_the_executor_is_constructed_prints_no_traceback() -> None:
-    assert run(EXECUTOR_AFTER_THE_SHUTDOWN) == (0, 'refused\n', '')
 
 
 def test_no_event_ends_a_wait_while_a_message_waits_for_a_thread(client: Client) -> None:
@@ -357,26 +333,6 @@ def test_nodes_end_after_several_signals(
     for node in nodes:
         assert node.wait() == 0, node.said()
         assert 'Traceback' not in node.said()
-
-
-SHUT_DOWN_TWICE = """
-import os
-import signal
-
-import rclpy
-from starcal_ros.ros.node import shut_down
-
-signal.signal(signal.SIGTERM, lambda *_: None)
-for _ in range(10_000):
-    rclpy.init()
-    os.kill(os.getpid(), signal.SIGTERM)
-    shut_down()
-"""
-
-
-def test_ros_may_be_shut_down_by_a_signal_at_the_same_time() -> None:
-    """`rclpy.try_shutdown` alone fails once in some hundred times: the signal was faster."""
-    assert run(SHUT_DOWN_TWICE) == (0, '', '')
 
 
 CALLBACK_AT_THE_END = """

@@ -9,10 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from rclpy.serialization import deserialize_message, serialize_message
 from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import array
 from collections.abc import Callable
 import dataclasses
 import json
@@ -13,28 +12,17 @@ import subprocess
 import sys
 from typing import Any, TYPE_CHECKING
 
-import cv2
-import numpy as np
-import pytest
-import yaml
-
-if TYPE_CHECKING:
-    from conftest import Client, NodeProcess, StartNode
-
-    from starcal_ros.records import Calibration as CalibrationRecord
-    from starcal_ros.records import Ensemble
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
-from geometry_msgs.msg import QuaternionStamped, TransformStamped
+from geometry_msgs.msg import QuaternionStamped
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
+import numpy as np
+import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, Temperature
+from sensor_msgs.msg import CameraInfo, Image, Imu, Temperature
 from std_srvs.srv import Trigger
+import yaml
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
@@ -52,7 +40,6 @@ from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     calibration_to_message,
     camera_info_to_message,
-    observations_from_message,
     observations_to_message,
 )
 from starcal_ros.formats.messages.sensor_messages import image_from_message
@@ -66,6 +53,12 @@ from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.records import refused_image
 from starcal_ros.ros.node import make_message
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+    from starcal_ros.records import Calibration as CalibrationRecord
+    from starcal_ros.records import Ensemble
 
 pytestmark = pytest.mark.nodes
 
@@ -231,6 +224,7 @@ def test_gate_refusal_and_force(
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_change_px:=1e-6'))
     client.fill(tiny_observations.images)
     found = client.latched(Calibration, 'calibration')
+    client.until(lambda: found)
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert not answer.success and answer.message.startswith('refused by the gate')
     solved = client.call(Calibrate, '/calibrator/solve')
@@ -250,70 +244,15 @@ def test_gate_refusal_and_force(
     assert calibrator.process.poll() is None
 
 
-def test_every_image_gets_one_answer(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    """Unusable images are refused with a reason, in order, each once."""
-    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=0.5'))
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, 'image', 50)
-    attitudes = client.publisher(QuaternionStamped, 'attitude')
-    client.until_listened()
-    sent = [
-        (blank(1, encoding='rgb8'), 'bad_encoding'),
-        (blank(2, step=3), 'bad_layout'),
-        (blank(3, data=array.array('B')), 'bad_layout'),
-        (blank(10_000_000_000), 'wrong_size'),
-        (blank(9_000_000_000), 'wrong_size'),
-    ]
-    for message, _ in sent:
-        images.publish(message)
-    for k in range(30):
-        attitudes.publish(attitude(k * 500_000_000))
-    client.until(lambda: len(answers) == len(sent))
-    stamps = [message_codec.stamp_ns(m.header.stamp) for m, _ in sent]
-    assert [message_codec.stamp_ns(a.header.stamp) for a in answers] == stamps
-    assert [a.refusal for a in answers] == [reason for _, reason in sent]
-    assert all(a.detail for a in answers)
-    images.publish(blank(60_000_000_000))
-    client.until(lambda: len(answers) == len(sent) + 1)
-    client.until_value('images', '6')
-    level, _, values = client.health()
-    assert (level, values['refused_bad_layout']) == (b'\x01', '2')
-
-
-def test_attitudes_of_an_imu_are_taken_by_their_type(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    """The orientations of an Imu serve as the quaternions do."""
-    start_node('star_observer', ros=parameters(tiny_bag))
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, 'image', 50)
-    attitudes = client.publisher(Imu, 'attitude', 200)
-    client.until_listened()
-    for raw in reader.read_raw([tiny_bag], [ATTITUDES]):
-        decoded = reader.decode(raw)
-        sample = Imu()
-        sample.header.stamp.sec = decoded.header.stamp.sec
-        sample.header.stamp.nanosec = decoded.header.stamp.nanosec
-        for axis in 'xyzw':
-            setattr(sample.orientation, axis, getattr(decoded.quaternion, axis))
-        attitudes.publish(sample)
-    first = next(iter(reader.read_images([tiny_bag], '/opnav/image_raw')))
-    assert isinstance(first, ImageRecord)
-    images.publish(image_to_message(first, 'camera', make_message))
-    client.until(lambda: bool(answers))
-    assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
-
-
 def test_an_image_waits_for_its_attitude_and_has_the_temperature(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
+    """The attitudes are those of an Imu, which the node takes by the type of their publisher."""
     given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
     start_node('star_observer', ros=(*given, *REMAPS, '-r', 'temperature:=/box'))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, IMAGES, 10)
-    attitudes = client.publisher(QuaternionStamped, ATTITUDES)
+    attitudes = client.publisher(Imu, ATTITUDES)
     temperatures = client.publisher(Temperature, '/box')
     first = next(reader.read_raw([tiny_bag], [IMAGES]))
     for offset_ns, degc in ((-2 * 10**9, 3.5), (-(10**9), -7.25), (10**9, 40.0)):
@@ -326,49 +265,15 @@ def test_an_image_waits_for_its_attitude_and_has_the_temperature(
     images.publish(first.data)
     client.until_value('images_waiting', '1')
     assert not answers
-    for sample in reader.read_raw([tiny_bag], [ATTITUDES]):
-        attitudes.publish(sample.data)
+    for raw in reader.read_raw([tiny_bag], [ATTITUDES]):
+        decoded, sample = reader.decode(raw), Imu()
+        sample.header = make_header(raw.log_time_ns, 'icrf', make_message)
+        for axis in 'xyzw':
+            setattr(sample.orientation, axis, getattr(decoded.quaternion, axis))
+        attitudes.publish(sample)
     client.until(lambda: answers)
     assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
     assert answers[0].temperature_degc == -7.25
-
-
-def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A topic of PNG gives the same observations as that of the raw image."""
-    # A small message waits behind a large one of its participant, under load longer than 10 s.
-    patient = 'attitude_timeout_s:=60.0'
-    raw_observer = start_node('star_observer', ros=(*parameters(tiny_bag, patient), *REMAPS))
-    start_node(
-        'star_observer',
-        ros=(
-            *(*parameters(tiny_bag, patient), '-r', f'image:={IMAGES}/compressed'),
-            *('-r', f'attitude:={ATTITUDES}', '-r', 'observations:=of_png'),
-            *('-r', '__node:=png_observer'),
-        ),
-    )
-    raw: list[Any] = client.collect(StarObservations, 'observations')
-    png: list[Any] = client.collect(StarObservations, 'of_png')
-    images = client.publisher(Image, IMAGES, 10)
-    compressed = client.publisher(CompressedImage, f'{IMAGES}/compressed', 10)
-    attitudes = client.publisher(QuaternionStamped, ATTITUDES)
-    client.until(lambda: attitudes.get_subscription_count() == 2)
-    client.until_listened()
-    client.until_listened('png_observer')
-    first = next(iter(reader.read_images([tiny_bag], '/opnav/image_raw')))
-    assert isinstance(first, ImageRecord)
-    message = CompressedImage(format='mono16; png compressed')
-    message.header = make_header(first.time_ns, 'camera', make_message)
-    message.data = array.array('B', cv2.imencode('.png', first.pixels)[1].tobytes())
-    compressed.publish(message)
-    images.publish(image_to_message(first, 'camera', make_message))
-    for sample in reader.read_raw([tiny_bag], [ATTITUDES]):
-        attitudes.publish(sample.data)
-    client.until(lambda: raw and png)
-    assert raw[0].refusal == '' and raw[0].header == png[0].header
-    # Not as bytes: what pads a field to its place in a serialised message may be anything.
-    one, other = (dataclasses.asdict(observations_from_message(m[0])) for m in (raw, png))
-    np.testing.assert_equal(one, other)
-    assert raw_observer.process.poll() is None
 
 
 def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
@@ -409,6 +314,7 @@ def test_camera_info_per_image(
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     calibrations = client.node.create_publisher(Calibration, 'calibration', latched)
     camera = setup.prior.camera
+    client.until_listened()
 
     def show(stamp_ns: int, frame_id: str = 'opnav', **size: int) -> Any:
         message = blank(stamp_ns, **{'width': camera.width, 'height': camera.height, **size})
@@ -429,7 +335,6 @@ def test_camera_info_per_image(
     client.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
     assert [info.header for info in infos] == [headers[0], *headers[2:]]
-    assert lossy[0].header in headers
     expected = camera_info_to_message(active, make_message)
     for info in infos:
         expected.header = info.header
@@ -440,83 +345,28 @@ def test_camera_info_per_image(
     header = show(8)
     client.until(lambda: len(infos) == 4)
     assert infos[-1].header == header
+    # Best effort may lose some of them, also all of a few.
+    client.until(lambda: lossy or not show(9))
+    assert lossy[0].k[0] > 0
 
 
 def test_calibrator_collects_while_it_solves(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
 ) -> None:
-    """Observations that arrive during a calibration are all counted."""
-    start_node('calibrator', ros=parameters(tiny_bag))
+    """Observations that arrive during a calibration are all counted, bad ones are logged."""
+    calibrator = start_node('calibrator', ros=parameters(tiny_bag))
     client.fill(tiny_observations.images)
     observations = client.publisher(StarObservations, 'observations')
     solve = client.node.create_client(Calibrate, '/calibrator/solve')
     client.until(solve.service_is_ready)
     futures = [solve.call_async(Calibrate.Request(dry_run=True)) for _ in range(5)]
+    observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
     for k in range(300):
         refused = refused_image(k, 8, 8, 'no_stars', '')
         observations.publish(observations_to_message(refused, '', make_message))
     client.until(lambda: all(future.done() for future in futures))
     assert all(future.result().success for future in futures)
-    client.until_refused(('no_stars', 300))
-
-
-def test_state_outlasts_a_kill(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
-) -> None:
-    """Ensemble and active calibration survive kill -9; the state folder has one owner."""
-    tool = read_calibration(tiny_products / CALIBRATION_FILE)
-    state = f'state_dir:={tmp_path / "state"}'
-    killed = start_node('calibrator', ros=parameters(tiny_bag, state))
-    play(start_node, tiny_products / 'observations.mcap')
-    client.until_images(tool.images_used, 'images_saved')
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    second = start_node('calibrator', ros=parameters(tiny_bag, state))
-    assert second.wait() == 2
-    assert f'state_dir: {tmp_path / "state"} is in use by another calibrator' in second.said()
-    killed.process.kill()
-    killed.process.wait()
-    # The graph takes twenty seconds to forget the dead: its heir has another name.
-    start_node('calibrator', ros=(*parameters(tiny_bag, state), '-r', '__node:=heir'))
-    found = client.latched(Calibration, 'calibration')
-    client.until(lambda: found)
-    active = calibration_from_message(found[0])
-    assert active.number == 1 and active.active_since_ns > 0
-    again = client.call(Calibrate, '/heir/solve', dry_run=True)
-    answer = calibration_from_message(again.calibration)
-    for one in (active, answer):
-        np.testing.assert_array_equal(one.covariance, tool.covariance)
-    ensemble_by_tool = ['calibrate', str(tmp_path / 'state' / 'ensemble')]
-    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(tmp_path / 'again')]
-    assert main(ensemble_by_tool) == 0
-    repeated = read_calibration(tmp_path / 'again' / CALIBRATION_FILE)
-    np.testing.assert_array_equal(repeated.covariance, tool.covariance)
-
-
-def test_without_images_nothing_is_active_and_a_bad_message_ends_nothing(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    """The prior is no calibration. Inconsistent observations are logged and counted."""
-    calibrator = start_node('calibrator', ros=parameters(tiny_bag))
-    latched = [
-        client.latched(CameraInfo, 'camera_info'),
-        client.latched(TransformStamped, 'alignment'),
-        client.latched(Calibration, 'calibration'),
-    ]
-    answer = client.call(Trigger, '/calibrator/calibrate')
-    assert not answer.success and '\n' not in answer.message
-    assert str(client.until_images(0).min_images) in answer.message
-    rollback = client.call(Trigger, '/calibrator/rollback')
-    assert not rollback.success and rollback.message == 'no calibration is active'
-    client.until(lambda: all(latched))
-    ((info,), (alignment,), (none,)) = latched
-    rotation = alignment.transform.rotation
-    assert not info.k.any() and (rotation.x, rotation.w) == (0.0, 0.0)
-    assert (none.number, none.camera.width, none.reasons) == (0, 0, [])
-    observations = client.publisher(StarObservations, 'observations')
-    observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
-    refused = refused_image(5, 8, 8, 'no_stars', '')
-    observations.publish(observations_to_message(refused, '', make_message))
-    client.until_refused(('bad_observations', 1), ('no_stars', 1))
+    client.until_refused(('bad_observations', 1), ('no_stars', 300))
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
     assert 'Traceback' not in calibrator.said()
 
@@ -542,6 +392,9 @@ def test_a_signal_while_python_imports(name: str) -> None:
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
 
 
+PLAYER = ('bag_player',)
+
+
 def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tuple[str, ...]]:
     """ROS arguments for a changed copy of the parameter file of the bag."""
 
@@ -554,35 +407,35 @@ def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tupl
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'text'),
+    ('names', 'arguments', 'text'),
     [
-        (lambda f, _: parameters(f, 'max_attitude_gap_s:=-1.0'), 'max_attitude_gap_s'),
-        (lambda f, _: parameters(f, 'max_attitude_gap_s:=soon'), 'max_attitude_gap_s'),
-        (lambda f, _: parameters(f, 'attitude_direction:=up'), 'attitude_direction'),
-        (lambda f, _: parameters(f, 'prior_alignment:=[1.0, 2.0]'), 'prior_alignment'),
-        (lambda f, _: parameters(f, 'estimate:=[fx, fz]'), 'estimate'),
-        (lambda f, _: parameters(f, 'observer:=ground'), 'observer: ground needs the site'),
-        (lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
+        (BOTH, lambda f, _: parameters(f, 'max_attitude_gap_s:=soon'), 'max_attitude_gap_s'),
+        (BOTH, lambda f, _: parameters(f, 'observer:=ground'), 'observer: ground needs the site'),
+        (BOTH, lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
         (
+            BOTH,
             lambda f, _: parameters(f, 'magnitude_limt:=6.0'),
             'magnitude_limt: no such parameter (did you mean magnitude_limit?)',
         ),
-        (lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
-        (lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
-        (tiny_parameters(lambda text: text.replace(':', ':::')), 'params.yaml'),
-        (tiny_parameters(lambda text: text + '    psf: {a: [1, b'), 'params.yaml'),
-        (tiny_parameters(lambda text: text.replace('camera.yaml', 'no.yaml')), 'no.yaml'),
+        (BOTH, lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
+        (BOTH, lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
+        (BOTH, tiny_parameters(lambda text: text + '    psf: {a: [1, b'), 'params.yaml'),
+        (BOTH, tiny_parameters(lambda text: text.replace('camera.yaml', 'no.yaml')), 'no.yaml'),
+        (PLAYER, lambda *_: (), 'bag: path of the bag to play is missing'),
+        (PLAYER, lambda *_: ('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such file or folder'),
+        (PLAYER, lambda *_: ('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
     ],
 )
 def test_bad_parameters(
     start_node: StartNode,
     tiny_bag: Path,
     tmp_path: Path,
+    names: tuple[str, ...],
     arguments: Callable[[Path, Path], tuple[str, ...]],
     text: str,
 ) -> None:
-    """A bad parameter ends either node with status 2 and one line that names it."""
-    for node in [start_node(name, ros=arguments(tiny_bag, tmp_path)) for name in BOTH]:
+    """A bad parameter ends a node with status 2 and one line that names it."""
+    for node in [start_node(name, ros=arguments(tiny_bag, tmp_path)) for name in names]:
         assert node.wait() == 2
         said = node.said()
         lines = [line for line in said.splitlines() if line.startswith(f'{node.name}: ')]
@@ -645,24 +498,3 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
         np.testing.assert_array_equal(got.pixels, image.pixels)
     stamps = [message_codec.stamp_ns(m.header.stamp) for m in attitudes]
     assert stamps == sorted(stamps)
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'text'),
-    [
-        ((), 'bag: path of the bag to play is missing'),
-        (('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such file or folder'),
-        (('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
-    ],
-)
-def test_player_refuses(start_node: StartNode, arguments: tuple[str, ...], text: str) -> None:
-    player = start_node('bag_player', ros=arguments)
-    assert player.wait() == 2
-    assert text in player.said() and 'Traceback' not in player.said()
-
-
-def test_player_stops_when_told(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    player: NodeProcess = start_node('bag_player', ros=('-p', f'bag:={tiny_bag}'))
-    client.until(lambda: 'bag_player' in client.node.get_node_names())
-    assert player.stop(signal.SIGTERM) == 0, player.said()
-    assert 'Traceback' not in player.said()

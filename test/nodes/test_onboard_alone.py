@@ -15,22 +15,18 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from ament_index_python.packages import get_packages_with_prefixes
 from node_inputs import BOTH, parameters, REMAPS  # type: ignore[import-not-found]
 from packaging.requirements import Requirement
+import pytest
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration
 import starcal_ros
 from starcal_ros.formats.messages.record_messages import calibration_from_message
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = [pytest.mark.nodes, pytest.mark.usefixtures('onboard')]
 

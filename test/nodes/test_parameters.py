@@ -7,16 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from rcl_interfaces.srv import GetParameters
 
 from starcal_ros.ros.parameters import folders_of_paths, unread_sections
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 

@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-if TYPE_CHECKING:
-    from conftest import Client
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from starcal_ground.ros.bag_player import BagPlayer
 from starcal_ros.ros.node import StarcalNode
 from starcal_ros.ros.printable_log import PrintableLog, PrintableLogger
+
+if TYPE_CHECKING:
+    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 

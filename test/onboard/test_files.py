@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from starcal_ros.errors import ProductError
 from starcal_ros.files import is_marked, mark, replacing
 from starcal_ros.formats.products.product_files import write_atomically
 
@@ -39,6 +40,22 @@ def test_an_exception_leaves_the_old_file(tmp_path: Path, error: type[BaseExcept
     with pytest.raises(error):
         interrupted()
     assert path.read_text() == 'old' and names(tmp_path) == ['a']
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / 'c.json'
+    write_atomically(path, 'old')
+
+    def full(_: int) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('os.fsync', full)
+    with pytest.raises(ProductError, match='No space left'):
+        write_atomically(path, 'new')
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_file_is_known_until_it_is_changed(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib
 import itertools
 from pathlib import Path
 import re
@@ -117,22 +116,6 @@ def heading_anchors(document: Path) -> set[str]:
     return {re.sub(r'[^\w\- ]', '', text).lower().replace(' ', '-') for text in headings}
 
 
-def test_the_documents_are_there() -> None:
-    names = {str(document.relative_to(ROOT)) for document in DOCUMENTS}
-    assert names >= {
-        'README.md',
-        'CONTRIBUTING.md',
-        'docs/icd.md',
-        'docs/algorithm.md',
-        'docs/design.md',
-        'docs/experiments.md',
-        'docs/performance.md',
-        'docs/tutorial.md',
-        'QUALITY_DECLARATION.md',
-        'bags/tiny/README.md',
-    }
-
-
 @pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_somewhere(document: Path) -> None:
     for link in links(document):
@@ -197,28 +180,6 @@ def test_every_parameter_is_in_the_interface_document_and_none_else() -> None:
     text = (ROOT / 'docs' / 'parameters.md').read_text()
     rows = re.findall(r'^\| `(\w+)` \| `[^|]*` \|', text, re.MULTILINE)
     assert sorted(rows) == sorted(names_of(*OPTIONS))
-
-
-FILE_ENDINGS = (
-    *('html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'py', 'sqlite', 'tf', 'ti', 'yaml'),
-)
-
-
-@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_named_functions_exist(document: Path) -> None:
-    homes: dict[str, list[str]] = {}
-    packages = (ROOT / 'starcal_ros', ROOT / 'starcal_ground')
-    for path in (path for package in packages for path in package.rglob('*.py')):
-        dotted = '.'.join(path.relative_to(ROOT).with_suffix('').parts)
-        homes.setdefault(path.stem, []).append(dotted)
-    cited = re.findall(r'`(?:(\w+)/)?(\w+)\.(\w+)(?:\.\w+)?`', document.read_text())
-    for room, module, name in cited:
-        if module not in homes or name in FILE_ENDINGS or room == module:
-            continue  # the last is a file in a folder of its name
-        places = [home for home in homes[module] if not room or f'.{room}.' in home]
-        assert places, f'{room}/{module}'
-        found = (importlib.import_module(home) for home in places)
-        assert any(hasattr(home, name) for home in found), f'{module}.{name}'
 
 
 def test_topics_and_services_are_names_that_the_nodes_use() -> None:
@@ -345,10 +306,6 @@ def test_a_program_of_a_document_runs(
     exec(compile(program, document.name, 'exec'), {})
 
 
-def test_most_programs_run() -> None:
-    assert sum(runs for *_, runs in PROGRAMS) >= 4
-
-
 def test_the_demo_lines_of_the_tutorial_are_those_of_the_demo(tiny_products: Path) -> None:
     """Estimates within a tenth of their sigma, sigmas within 2 %."""
     bag = demo.tiny_bag(tiny_products)
@@ -384,10 +341,6 @@ def numbers(line: str) -> list[float]:
     return [float(n) for n in re.findall(r'(?<!\w)[-+]?[\d.]+(?:e[-+]?\d+)?', line)]
 
 
-def test_the_tutorial_shows_a_parameter_file() -> None:
-    assert 'tutorial.md' in {path.name for path, _ in PARAMETER_BLOCKS}
-
-
 def test_the_readme_is_one_page() -> None:
     """About 600 words of text."""
     text = FENCE.sub('', (ROOT / 'README.md').read_text())
@@ -397,19 +350,6 @@ def test_the_readme_is_one_page() -> None:
 @pytest.mark.parametrize('target', MAKE_TARGETS)
 def test_make_knows_the_target(target: str) -> None:
     assert run('make', '--dry-run', target).returncode == 0
-
-
-def test_scripts_that_are_named_exist() -> None:
-    lines = [
-        line.words
-        for line in (*lines_of('python'), *lines_of('python3'))
-        if line.words[1:2] == ('-m',)
-    ]
-    assert lines
-    for words in lines:
-        module = ROOT / words[2].replace('.', '/')
-        ours = module.with_suffix('.py').is_file() or (module / '__main__.py').is_file()
-        assert ours or words[2] in ('pytest', 'cProfile', 'pip'), words
 
 
 def interface(directions: str) -> dict[str, str]:
@@ -474,7 +414,13 @@ def test_what_a_ros2_line_names_is_there(line: Line) -> None:
         assert verb in ('launch', 'run') and rest[0] != 'starcal', line
 
 
-def test_the_documents_show_the_ways_into_the_vehicle() -> None:
+def test_the_documents_have_what_is_tested() -> None:
+    """Commands and programs that run, a parameter file, and the ways into the vehicle."""
+    assert {path.name for path in RUNNING} >= {'README.md', 'tutorial.md'}
+    ran = {line.words[1] for line in TOOL_LINES if line.runs}
+    assert ran >= {'diagnose', 'calibrate', 'compare'}
+    assert sum(runs for *_, runs in PROGRAMS) >= 4
+    assert 'tutorial.md' in {path.name for path, _ in PARAMETER_BLOCKS}
     assert {line.words[1] for line in lines_of('ros2')} >= {'launch', 'run', 'service', 'topic'}
 
 

@@ -26,8 +26,7 @@ from starcal_ground.cli import main
 from starcal_ground.comparison import alignment_difference_rad, compare, truth_like
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
-from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, CameraGeometry, Image
@@ -72,38 +71,13 @@ def read_truth(path: Path) -> CameraGeometry:
     return simulated_bag.true_geometry(json.loads(path.read_text()))
 
 
-def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[float, int]:
-    """Squared Mahalanobis error of all estimated parameters, and their number."""
-    free = [k for k, name in enumerate(PARAMETER_NAMES) if name in calibration.estimated]
-    error = np.r_[
-        (calibration.geometry.camera.parameters - truth.camera.parameters)[free],
-        alignment_difference_rad(calibration.geometry, truth),
-    ]
-    rows = [*free, 10, 11, 12]
-    covariance = calibration.covariance[np.ix_(rows, rows)]
-    sigma = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(sigma, sigma)
-    whitened = np.linalg.solve(np.linalg.cholesky(correlation), error / sigma)
-    return float(whitened @ whitened), len(rows)
-
-
 def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> None:
     """Assert each parameter within 5 sigma, and the Mahalanobis error within 5 sigma."""
     compared = compare(calibration, truth_like(calibration, truth))
     sigmas = compared.sigmas if compared.is_aligned else compared.sigmas[:-3]
     assert np.nanmax(np.abs(sigmas)) < 5, sigmas
-    chi2, count = normalised_error(calibration, truth)
-    assert chi2 < count + 5 * np.sqrt(2 * count)  # five standard deviations of chi^2
-
-
-def map_error_arcsec(calibration: Calibration, truth: CameraGeometry) -> float:
-    """RMS over the detector of the line-of-sight error after the best common rotation."""
-    grid = pixel_grid(truth.camera, 25, 25)
-    estimate = line_of_sight(calibration.geometry.camera, grid)
-    true = line_of_sight(truth.camera, grid)
-    rotation, _ = Rotation.align_vectors(true, estimate)
-    error = np.linalg.norm(rotation.apply(estimate) - true, axis=1)
-    return float(np.sqrt(np.mean(error**2)) / ARCSECOND_RAD)
+    count = compared.total.degrees_of_freedom
+    assert compared.total.value < count + 5 * np.sqrt(2 * count)  # 5 deviations of chi^2
 
 
 def test_the_tiny_bag_gives_the_truth(tiny_products: Path) -> None:
@@ -117,7 +91,11 @@ def test_the_tiny_bag_gives_the_truth(tiny_products: Path) -> None:
         read_camera_info(TINY / 'camera.yaml'), calibration.geometry.star_tracker_from_camera_xyzw
     )
     before = dataclasses.replace(calibration, geometry=prior)
-    assert map_error_arcsec(calibration, truth) < 0.2 * map_error_arcsec(before, truth)
+    (_, error_px), (_, prior_error_px) = (
+        compare(one, truth_like(one, truth)).after.worst_and_rms_px
+        for one in (calibration, before)
+    )
+    assert error_px < 0.2 * prior_error_px
 
 
 def test_camera_info_is_the_calibration_without_skew(tiny_products: Path) -> None:
@@ -142,17 +120,6 @@ def test_recorded_observations_give_the_same_calibration(
     )
     second['provenance'] = first['provenance']  # the one names images, the other observations
     assert first == second
-
-
-def test_observations_are_not_calibrated_in_place(tiny_products: Path, tmp_path: Path) -> None:
-    bag = tmp_path / 'observations.mcap'
-    content = (tiny_products / 'observations.mcap').read_bytes()
-    bag.write_bytes(content)
-    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
-    assert done.returncode == 2 and 'holds the bag that is read' in done.stderr, done.stderr
-    assert bag.read_bytes() == content
-    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
@@ -211,34 +178,10 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
             assert abs(row - 5) <= 2 and abs(column - 5) <= 2
 
 
-def test_eight_bit_images_give_the_truth(tmp_path: Path) -> None:
-    scenario = synthetic.scenario('tiny', 3)
-    detector = dataclasses.replace(
-        scenario.detector, bits=8, electrons_per_dn=16.0, offset_dn=10.0
-    )
-    scenario = dataclasses.replace(scenario, detector=detector)
-    made = simulated_bag.write_bag(scenario, tmp_path / 'bag')
-    calibration = calibrated(made, tmp_path / 'out')
-    assert_close_to_truth(calibration, read_truth(made.truth))
-
-
 def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
     scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
     made = simulated_bag.write_bag(scenario, tmp_path / 'bag.mcap')
     calibration = calibrated(made, tmp_path / 'out')
-    assert_close_to_truth(calibration, read_truth(made.truth))
-
-
-def test_a_launch_shift_of_a_degree_is_found(tmp_path: Path) -> None:
-    scenario = synthetic.scenario('tiny', 4)
-    mounting = Rotation.from_quat(scenario.prior.star_tracker_from_camera_xyzw)
-    shift = Rotation.from_rotvec(np.radians([0.8, -0.7, 0.6]))  # 1.2 degrees; 1.5 is the limit
-    prior = dataclasses.replace(
-        scenario.prior, star_tracker_from_camera_xyzw=(mounting * shift).as_quat()
-    )
-    made = simulated_bag.write_bag(dataclasses.replace(scenario, prior=prior), tmp_path / 'bag')
-    calibration = calibrated(made, tmp_path / 'out')
-    assert calibration.images_used == 10
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 
@@ -255,34 +198,15 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
     assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
 
 
-def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
-    content = bytearray((TINY / 'tiny_0.mcap').read_bytes())
-    content[len(content) * 9 // 10] ^= 4
-    bag = tmp_path / 'flipped.mcap'
-    bag.write_bytes(content)
-    done = in_a_process('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    assert done.returncode == 0, done.stderr
-    assert 'damaged' in done.stderr and 'Traceback' not in done.stderr
-    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
-    assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
-
-
 @needs_interfaces
 @pytest.mark.nodes
-def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path) -> None:
+def test_the_demonstration_on_the_real_graph(tmp_path: Path) -> None:
     done = in_a_process('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'sigma' in done.stdout and 'alignment z' in done.stdout
     assert done.stdout.endswith(f'open {tmp_path / "report.html"}\n')
     assert (tmp_path / 'report.html').stat().st_size > 100_000  # with its pictures
-    # The nodes and the tool give the same calibration from the same bag.
-    nodes = read_calibration(tmp_path / 'calibration.json')
-    tool = read_calibration(tiny_products / 'calibration.json')
-    assert nodes.stars_used == tool.stars_used
-    # The nodes predict with the newest attitude; where a stamp is the same, so is everything.
-    sigma = np.where(tool.sigma > 0, tool.sigma, 1.0)
-    change = nodes.geometry.camera.parameters - tool.geometry.camera.parameters
-    assert np.abs(change / sigma[:10]).max() < 1e-6
+    assert read_calibration(tmp_path / 'calibration.json').images_used == 10
 
 
 @needs_interfaces

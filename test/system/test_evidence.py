@@ -109,12 +109,12 @@ def test_a_table_of_two_files_shows_what_changed_and_what_is_gone() -> None:
     assert lies.rows == [('y', '2.50 → -', '0.50 → -', '1.00 → -', '1.00 → -')]
 
 
-@pytest.mark.parametrize('body', ['disc', 'limb', 'crescent', 'bloom', 'ghosts', 'moons'])
-def test_a_planet_is_in_the_frame_and_hides_stars(body: str) -> None:
-    made = world(body)
-    scenario = scenario_of(made, 3)
-    with_it, without = (next(frames(one, scenario))[0].pixels for one in (made, World('sound')))
-    full = with_it == scenario.detector.full_dn
-    assert full.mean() > 10 * (without == scenario.detector.full_dn).mean() + 1e-4
-    # Scattered light covers the rest of the frame, photon noise aside.
-    assert with_it[~full].mean() > without[~full].mean()
+def test_a_planet_is_in_the_frame_and_hides_stars() -> None:
+    scenario = scenario_of(world('disc'), 3)
+    without = next(frames(World('sound'), scenario))[0].pixels
+    for body in ('disc', 'limb', 'crescent', 'bloom', 'ghosts', 'moons'):
+        with_it = next(frames(world(body), scenario))[0].pixels
+        full = with_it == scenario.detector.full_dn
+        assert full.mean() > 10 * (without == scenario.detector.full_dn).mean() + 1e-4, body
+        # Scattered light covers the rest of the frame, photon noise aside.
+        assert with_it[~full].mean() > without[~full].mean(), body

@@ -5,32 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import dataclasses
-import hashlib
 import json
 import os
 from pathlib import Path
-import shutil
-from typing import Any
 
-from attacks import drawn, spoilt_text  # type: ignore[import-not-found]
+from attacks import BAG, calibration, drawn, setup, spoilt_text  # type: ignore[import-not-found]
 from hypothesis import given
 import numpy as np
 import pytest
 
-from bench.frames import write_set_up
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
 from starcal_ground.products import prior_of
-from starcal_ground.simulation.centroids import true_observations
-from starcal_ground.simulation.scenario import scenario
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.bag.typestore import observations_bag
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import (
     CALIBRATION_FILE,
@@ -38,12 +30,9 @@ from starcal_ros.formats.products.product_files import (
     write_calibration,
 )
 from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODES
-from starcal_ros.records import Activation, Calibration, Ensemble, Image
-from starcal_ros.ros.archive import Archive
+from starcal_ros.records import Image
 
-SCENARIO = scenario('tiny')
 pytestmark = pytest.mark.slow
 
 
@@ -59,20 +48,6 @@ def read_or_refused() -> Iterator[None]:
     assert len(refusal.splitlines()) <= 1 and len(refusal) < 5000
 
 
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the parameter file and the camera file of the scenario."""
-    path = tmp_path_factory.mktemp('set_up')
-    write_set_up(SCENARIO, path)
-    return path
-
-
-@pytest.fixture(scope='module')
-def calibration(folder: Path) -> Calibration:
-    setup = load_setup(read_parameter_file(folder / 'params.yaml', NODES))
-    return solve.solve(true_observations(SCENARIO), setup)
-
-
 def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60) -> None:
     """Write spoilt copies of a text to a file, and read each."""
 
@@ -86,27 +61,25 @@ def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60)
     spoil()
 
 
-def test_parameter_files(folder: Path, tmp_path: Path) -> None:
-    values = read_parameter_file(folder / 'params.yaml', NODES)
-    setup = load_setup(values)
-    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup.options().items()}
+def test_parameter_files(tmp_path: Path) -> None:
+    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup().options().items()}
     lines = [f'    {name}: {json.dumps(value)}' for name, value in flow.items()]
 
     def read(path: Path) -> None:
-        load_setup(read_parameter_file(path, NODES), setup.prior)
+        load_setup(read_parameter_file(path, NODES), setup().prior)
 
     text = '\n'.join(['/**:', '  ros__parameters:', *lines])
     spoils(text, tmp_path / 'params.yaml', read)
 
 
-def test_camera_files(folder: Path, tmp_path: Path) -> None:
+def test_camera_files(tmp_path: Path) -> None:
     def read(path: Path) -> None:
         camera = read_camera_info(path)
         project(camera, line_of_sight(camera, pixel_grid(camera, 5, 5)))
         field_radius_rad(camera)
         ros_fit(camera)
 
-    spoils((folder / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
+    spoils((BAG / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
 
 
 def test_metadata_of_bags(tmp_path: Path) -> None:
@@ -122,85 +95,19 @@ def test_metadata_of_bags(tmp_path: Path) -> None:
     spoils(path.read_text(), path, read)
 
 
-def test_calibration_files(calibration: Calibration, tmp_path: Path) -> None:
+def test_calibration_files(tmp_path: Path) -> None:
     path = tmp_path / CALIBRATION_FILE
-    write_calibration(calibration, path)
+    write_calibration(calibration(), path)
 
     def read(path: Path) -> None:
         back = read_calibration(path)
         prior_of(back)
         if back.accepted or back.forced:
-            compare(calibration, back)
+            compare(calibration(), back)
             camera = back.geometry.camera
             line_of_sight_table(camera, back.map_covariance, pixel_grid(camera, 3, 3))
 
     spoils(path.read_text(), path, read)
-
-
-def test_state_files_with_new_checksums(calibration: Calibration, tmp_path: Path) -> None:
-    """Other records are not read in place of those of the folder."""
-    sound, copy = tmp_path / 'sound', tmp_path / 'copy'
-    first = Activation(1, 0, dataclasses.replace(calibration, number=1))
-    ensemble = Ensemble(true_observations(SCENARIO).images[:1], {'no_match': 3})
-    with contextlib.closing(Archive(sound, 'camera')) as archive:
-        archive.keep(ensemble, (first,))
-
-    for file in sorted(sound.rglob('*.json')):
-
-        def read(path: Path, file: Path = file) -> None:
-            shutil.rmtree(copy, ignore_errors=True)
-            shutil.copytree(sound, copy)
-            (copy / file.relative_to(sound)).write_bytes(sealed_again(path.read_bytes()))
-            with contextlib.closing(Archive(copy, 'camera')) as archive:
-                images, history = archive.read_ensemble(), archive.read_history()
-                assert len(images.images) == 1 and len(history) <= 1
-                archive.keep(images, history)
-                assert all('\n' not in text for text in archive.damage)
-
-        spoils(file.read_text(), tmp_path / 'content', read, 30)
-
-
-def sealed_again(content: bytes) -> bytes:
-    """The content with its checksum made right, where it is a JSON object."""
-    try:
-        fields = json.loads(content)
-        del fields['sha256']
-        text = json.dumps(fields, sort_keys=True, separators=(',', ':'))
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        return json.dumps({**fields, 'sha256': digest}).encode()
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return content
-
-
-@pytest.mark.nodes
-def test_observations() -> None:
-    """Mutants of a message are refused, or saved, read again and counted."""
-    pytest.importorskip('rclpy')
-    from mutants import mutants  # type: ignore[import-not-found]
-
-    from starcal_ros.formats.messages.record_messages import (
-        checked_observations,
-        observations_to_message,
-    )
-    from starcal_ros.ros.node import make_message
-
-    images = true_observations(SCENARIO).images
-    brightest = images[0].select(np.argsort(np.argsort(-images[0].flux_dn)) < 20)
-    setup = load_setup({}, SCENARIO.prior)
-    answers = {'refused': 0, 'saved': 0}
-
-    @drawn(60)
-    @given(mutants(observations_to_message(brightest, 'camera', make_message)))
-    def mutate(message: Any) -> None:
-        with read_or_refused():
-            record = checked_observations(message)
-            observations_bag('/observations', record, 'camera')
-            ensemble = solve.add_to_ensemble(Ensemble(images[1:4]), record, setup)
-            assert not np.isnan(solve.ensemble_status(ensemble, setup).predicted_sigma).any()
-            answers['refused' if record.refusal else 'saved'] += 1
-
-    mutate()
-    assert answers['saved'] and answers['refused']
 
 
 def test_pipes_in_a_folder_are_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

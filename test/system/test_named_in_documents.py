@@ -248,14 +248,16 @@ def test_a_docstring_names_no_function_of_docstrings_alone() -> None:
     assert is_in_code('line_of_sight_table') and not is_in_code('line_of_sight_jacobian')
 
 
-def test_lines_of_pytest_bench_and_studies_in_documents_exist() -> None:
-    """In indented blocks too: files of tests, -m and -k, names of benches, options of studies."""
+def test_lines_that_run_a_module_of_python_exist() -> None:
+    """In indented blocks too: modules, files of tests, names of benches, options of studies."""
     for document in DOCUMENTS:
-        for line in re.findall(r'-m (pytest|bench|studies) ([^\n#`]*)', document.read_text()):
-            if line[0] == 'bench':
+        for line in re.findall(r'python3? -m ([\w.]+) ?([^\n#`]*)', document.read_text()):
+            if line[0] not in ('bench', 'pytest', 'studies'):
+                assert importlib.util.find_spec(line[0]), line
+            elif line[0] == 'bench':
                 name = line[1].split()[:1]
                 assert not name or name[0].startswith('-') or is_bench(f'bench {name[0]}')
-            elif line[0] == 'studies':
+            elif line[0] == 'studies' and line[1]:
                 studies.parser().parse_args(shlex.split(line[1].replace('STUDY', 'table1')))
             else:
                 words_of = [word for word in line[1].split() if word.startswith('test/')]

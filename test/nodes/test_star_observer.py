@@ -8,13 +8,9 @@ from pathlib import Path
 import threading
 from typing import TYPE_CHECKING
 
-import pytest
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
-
 from geometry_msgs.msg import TwistStamped
 from node_inputs import in_this_process  # type: ignore[import-not-found]
+import pytest
 
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration

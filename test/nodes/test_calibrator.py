@@ -1,23 +1,18 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Activations by several requests at once, on the node itself."""
+"""The calibrator in the process of the test: requests at once, new limits, foreign transforms."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 import threading
-from typing import TYPE_CHECKING
-
-import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client
-
-pytest.importorskip('rclpy')
-pytest.importorskip('starcal.msg')
+from types import SimpleNamespace
+from typing import Any, TYPE_CHECKING
 
 from geometry_msgs.msg import TransformStamped
 from node_inputs import in_this_process  # type: ignore[import-not-found]
+import pytest
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
@@ -31,6 +26,9 @@ from starcal_ros.records import Ensemble
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.state import Answer
+
+if TYPE_CHECKING:
+    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 
@@ -73,3 +71,47 @@ def test_what_is_latched_is_what_is_active(client: Client, calibrator: Calibrato
     assert (found.number, found.active_since_ns) == (active.number, active.active_since_ns)
     assert infos == [camera_info_to_message(active, make_message)]
     assert alignments == [alignment_to_message(active, make_message)]
+
+
+def test_diagnostics_are_of_the_limits_of_today(client: Client, calibrator: Calibrator) -> None:
+    """Cleaned up, configured with a tighter limit, and back, in one process."""
+    assert calibrator._on_calibrate(None, Trigger.Response()).success
+    latched: list[Any] = client.latched(CameraInfo, 'camera_info')
+
+    def configure(max_change_px: float) -> dict[str, object]:
+        calibrator.trigger_deactivate()
+        calibrator.trigger_cleanup()
+        parameter = Parameter('max_change_px', Parameter.Type.DOUBLE, max_change_px)
+        assert calibrator.set_parameters([parameter])[0].successful
+        calibrator.trigger_configure()
+        calibrator.trigger_activate()
+        return dict(calibrator.health()[2])
+
+    strict = configure(1e-6)
+    assert strict['active'] == 'none' and str(strict['last_gate']).startswith('refused: calib')
+    client.until(lambda: latched and latched[-1].k[0] == 0)
+    assert not calibrator._on_calibrate(None, Trigger.Response()).success
+    relaxed = configure(10.0)
+    told = [relaxed[key] for key in ('active', 'last_gate', 'last_answer')]
+    assert told == [1, 'accepted', '']
+    client.until(lambda: latched[-1].k[0] > 0)
+
+
+def transform(frame: str, x: float) -> TransformStamped:
+    made = TransformStamped(child_frame_id=frame)
+    made.transform.translation.x = x
+    return made
+
+
+def test_a_transform_of_another_node_is_named(
+    calibrator: Calibrator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only to a frame that this node publishes too, and not its own message."""
+    monkeypatch.setattr(calibrator, 'count_publishers', lambda topic: 2)
+    own = transform(calibrator._setup.frames.camera_frame, 0.0)
+    calibrator._own_transforms.append(own)
+    calibrator._on_transforms(SimpleNamespace(transforms=[own, transform('other', 1.0)]))
+    assert calibrator._foreign_transforms() == ''
+    foreign = transform(f'/{own.child_frame_id}', 1.0)
+    calibrator._on_transforms(SimpleNamespace(transforms=[foreign]))
+    assert f'publishes {own.child_frame_id} too' in calibrator._foreign_transforms()

@@ -1,0 +1,32 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Files of tests with nodes are skipped where rclpy or the messages of starcal are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+MISSING = [name for name in ('rclpy', 'starcal') if find_spec(name) is None]
+
+
+class WithoutRos(pytest.Module):
+    """A file of tests that cannot be imported here."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        """Skip the file with the reason."""
+        pytest.skip(f'{MISSING[0]} is not installed')
+
+
+def pytest_pycollect_makemodule(
+    module_path: Path, parent: pytest.Collector
+) -> pytest.Module | None:
+    """Skip a file of this folder with tests marked ``nodes``."""
+    is_with_nodes = module_path.parent == Path(__file__).parent and (
+        'pytest.mark.nodes' in module_path.read_text()
+    )
+    if MISSING and is_with_nodes:
+        return WithoutRos.from_parent(parent, path=module_path)
+    return None
