@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 import pytest
-from random_pointings import displaced, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from worlds import displaced, each_image, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
@@ -39,12 +39,12 @@ def worst_of(bins: list[ResidualBin]) -> ResidualBin:
 def with_noise(ensemble: Ensemble, factor: Callable[[int, StarObservations], Floats]) -> Ensemble:
     """The ensemble with more noise: so many sigma of each star of each image."""
     rng = np.random.default_rng(14)
-    images = []
-    for k, image in enumerate(ensemble.images):
+
+    def noisy(k: int, image: StarObservations) -> dict[str, Floats]:
         sigma_px = np.sqrt(image.covariance_px2[:, [0, 2]]) * factor(k, image)[:, None]
-        noise_px = sigma_px * rng.normal(size=sigma_px.shape)
-        images.append(dataclasses.replace(image, measured_px=image.measured_px + noise_px))
-    return Ensemble(tuple(images))
+        return {'measured_px': image.measured_px + sigma_px * rng.normal(size=sigma_px.shape)}
+
+    return each_image(ensemble, noisy)  # type: ignore[no-any-return]
 
 
 def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
@@ -148,20 +148,6 @@ def test_a_part_that_scatters_more_is_named(by: str) -> None:
     assert found[-1].normalised > 1.2 > 1.0 > found[0].normalised
 
 
-def test_a_bad_part_of_the_detector_shows_in_the_cells() -> None:
-    """A bubble of 60 px in a corner of the window, 0.4 px: too small for the field."""
-    given = of_random_pointings(15, images=12)
-
-    def bubble(pixels: Floats) -> Floats:
-        inside = np.linalg.norm(pixels - [1180.0, 900.0], axis=1) < 60.0
-        return np.stack([0.35 * inside, -0.25 * inside], axis=-1)
-
-    bins = bins_of(given, displaced(true_observations(given), bubble))
-    worst = worst_of(bins)
-    assert (worst.by, worst.high) == ('cell', max(one.high for one in bins if one.by == 'cell'))
-    assert worst.normalised > 1.0 + 3.5 * worst.sigma
-
-
 def torn(ensemble: Ensemble, size_px: float = 0.3) -> Ensemble:
     """The ensemble whose last image has a shape of its own, as of a shutter that sticks."""
     last = ensemble.images[-1]
@@ -170,19 +156,16 @@ def torn(ensemble: Ensemble, size_px: float = 0.3) -> Ensemble:
     return Ensemble((*ensemble.images[:-1], dataclasses.replace(last, measured_px=moved_px)))
 
 
-def test_a_bad_image_shows_in_its_part() -> None:
-    given = of_random_pointings(16, images=8)
-    bins = bins_of(given, torn(true_observations(given)))
-    assert worst_of(bins).by == 'image' and worst_of(bins).high == 7.0
-    assert worst_of(bins).normalised > 1.1
+def of_a_cell(_: int, image: StarObservations) -> dict[str, Floats]:
+    inside = (np.abs(image.measured_px - [980.0, 580.0]) < 80.0).all(axis=1)
+    return {'measured_px': image.measured_px + np.outer(inside, [0.3, 0.0])}
 
 
-FAULTS = {
-    'cell': lambda x, m: 0.3 * ((np.abs(x - [980.0, 580.0]) < 80.0).all(axis=1)),
-    'brightness': lambda x, m: 0.1 * (m > 7.2),
-    'image': None,
-}
-"""Displacements along u of stars at pixels x of magnitudes m, by the part that shows them."""
+def of_faint_stars(_: int, image: StarObservations) -> dict[str, Floats]:
+    return {'measured_px': image.measured_px + np.outer(image.magnitude > 7.2, [0.1, 0.0])}
+
+
+FAULTS = {'cell': of_a_cell, 'brightness': of_faint_stars, 'image': None}
 
 
 @pytest.mark.parametrize('by', list(FAULTS))
@@ -192,16 +175,8 @@ def test_a_fault_is_seen_in_its_part(by: str) -> None:
     ensemble, fault = true_observations(given), FAULTS[by]
     sound = worst_of(bins_of(given, ensemble))
     assert sound.normalised < 1.0 + 3.5 * sound.sigma
-    images = tuple(
-        dataclasses.replace(
-            image,
-            measured_px=image.measured_px
-            + np.outer(fault(image.measured_px, image.magnitude), [1.0, 0.0]),
-        )
-        for image in ensemble.images
-        if fault
-    )
-    worst = worst_of(bins_of(given, Ensemble(images) if fault else torn(ensemble, 0.4)))
+    faulty = each_image(ensemble, fault) if fault else torn(ensemble, 0.4)
+    worst = worst_of(bins_of(given, faulty))
     assert worst.by == by
     assert worst.normalised > 1.0 + 5.0 * worst.sigma
 
@@ -249,13 +224,13 @@ def of_three_fields() -> tuple[Scenario, Ensemble]:
         for image in ensemble.images
         for one in image.catalog_id.tolist()
     }
-    images = []
-    for image in ensemble.images:
+
+    def moved(_: int, image: StarObservations) -> dict[str, Floats]:
         seen = line_of_sight(given.truth.camera, image.measured_px)
         turn = np.array([off[one] for one in image.catalog_id.tolist()])
-        moved_px = project(given.truth.camera, seen + turn) - image.measured_px
-        images.append(dataclasses.replace(image, measured_px=image.measured_px + moved_px))
-    return given, Ensemble(tuple(images))
+        return {'measured_px': project(given.truth.camera, seen + turn)}
+
+    return given, each_image(ensemble, moved)
 
 
 def test_an_image_is_predicted_where_stars_come_again() -> None:

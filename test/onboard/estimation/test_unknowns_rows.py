@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from random_pointings import estimated, of_random_pointings  # type: ignore[import-not-found]
+from worlds import each_image, estimated, of_random_pointings  # type: ignore[import-not-found]
 
 from starcal_ground.planning.plan import prospect, target
 from starcal_ground.simulation.centroids import true_observations
@@ -22,7 +22,7 @@ from starcal_ros.estimation import unknowns
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.unknowns import Given, Kind, PriorTest, Unknown
-from starcal_ros.records import Ensemble, GateCheck
+from starcal_ros.records import Ensemble, GateCheck, StarObservations
 
 MASS_ICRF = np.array([0.6, 0.8, 0.0])
 TRUE_ARCSEC = 2.0  # at 90 degrees five hundred times the Sun's: a few images show it
@@ -52,14 +52,14 @@ def row(sigma_arcsec: float) -> Kind:
 
 def deflected(made: Scenario) -> Ensemble:
     """Observations whose catalog has the stars where they were without the mass."""
-    images = []
-    for image in true_observations(made).images:
+
+    def moved(_: int, image: StarObservations) -> dict[str, Floats]:
         e = image.direction_icrf
         cosine = (e @ MASS_ICRF)[:, None]
         e = e - TRUE_ARCSEC * ARCSECOND_RAD * (e * cosine - MASS_ICRF) / (1.0 - cosine)
-        e /= np.linalg.norm(e, axis=1, keepdims=True)
-        images.append(dataclasses.replace(image, direction_icrf=e))
-    return Ensemble(tuple(images))
+        return {'direction_icrf': e / np.linalg.norm(e, axis=1, keepdims=True)}
+
+    return each_image(true_observations(made), moved)  # type: ignore[no-any-return]
 
 
 def solved(monkeypatch: pytest.MonkeyPatch, sigma_arcsec: float) -> Estimate:
