@@ -9,7 +9,6 @@ import math
 from four_images import (  # type: ignore[import-not-found]
     ASSUMED,
     CAMERA,
-    cosine,
     Dense,
     HEIGHT,
     IMAGES,
@@ -222,26 +221,6 @@ def test_octaves_are_of_wavelengths_down_to_a_width_its_half_and_its_quarter(
     waves = np.hypot(i / 2.7, j * WIDTH / (2.7 * HEIGHT))
     assert len(entry) == 2 * (np.count_nonzero(waves <= 4.0) - 1)
     assert {'field_9_0_u_px', 'field_0_6_v_px', 'field_1_0_v_px'} <= set(entry.labels)
-
-
-def test_an_amplitude_of_one_is_about_the_rms_of_its_octave_along_each_axis(
-    given: Small,
-) -> None:
-    entry = given.layout['field']
-    assert entry.functions is not None and entry.octave is not None
-    u, v = (size * (np.arange(60) + 0.5) / 60 - 0.5 for size in (WIDTH, HEIGHT))
-    grid = np.stack([np.repeat(u, 60), np.tile(v, 60)])
-    phi = entry.functions(grid)
-    t = len(entry) // 2
-    for axis in (slice(0, t), slice(t, 2 * t)):
-        for octave in range(3):
-            terms = entry.octave[axis] == octave
-            variance = (entry.sigma[axis][terms, None] ** 2 * phi[terms] ** 2).sum(axis=0)
-            # The mean square is one over the longer domain of the cosines, of which the longest
-            # waves have their extremes beyond the detector: 0.8 on it.
-            assert np.sqrt(variance.mean()) == pytest.approx(1.0, abs=0.22)
-    k = entry.labels.index('field_3_1_u_px')
-    assert phi[k] == pytest.approx(cosine(grid[0], 3, WIDTH) * cosine(grid[1], 1, HEIGHT))
 
 
 def test_the_field_has_the_next_radial_term_of_a_lens_free_of_lower_ones(given: Small) -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.weights import _brightness, _line, CentroidVariance, estimate_variance
+from starcal_ros.estimation.weights import _brightness, CentroidVariance, estimate_variance
 
 N = 6000
 
@@ -70,13 +70,6 @@ def test_a_planted_function_of_brightness_is_recovered() -> None:
     )
 
 
-def test_sound_centroids_have_a_factor_of_one() -> None:
-    rng = np.random.default_rng(3)
-    covariance, magnitude = centroids(rng)
-    found = estimated(residuals(rng, covariance), covariance, magnitude)
-    assert found.class_factor == pytest.approx([1.0] * 5, abs=0.12)
-
-
 def test_few_stars_have_no_function_of_brightness() -> None:
     rng = np.random.default_rng(4)
     covariance, magnitude = centroids(rng, 79)
@@ -123,31 +116,6 @@ def test_the_clip_is_at_four_and_a_half_sigma_and_makes_no_step() -> None:
     assert scales[-1] == pytest.approx(1.0, abs=0.002)
 
 
-def test_freedom_makes_the_variance_of_a_fit_with_few_stars_unbiased() -> None:
-    # 500 images of five stars: a shift of each image is fitted, bright stars hold it.
-    rng = np.random.default_rng(7)
-    images, stars = 500, 5
-    n = images * stars
-    sigma = np.tile([0.05, 0.2, 0.2, 0.2, 0.3], images)
-    covariance = np.stack([sigma**2, 0 * sigma, sigma**2], axis=1)
-    error = residuals(rng, covariance).reshape(images, stars, 2)
-    weight = (sigma**-2).reshape(images, stars)
-    share = weight / weight.sum(axis=1, keepdims=True)
-    residual = error - np.einsum('ms,msa->ma', share, error)[:, None]
-    magnitude = np.tile([2.0, 5.0, 5.1, 5.2, 6.0], images)
-    used = np.ones(n, bool)
-    flat = residual.reshape(n, 2)
-    freedom = 2.0 * (1.0 - share.ravel())
-    found = estimate_variance(flat, covariance, magnitude, used, freedom)
-    of_star = found.of(covariance, magnitude)[:, 0] / covariance[:, 0]
-    bright = magnitude == 2.0
-    # The bright star keeps a tenth of its freedom: 100 of 1000, so 14 %, and the prior's share.
-    assert of_star[bright].mean() == pytest.approx(1.0, abs=0.3)
-    assert of_star[~bright].mean() == pytest.approx(1.0, abs=0.1)
-    ignored = estimate_variance(flat, covariance, magnitude, used, np.full(n, 2.0))
-    assert (ignored.of(covariance, magnitude)[:, 0] / covariance[:, 0])[bright].mean() < 0.5
-
-
 def test_a_star_without_freedom_does_not_count_without_limit() -> None:
     rng = np.random.default_rng(8)
     covariance, magnitude = centroids(rng, 400)
@@ -181,19 +149,6 @@ def test_the_correction_is_f_times_scale_and_floor() -> None:
     assert variance.of(covariance, np.array([1.0, 2.0])) == pytest.approx(
         np.array([[10.0, 2.0, 26.0], [15.0, 3.0, 39.0]])
     )
-
-
-def test_scale_and_floor_weigh_each_square_by_its_variance() -> None:
-    rng = np.random.default_rng(11)
-    own = rng.uniform(0.01, 1.0, 300)
-    expected = own + 0.1
-    squared = expected * rng.chisquare(2, 300) / 2.0
-    # The variance of a square is that of its expectation, squared.
-    columns = np.stack([own, np.ones(300)], axis=1) / expected[:, None]
-    (scale, floor_px2), *_ = np.linalg.lstsq(columns, squared / expected, rcond=None)
-    assert scale > 0.05 and floor_px2 > 0
-    found = _line(own, squared, expected**-2)
-    assert found == pytest.approx((scale, floor_px2), rel=1e-9)
 
 
 @pytest.mark.parametrize('bright_px', [0.005, 0.03])
