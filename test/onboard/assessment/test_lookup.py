@@ -19,7 +19,6 @@ from starcal_ros.assessment.lookup import (
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import ProductError
 from starcal_ros.records import MapCovariance
 
 LENS = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.1, 4e-4, -3e-4]))
@@ -150,16 +149,6 @@ def test_many_pixels_are_as_each_alone() -> None:
             np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14, err_msg=name)
 
 
-def test_an_alignment_alone_has_no_shape() -> None:
-    covariance = np.zeros((13, 13))
-    covariance[11, 11] = (50 * ARCSECOND_RAD) ** 2
-    centre = LENS.parameters[3:5][None]
-    table = line_of_sight_table(LENS, MapCovariance(covariance), centre)
-    assert table.shape_sigma_arcsec[0] == 0.0
-    # A rotation about y moves what lies along z by its whole angle.
-    assert table.sigma_arcsec[0] == pytest.approx(50.0, rel=1e-5)
-
-
 def test_a_pixel_without_a_line_of_sight_is_nan() -> None:
     folded = LENS.replace(k1=-12.0, k2=0.0, k3=0.0)
     table = line_of_sight_table(folded, MapCovariance(covariance_of(LENS)), PIXELS)
@@ -203,10 +192,3 @@ def test_a_file_comes_back_to_the_last_bit(
         assert tuple(back.files) == COLUMNS
     for column, values in columns_of(table).items():
         np.testing.assert_array_equal(back[column], values, column)
-
-
-@pytest.mark.parametrize('name', ['a.txt', 'a.fits', 'a', 'a.CSV.gz'])
-def test_another_ending_is_refused(table: LineOfSightTable, tmp_path: Path, name: str) -> None:
-    with pytest.raises(ProductError, match=f'{name}: ends neither in .csv'):
-        write_lookup_table(table, tmp_path / name)
-    assert not list(tmp_path.iterdir())
