@@ -7,7 +7,6 @@ import dataclasses
 import functools
 from pathlib import Path
 
-import cv2
 import erfa
 import numpy as np
 import pytest
@@ -185,16 +184,6 @@ def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: Setup) -> Non
     assert passed(setup, track, -90, -80, 5, -70, -60, 6) == [late, late, taken, late, late, taken]
 
 
-def test_a_recording_that_plays_twice_counts_once(setup: Setup) -> None:
-    first, _ = observe.observe_next(image(), attitudes(), setup, observe.Track(setup.prior))
-    assert not first.refusal
-    later = dataclasses.replace(first, time_ns=first.time_ns + 1, pixel_digest='another')
-    ensemble = Ensemble().add(first).add(later)
-    again = dataclasses.replace(first, attitude_gap_s=0.125)
-    ensemble = ensemble.add(again)
-    assert ensemble.images == (first, later) and dict(ensemble.refused) == {'duplicate': 1}
-
-
 MS = 1_000_000
 LATER = 1000 * S
 SHOWN_AGAIN: dict[str, tuple[list[tuple[int, int]], dict[str, int]]] = {
@@ -355,21 +344,6 @@ def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
     assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
 
 
-def test_a_frame_that_is_shown_again_is_refused_once_its_stamp_is_new(
-    setup: Setup,
-) -> None:
-    held = attitudes(1)
-    for sample in attitude_samples(SCENARIO, 2):
-        held.add(sample.time_ns, sample)
-    first, track = observe.observe_next(image(1), held, setup, observe.Track(setup.prior))
-    stuck = Image(image(2).time_ns, image(1).pixels)
-    again, track = observe.observe_next(stuck, held, setup, track)
-    assert (first.refusal, again.refusal) == ('', 'frozen')
-    assert again.attitude_gap_s == 0.5
-    next_one, _ = observe.observe_next(image(2), held, setup, track)
-    assert next_one.refusal == ''
-
-
 def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
     setup: Setup,
 ) -> None:
@@ -393,20 +367,6 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
     assert plain.catalog_id[star] not in found.catalog_id
     reason = found.refused_reason[found.refused_catalog_id == plain.catalog_id[star]]
     assert [list(found.refused_stars)[code] for code in reason] == ['hot_pixel']
-
-
-def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
-    camera_yaml: Path, tmp_path: Path, setup: Setup
-) -> None:
-    plain = observe.observe_next(image(), attitudes(), setup)[0]
-    u, v = np.rint(plain.measured_px[0]).astype(int)
-    dark = np.full(image().pixels.shape, 32, np.uint16)
-    dark[v, u] = 60
-    cv2.imwrite(str(tmp_path / 'dark.png'), dark)
-    made = load_setup(values(camera_yaml, dark_frame=str(tmp_path / 'dark.png')))
-    found = observe.observe_next(image(), attitudes(), made)[0]
-    assert found.refused_stars['hot_pixel'] == 1
-    assert plain.catalog_id[0] not in found.catalog_id
 
 
 def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
@@ -453,20 +413,6 @@ def test_a_hung_star_tracker_is_refused_once_the_stars_have_turned(setup: Setup)
     assert _observed(setup, 72.0, is_hung=False) == [ok] * 5
     # A spacecraft that holds its attitude, with a star tracker without noise.
     assert _observed(setup, 0.0, is_hung=True) == [ok] * 5
-
-
-def test_the_rate_of_the_star_tracker_is_recorded(setup: Setup) -> None:
-    """Two samples half a second before and after the image, 0.02 degrees apart."""
-    step = Rotation.from_rotvec(np.radians([0.0, 0.01, 0.0]))
-    held = AttitudeHistory()
-    middle = Rotation.from_quat(scene(SCENARIO, 1).icrf_from_star_tracker_xyzw)
-    for time_s, turned in ((-0.5, middle * step.inv()), (0.5, middle * step)):
-        time_ns = image().time_ns + round(time_s * S)
-        held.add(time_ns, attitude_sample(time_ns, turned.as_quat(), 'st_to_inertial'))
-    found = observe.observe_next(image(), held, setup)[0]
-    assert not found.refusal
-    expected = np.radians([0.0, 0.02, 0.0])
-    np.testing.assert_allclose(found.star_tracker_rate_rad_s, expected, atol=1e-12)
 
 
 def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> None:

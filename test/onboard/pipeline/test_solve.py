@@ -15,15 +15,14 @@ from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: igno
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import topics
 from starcal_ground.bags.reader import Topics
-from starcal_ground.simulation.scenario import attitude_samples, Detector
+from starcal_ground.simulation.scenario import attitude_samples
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.pipeline import observe, solve
+from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, Setup, with_method
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image
-from starcal_ros.sky.attitude import AttitudeHistory
 
 S = 1_000_000_000
 
@@ -159,22 +158,6 @@ def test_method_and_names_can_be_said_for_one_solution(setup: Setup) -> None:
         with_method(setup, '', ['fz'])
 
 
-def test_too_few_images_cannot_be_solved(setup: Setup) -> None:
-    with pytest.raises(TooFewObservations, match='1 more image .* needed'):
-        solve.solve(Ensemble(ensemble().images[:2]), setup)
-
-
-@pytest.mark.slow
-def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
-    strict = load_setup(values(camera_yaml, requirements=['map=1e-6px']))
-    found = solve.solve(ensemble(), strict)
-    assert not found.accepted
-    assert len(found.reasons) == 1 and 'requirements' in found.reasons[0]
-    refused = [check for check in found.gate if check.passed is False]
-    assert [check.option for check in refused] == ['requirements']
-    assert refused[0].limit == 1e-6 and found.reasons[0].startswith(refused[0].name)
-
-
 @pytest.mark.slow
 def test_the_gate_counts_the_stars_that_were_used(setup: Setup) -> None:
     """Those left out as outliers cover nothing."""
@@ -190,26 +173,6 @@ def test_equal_inputs_give_equal_numbers(setup: Setup) -> None:
     np.testing.assert_array_equal(one.covariance, other.covariance)
     np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
     assert one.provenance == other.provenance
-
-
-@pytest.mark.slow
-def test_from_pixels_to_a_calibration_that_is_true(setup: Setup) -> None:
-    held = AttitudeHistory()
-    for index in range(10):
-        for sample in attitude_samples(SCENARIO, index):
-            held.add(sample.time_ns, sample)
-    collected = Ensemble()
-    for index in range(10):
-        found = observe.observe_next(image(index), held, setup)[0]
-        collected = solve.add_to_ensemble(collected, found, setup)
-    assert len(collected.images) == 10
-    calibration = solve.solve(collected, setup)
-    assert calibration.accepted
-    free = [PARAMETER_NAMES.index(name) for name in calibration.estimated]
-    error = (calibration.geometry.camera.parameters - TRUTH.camera.parameters)[free]
-    assert np.abs(error / calibration.sigma[free]).max() < 4.5
-    assert calibration.residual_rms_px < 0.25
-    assert Detector().psf_sigma_px == pytest.approx(collected.images[0].psf_sigma_px, rel=0.02)
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import Counter
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from starcal_ros.stars.image_model import (
     model_image,
     saturation_level,
 )
-from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise, quantisation_step_dn
+from starcal_ros.stars.pixel_noise import PixelNoise, quantisation_step_dn
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums
 
 SHAPE = (512, 640)
@@ -117,17 +116,6 @@ def test_stars_of_one_shape_are_measured_and_another_shape_is_refused(
     assert elongated.sum() < len(other) + 0.07 * len(xy)
 
 
-def test_the_covariance_is_true_where_the_gain_is_given() -> None:
-    options = CentroidOptions(gain_e_per_dn=QUIET.electrons_per_dn)
-    squared = []
-    for seed in range(6):
-        error, found, _, snr = field(seed, QUIET, options)
-        good = (snr > 10) & (found.refusal == StarRefusal.NONE)
-        squared.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
-    # Known to 1 %.
-    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.03)
-
-
 @pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
 def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
     # So bright (16 bit) that a single centroid is good to 1.5e-3 sigma.
@@ -146,26 +134,6 @@ def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
     bias = np.bincount(bins, np.concatenate(error).ravel()) / np.bincount(bins)
     # 330 centroids in each of ten bins: means good to 2e-4 px.
     assert len(bias) == 10 and np.abs(bias).max() < 0.002
-
-
-@pytest.mark.parametrize('flux', [6e2, 1e3, 2e4])
-def test_no_bias_with_the_phase_at_any_signal(flux: float) -> None:
-    """Signal-to-noise of about 14, 21 and 130: the amplitude of one wave over the pixel."""
-    error, phase = [], []
-    for seed in range(4):
-        xy = star_grid(30 + seed)
-        found = measured(exposed(seed, xy, np.full(len(xy), flux), QUIET), xy)
-        good = found.refusal == StarRefusal.NONE
-        assert good.mean() > 0.95
-        error.append((found.xy_px - xy)[good])
-        phase.append(2 * np.pi * xy[good])
-    wave = np.exp(1j * np.concatenate(phase).ravel())
-    squared = np.concatenate(error).ravel() ** 2
-    amplitude_px = 2 * np.abs(np.mean(np.concatenate(error).ravel() * wave))
-    # The noise of the stars alone gives a wave of this size.
-    by_chance_px = 2 * np.sqrt(squared.mean() / len(squared))
-    assert by_chance_px < 0.004
-    assert amplitude_px < 0.01
 
 
 @pytest.mark.parametrize('known', [True, False], ids=['known', 'unknown'])
@@ -200,17 +168,6 @@ def test_moments_are_pulled_to_the_middle_of_the_pixel() -> None:
         bias = np.bincount(bins, error.ravel()) / np.bincount(bins)
         assert np.abs(bias).max() < bias_px
         assert np.sqrt((error**2).mean()) < 1.5 * bias_px
-
-
-def test_moments_are_worse_than_the_fit_but_no_more_than_twice() -> None:
-    rms = {}
-    for name, options in (('psf', PSF), ('moment', MOMENT)):
-        squared = []
-        for seed in range(3):
-            error, found, _, snr = field(seed, QUIET, options)
-            squared.append(error[(found.refusal == StarRefusal.NONE) & (snr > 20)] ** 2)
-        rms[name] = np.sqrt(np.concatenate(squared).mean())
-    assert rms['psf'] < rms['moment'] < 2.0 * rms['psf']
 
 
 def test_background_and_noise_under_stars_and_a_gradient() -> None:
@@ -296,21 +253,6 @@ def test_noise_alone_gives_no_more_detections_than_it_should(
     # Poisson; the noise, 1 % off, changes the count by 12 % at 3.5 sigma and 25 % at 5.
     assert count < 1.25 * expected + 3 * np.sqrt(expected)
     assert count > 0.75 * expected - 3 * np.sqrt(expected)
-
-
-@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
-def test_gain_and_width_are_found_from_the_image(psf_sigma_px: float) -> None:
-    detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
-    gains, widths = [], []
-    for seed in range(6):
-        xy = star_grid(seed)
-        flux = unlike_fluxes(seed, len(xy))
-        model = modelled(exposed(seed, xy, flux, detector))
-        gains.append(model.pixel_noise.gain_e_per_dn)
-        widths.append(model.psf_sigma_px)
-    # One image knows it to 6 %.
-    assert np.mean(gains) == pytest.approx(4.0, rel=0.08)
-    assert np.mean(widths) == pytest.approx(psf_sigma_px, rel=0.005)
 
 
 def test_a_given_gain_is_kept() -> None:
@@ -618,32 +560,6 @@ def test_the_fit_that_a_faint_star_is_spared_changes_nothing(
     faint = np.count_nonzero(spared.refusal == StarRefusal.FAINT)
     assert len(whole.fitted) == len(xy) and faint > 100
     assert len(xy) - len(spared.fitted) > 0.33 * faint
-
-
-@pytest.mark.parametrize('longest_px', [0.0, 10.0])
-@pytest.mark.parametrize(('flux_snr', 'min_snr'), [(5.5, 5.0), (6.5, 5.0), (25.0, 20.0)])
-def test_no_star_above_the_limit_is_surely_fainter(
-    longest_px: float, flux_snr: float, min_snr: float
-) -> None:
-    """Each star by its own path: in a roll the paths of one image differ."""
-    count, noise_dn, noise = 2000, 5.0, PixelNoise(1.0, 0.0)
-    rng = np.random.default_rng(1)
-    paths_px = np.stack([np.linspace(0.0, longest_px, count), np.zeros(count)], axis=-1)
-    sigma_px, width = np.ones(count), 2 * psf_fit.stamp_radius_px(1.0, longest_px) + 1
-    sky_dn2 = 4.0 * math.pi * blurred_px(sigma_px, paths_px[:, 0]) ** 2 * noise_dn**2
-    flux_dn = 0.5 * (flux_snr**2 + np.sqrt(flux_snr**4 + 4.0 * flux_snr**2 * sky_dn2))
-    place_px = rng.uniform(-0.5, 0.5, (count, 2))
-    light = psf_fit.light_in_stamps(place_px, flux_dn, sigma_px, width, paths_px)
-    variance = noise_dn**2 + np.maximum(light, 0.0)
-    pixels = (light + 100.0 + np.sqrt(variance) * rng.normal(size=light.shape)).reshape(
-        count, width, width
-    )
-    stamps = psf_fit.Stamps(pixels, sigma_px, np.full((count, 1), noise_dn**2), streak_px=paths_px)
-    guess = psf_fit.first_guess(stamps, psf_fit.border_level_dn(pixels))
-    near, done = psf_fit.approach(stamps, guess, noise)
-    fainter = psf_fit.surely_fainter(stamps, near, done, min_snr, noise)
-    snr = psf_fit.fit_at(stamps, near, noise).snr
-    assert np.count_nonzero(snr >= min_snr) > 100 and not (fainter & (snr >= min_snr)).any()
 
 
 @pytest.mark.parametrize('gain', [0.5, 2.0, 8.0])
