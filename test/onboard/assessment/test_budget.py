@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from worlds import campaign, each_image, estimate_of, options_of, solved  # type: ignore[import-not-found]
 
+from starcal_ros.assessment import budget
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart
 from studies.worlds import World
@@ -184,8 +186,32 @@ def test_a_value_that_the_images_contradict_is_not_asked_for() -> None:
     assert not [row for row in statements(sigma_budget(*found), *found) if 'slow' in row.option]
 
 
-def test_a_camera_that_changes_from_image_to_image_is_the_largest_cause() -> None:
+def test_known_unknowns_do_not_depend_on_their_units() -> None:
+    found, _ = estimate(RAM)
+    errors = found.posterior.errors
+    assert errors is not None
+    scale = np.ones((len(errors.root), 1))
+    scale[found.linear.layout.places['velocity'].start] = 1e-24
+    rescaled = dataclasses.replace(errors, root=errors.root * scale)
+    T, again = (budget._known(one, found, ['velocity']) for one in (errors, rescaled))
+    np.testing.assert_allclose(again @ again.T, T @ T.T, atol=1e-9)
+
+
+def test_known_shapes_add_the_information_that_they_hide() -> None:
     breathing = World(6, breathing=3e-4)
+    found, _ = estimate(breathing)
+    errors = found.posterior.errors
+    assert errors is not None
+    T = budget._known(errors, found, [], budget._of_shapes(found, errors))
+    given = found.sums, found.linear
+    hidden = equations(*given, 1e-7).information
+    hidden = hidden - equations(*given, found.posterior.shapes.sigma_px).information
+    C = errors.root @ errors.root.T
+    size = np.sqrt(np.diag(C))
+    size[size == 0] = 1.0
+    left = errors.root @ T @ T.T @ errors.root.T  # (C^-1 + hidden)^-1
+    back = (left + left @ hidden @ C) / np.outer(size, size)
+    np.testing.assert_allclose(back, C / np.outer(size, size), atol=1e-6)
     part = parts(breathing)['change from image to image']
     assert part.map_arcsec > 0.5 * parts(breathing)['total'].map_arcsec
 

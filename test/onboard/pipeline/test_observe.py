@@ -369,6 +369,19 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
     assert [list(found.refused_stars)[code] for code in reason] == ['hot_pixel']
 
 
+def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
+    camera_yaml: Path, tmp_path: Path, setup: Setup
+) -> None:
+    plain = observe.observe_next(image(), attitudes(), setup)[0]
+    u, v = np.rint(plain.measured_px[0]).astype(int)
+    dark = np.full(image().pixels.shape, 32, np.uint16)
+    dark[v, u] = 60
+    made = load_setup(values(camera_yaml, dark_frame=write_png(tmp_path / 'dark.png', dark)))
+    found = observe.observe_next(image(), attitudes(), made)[0]
+    assert found.refused_stars['hot_pixel'] == 1
+    assert plain.catalog_id[0] not in found.catalog_id
+
+
 def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
     camera_yaml: Path, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from starcal_ros.stars.image_model import (
     model_image,
     saturation_level,
 )
-from starcal_ros.stars.pixel_noise import PixelNoise, quantisation_step_dn
+from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise, quantisation_step_dn
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums
 
 SHAPE = (512, 640)
@@ -560,6 +561,32 @@ def test_the_fit_that_a_faint_star_is_spared_changes_nothing(
     faint = np.count_nonzero(spared.refusal == StarRefusal.FAINT)
     assert len(whole.fitted) == len(xy) and faint > 100
     assert len(xy) - len(spared.fitted) > 0.33 * faint
+
+
+@pytest.mark.parametrize('longest_px', [0.0, 10.0])
+@pytest.mark.parametrize(('flux_snr', 'min_snr'), [(5.5, 5.0), (6.5, 5.0), (25.0, 20.0)])
+def test_no_star_above_the_limit_is_surely_fainter(
+    longest_px: float, flux_snr: float, min_snr: float
+) -> None:
+    """Each star by its own path: in a roll the paths of one image differ."""
+    count, noise_dn, noise = 2000, 5.0, PixelNoise(1.0, 0.0)
+    rng = np.random.default_rng(1)
+    paths_px = np.stack([np.linspace(0.0, longest_px, count), np.zeros(count)], axis=-1)
+    sigma_px, width = np.ones(count), 2 * psf_fit.stamp_radius_px(1.0, longest_px) + 1
+    sky_dn2 = 4.0 * math.pi * blurred_px(sigma_px, paths_px[:, 0]) ** 2 * noise_dn**2
+    flux_dn = 0.5 * (flux_snr**2 + np.sqrt(flux_snr**4 + 4.0 * flux_snr**2 * sky_dn2))
+    place_px = rng.uniform(-0.5, 0.5, (count, 2))
+    light = psf_fit.light_in_stamps(place_px, flux_dn, sigma_px, width, paths_px)
+    variance = noise_dn**2 + np.maximum(light, 0.0)
+    pixels = (light + 100.0 + np.sqrt(variance) * rng.normal(size=light.shape)).reshape(
+        count, width, width
+    )
+    stamps = psf_fit.Stamps(pixels, sigma_px, np.full((count, 1), noise_dn**2), streak_px=paths_px)
+    guess = psf_fit.first_guess(stamps, psf_fit.border_level_dn(pixels))
+    near, done = psf_fit.approach(stamps, guess, noise)
+    fainter = psf_fit.surely_fainter(stamps, near, done, min_snr, noise)
+    snr = psf_fit.fit_at(stamps, near, noise).snr
+    assert np.count_nonzero(snr >= min_snr) > 100 and not (fainter & (snr >= min_snr)).any()
 
 
 @pytest.mark.parametrize('gain', [0.5, 2.0, 8.0])
