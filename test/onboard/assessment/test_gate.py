@@ -189,13 +189,12 @@ def with_sigma(**sigma: float) -> np.ndarray:
             ),
         ),
         (
-            # Images are numbered from one, as on the report.
-            with_model(predictions=(ResidualBin('image', 7.0, 9.0, 10000, 1.5, 0.005),)),
+            with_model(predictions=(ResidualBin('star', 5.0, 9.0, 10000, 1.5, 0.005),)),
             'max_cross_validated_residual',
             1.5,
             1.25,
             (
-                'residual over predicted sigma at image 8 to 10 is 1.5, over the limit of 1.25 '
+                'residual over predicted sigma at star 5 to 9 is 1.5, over the limit of 1.25 '
                 '(max_cross_validated_residual); the sigma is wrong there: check the PSF, the '
                 'lens model or its images'
             ),
@@ -273,6 +272,12 @@ def test_an_assumed_velocity_that_the_stars_contradict_is_not_called_stated() ->
         ' check the date'
     )
     assert len(reason) <= 200
+
+
+def test_images_are_numbered_from_one_as_on_the_report() -> None:
+    bins = (ResidualBin('image', 7.0, 9.0, 1000, 1.5, 0.01),)
+    (reason,) = reasons(dataclasses.replace(GOOD, **with_model(predictions=bins)), GateOptions())
+    assert reason.startswith('residual over predicted sigma at image 8 to 10 is 1.5')
 
 
 LONGER = turned(0.0, fx=1818.0, fy=1819.01)

@@ -143,19 +143,6 @@ def test_the_units_of_the_unknowns_do_not_matter() -> None:
     np.testing.assert_allclose(other.state * units, one.state, rtol=1e-13)
 
 
-def test_the_cost_never_rises() -> None:
-    evaluate, move, _ = decays(np.ones(4))
-    accepted: list[float] = []
-
-    def watched(x: np.ndarray, shared: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-        accepted.append(evaluate(x).cost)
-        return move(x, shared, blocks)
-
-    levenberg_marquardt(START, evaluate, watched)
-    assert len(accepted) > 5
-    assert (np.diff(accepted) <= 0).all()
-
-
 def test_a_column_without_data_is_not_observable() -> None:
     J = np.random.default_rng(4).normal(size=(20, 3))
     J[:, 1] = 0.0

@@ -14,14 +14,9 @@ from worlds import each_image, errors_of, normalised_error, with_noise  # type: 
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.assessment.observability import (
-    estimated_names,
-    keep_most_informative,
-    predicted_sigma,
-)
+from starcal_ros.assessment.observability import estimated_names, predicted_sigma
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.problem import geometry_at, METHODS, reference_degc
@@ -266,21 +261,6 @@ def test_terms_that_the_images_do_not_carry_are_infinite_and_cost_nothing() -> N
     of_temperature = np.array(['temperature' in name for name in names])
     assert of_temperature.sum() == 5 and np.isinf(sigma[of_temperature]).all()
     np.testing.assert_array_equal(sigma[~of_temperature], predicted_sigma(ensemble, TRUTH, plain))
-
-
-def test_images_that_tell_of_the_temperature_are_kept() -> None:
-    temperatures = np.array([15.0, 14.0, 40.0, 16.0, 15.5, -20.0, 14.5, 15.2, 13.0, 15.7])
-    ensemble = observed(FOCAL[:1], RATE_RAD, temperatures)
-    chosen = options(order=1, max_images=4)
-    plain = dataclasses.replace(chosen, focal_temperature_order=0, alignment_temperature=False)
-    kept, without = (keep_most_informative(ensemble, TRUTH, o) for o in (chosen, plain))
-    assert {40.0, -20.0} <= {image.temperature_degc for image in kept.images}
-    assert not {40.0, -20.0} <= {image.temperature_degc for image in without.images}
-
-
-def test_per_image_has_no_rate() -> None:
-    with pytest.raises(OptionError, match='alignment_temperature: the method per_image'):
-        estimate_calibration(observed(), PRIOR, options('per_image', alignment_temperature=True))
 
 
 def test_the_camera_at_a_temperature() -> None:
