@@ -254,6 +254,11 @@ def test_without_a_majority_there_is_no_misfit() -> None:
     assert not judged(error, np.zeros((9, 3))).any()
 
 
+def test_two_attitudes_cannot_show_which_is_wrong() -> None:
+    error = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    assert not judged(error, np.zeros((2, 3))).any()
+
+
 def test_images_without_stars_enough_are_not_judged() -> None:
     error, variance = attitudes(np.random.default_rng(8), 12, 0.3)
     seen = np.ones(12, bool)

@@ -101,3 +101,13 @@ def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> 
     detector = dataclasses.replace(SCENARIO.detector, psf_sigma_px=psf_sigma_px)
     for index in (2, 3, 4):
         _, track = track_stars(exposed(SHARP, index, detector)[1], track, SEARCH)
+
+
+def test_streaks_of_which_too_few_are_alone_are_searched_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, track = sharp()
+    monkeypatch.setattr('starcal_ros.stars.image_model._ISOLATED_PX', 1000.0)
+    with pytest.raises(ImageRefused, match='too few of them are alone') as refused:
+        track_stars(exposed(turned(6.0, 0.0, 0.0))[1], track, SEARCH)
+    assert refused.value.reason == 'no_match'
