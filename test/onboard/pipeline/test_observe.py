@@ -428,6 +428,20 @@ def test_a_hung_star_tracker_is_refused_once_the_stars_have_turned(setup: Setup)
     assert _observed(setup, 0.0, is_hung=True) == [ok] * 5
 
 
+def test_the_rate_of_the_star_tracker_is_recorded(setup: Setup) -> None:
+    """Two samples half a second before and after the image, 0.02 degrees apart."""
+    step = Rotation.from_rotvec(np.radians([0.0, 0.01, 0.0]))
+    held = AttitudeHistory()
+    middle = Rotation.from_quat(scene(SCENARIO, 1).icrf_from_star_tracker_xyzw)
+    for time_s, turned in ((-0.5, middle * step.inv()), (0.5, middle * step)):
+        time_ns = image().time_ns + round(time_s * S)
+        held.add(time_ns, attitude_sample(time_ns, turned.as_quat(), 'st_to_inertial'))
+    found = observe.observe_next(image(), held, setup)[0]
+    assert not found.refusal
+    expected = np.radians([0.0, 0.02, 0.0])
+    np.testing.assert_allclose(found.star_tracker_rate_rad_s, expected, atol=1e-12)
+
+
 def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> None:
     rate_rad_s = np.array([0.01, 0.0, 0.0])
     held = AttitudeHistory()
