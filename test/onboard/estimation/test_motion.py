@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from worlds import each_image, estimate_of  # type: ignore[import-not-found]
+from worlds import campaign, each_image, estimate_of, solved  # type: ignore[import-not-found]
 
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
@@ -29,8 +29,9 @@ def of_focal(found: Estimate, made: Campaign) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_known_time_of_readout_is_corrected() -> None:
-    made = simulate(ROLLING, 2)
-    error_px, sigma_px = of_focal(estimate_of(made, shutter='rolling', readout_s=READOUT_S), made)
+    made = campaign(ROLLING, 2)
+    known = solved(ROLLING, 2, shutter='rolling', readout_s=READOUT_S)
+    error_px, sigma_px = of_focal(known, made)
     assert (np.abs(error_px) < 3.0 * sigma_px).all() and sigma_px.max() < 0.06
     error_px, sigma_px = of_focal(estimate_of(made, shutter='global'), made)
     assert np.abs(error_px / sigma_px).max() > 30.0
@@ -40,8 +41,8 @@ def test_a_known_time_of_readout_is_corrected() -> None:
 
 
 def test_an_unknown_time_of_readout_is_in_the_sigma() -> None:
-    made = simulate(ROLLING, 2)
-    error_px, sigma_px = of_focal(estimate_of(made), made)
+    made = campaign(ROLLING, 2)
+    error_px, sigma_px = of_focal(solved(ROLLING, 2), made)
     assert (np.abs(error_px) < 3.0 * sigma_px).all() and sigma_px.max() > 0.4
 
 
@@ -128,8 +129,8 @@ def test_without_any_rate_a_camera_turns_as_its_images_do_or_as_an_orbit(
 @pytest.mark.parametrize('stated', [{}, {'shutter': 'rolling', 'readout_s': READOUT_S}])
 def test_an_image_without_a_rate_turns_as_the_others_do(stated: dict[str, object]) -> None:
     """One of them left out the read-out of all: the sigma was too small by 30."""
-    made = simulate(ROLLING, 2)
-    error_px, sigma_px = of_focal(estimate_of(made, **stated), made)
+    made = campaign(ROLLING, 2)
+    error_px, sigma_px = of_focal(solved(ROLLING, 2, **stated), made)
     partly = with_fields(
         made, lambda k: {'star_tracker_rate_rad_s': UNKNOWN} if k % 3 == 0 else {}
     )

@@ -206,8 +206,8 @@ def test_a_stated_sigma_that_is_far_too_small_bends_nothing(
 def test_the_order_of_images_and_the_length_of_the_list_change_nothing() -> None:
     made = sound(5)
     turned = dataclasses.replace(made, ensemble=Ensemble(made.ensemble.images[::-1]))
-    one, other = (estimated(each).geometry for each in (made, turned))
-    sigma = np.sqrt(np.diag(estimated(made).covariance)[:10])
-    off = (one.camera.parameters - other.camera.parameters) / sigma
+    one, other = (estimated(each) for each in (made, turned))
+    off = one.geometry.camera.parameters - other.geometry.camera.parameters
+    off /= np.sqrt(np.diag(one.covariance)[:10])
     # Rounds stop at a step of a twentieth of a sigma.
     assert np.abs(off).max() < 0.02
