@@ -398,31 +398,16 @@ def prior_offset(given: Small) -> Floats:
     return np.concatenate([*shared, np.zeros(OWN * IMAGES)])
 
 
-def lens_term(given: Small, amplitude_px: float) -> Floats:
-    """Return the next term of the lens as values (P + 11 m,) of the unknowns."""
-    term = given.layout['field'].term
-    assert term is not None
-    values = np.zeros(given.layout.count + OWN * IMAGES)
-    values[given.layout.of(['field'])] = amplitude_px * term
-    return values
-
-
-def solution(
-    problem: Dense, precision: Floats, offset: Floats, term: Floats | None = None
-) -> tuple[Floats, Floats, float]:
+def solution(problem: Dense, precision: Floats, offset: Floats) -> tuple[Floats, Floats, float]:
     """
     Mean, covariance and log evidence of all unknowns; held ones are zero.
 
-    The evidence is that of the priors that are proper, up to a constant.  ``term`` (P + 11 m,):
-    its outer product is in the prior covariance besides.
+    The evidence is that of the priors that are proper, up to a constant.
     """
     free = np.isfinite(precision)
     X = np.concatenate([problem.stars, problem.trackers])[:, free]
     r = np.concatenate([problem.residual, -problem.error])
-    own: Floats = np.zeros(len(free)) if term is None else term * np.where(free, precision, 0.0)
-    own_size = 0.0 if term is None else float(term @ own)
     N = X.T @ X + np.diag(precision[free])
-    N -= np.outer(own, own)[np.ix_(free, free)] / (1.0 + own_size)  # Sherman and Morrison
     g = X.T @ r - precision[free] * offset[free]
     size = 1.0 / np.sqrt(np.diag(N))
     inverse = size[:, None] * np.linalg.inv(N * np.outer(size, size)) * size
@@ -430,7 +415,6 @@ def solution(
     mean[free] = inverse @ g
     covariance[np.ix_(free, free)] = inverse
     log_det = np.linalg.slogdet(N * np.outer(size, size))[1] - 2.0 * np.log(size).sum()
-    proper = precision[free] > 0
-    log_prior = np.log(precision[free][proper]).sum() - np.log1p(own_size)
+    log_prior = np.log(precision[free][precision[free] > 0]).sum()
     evidence = 0.5 * (g @ inverse @ g - log_det + log_prior)
     return mean, covariance, float(evidence)

@@ -193,16 +193,13 @@ def averaged_field(
     amplitudes: Amplitudes,
     term: Floats,
     first: tuple[float, float] = UNSTATED,
-    shifts: Floats = _SHIFTS,
-    log_term: Floats | None = None,
 ) -> Averaged:
     """
     Return the coefficients averaged over a common factor of the amplitudes of the octaves.
 
     ``term`` (q,) are the coefficients of a departure that is likely, at 1 px.  It is averaged over
     an amplitude of its own; those of the octaves are found without it, since another
-    departure may look like it.  ``shifts`` are the logarithms of the factors, ``log_term``
-    those of the amplitude of the term (default: all).
+    departure may look like it.
     """
     mean, precision = octave_prior(len(amplitudes.log_px), first)
     s = np.exp(amplitudes.log_px)[octave]
@@ -210,7 +207,7 @@ def averaged_field(
     values = np.maximum(values, 0.0)
     along = vectors.T @ (s * gradient)
     room = math.log(LARGEST_FIELD_PX) - amplitudes.log_px.max()
-    shift = shifts[room + 1e-9 >= shifts]
+    shift = _SHIFTS[room + 1e-9 >= _SHIFTS]
     factor = np.exp(2.0 * shift)[:, None]
     held = 1.0 + values * factor
     variance = factor / held
@@ -222,8 +219,7 @@ def averaged_field(
     with_term = vectors.T @ (s * shown)
     own = np.maximum(term @ shown - variance @ with_term**2, 0.0)[:, None]
     pull = (term @ gradient - variance @ (with_term * along))[:, None]
-    if log_term is None:
-        log_term = log_amplitudes(LARGEST_FIELD_PX)
+    log_term = log_amplitudes(LARGEST_FIELD_PX)
     prior = np.exp(2.0 * log_term)
     of_term = prior / (1.0 + prior * own)
     log_share = 0.5 * (of_term * pull**2 - np.log1p(prior * own))

@@ -1,11 +1,13 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Text of unknown origin, made safe to print."""
+"""Text of unknown origin made safe to print, and numbers as a reader sees them."""
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from starcal_ros.text import printable
+from starcal_ros.text import p_value_text, printable, significant, to_sigma
 
 
 @pytest.mark.parametrize(
@@ -23,3 +25,35 @@ from starcal_ros.text import printable
 def test_characters_that_act_on_a_terminal_are_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
     printable(text).encode()
+
+
+@pytest.mark.parametrize(
+    ('value', 'digits', 'text'),
+    [
+        (4e-05, 2, '0.00004'),
+        (0.0100, 3, '0.01'),
+        (9.996, 3, '10'),
+        (0.09996, 3, '0.1'),
+        (123456.0, 4, '123456'),
+        (-3.941e-06, 4, '-0.000003941'),
+        (0.0, 3, '0'),
+        (math.nan, 3, 'nan'),
+        (math.inf, 3, 'inf'),
+        (2e-12, 2, '2e-12'),
+        (3e20, 3, '3e+20'),
+    ],
+)
+def test_significant_digits_come_without_an_exponent(value: float, digits: int, text: str) -> None:
+    assert significant(value, digits) == text
+
+
+def test_a_size_below_the_least_one_shown_is_less_than_that() -> None:
+    assert significant(7.2e-4, 3, least=0.001) == significant(-7.2e-4, 3, least=0.001) == '< 0.001'
+    assert significant(0.0, 3, least=0.001) == '0'
+    assert p_value_text(1e-9) == '< 0.000001' and p_value_text(0.1849) == '0.18'
+
+
+def test_a_value_has_two_digits_of_its_sigma() -> None:
+    assert to_sigma(0.075857993, 0.014) == '0.076'
+    assert to_sigma(0.00019383623, 4e-05, '+') == '+0.000194'
+    assert to_sigma(2000.123456, 0.0) == to_sigma(2000.123456, math.nan) == '2000.1235'

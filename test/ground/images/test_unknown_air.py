@@ -12,8 +12,8 @@ from pathlib import Path
 import erfa
 import numpy as np
 import pytest
-from random_pointings import honesty  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
+from worlds import honesty  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.topics import Topics

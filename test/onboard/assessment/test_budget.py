@@ -10,35 +10,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from worlds import campaign, each_image, estimate_of, options_of, solved  # type: ignore[import-not-found]
 
 from starcal_ros.assessment import budget
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
-from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.posterior import with_shared_errors
-from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, Ensemble, SigmaPart
-from studies.worlds import Campaign, simulate, World
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart
+from studies.worlds import World
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
 FIELDS = World(24, 'fields4', star_arcsec=3.0)
 
 
-@functools.cache
-def campaign(world: World) -> Campaign:
-    return simulate(world, 1)
-
-
-@functools.cache
 def estimate(world: World, **options: object) -> tuple[Estimate, CalibrationOptions]:
-    made = campaign(world)
-    chosen = CalibrationOptions(
-        star_tracker_sigma_arcsec=made.scenario.star_tracker_sigma_arcsec,
-        **options,  # type: ignore[arg-type]
-    )
-    return estimate_calibration(made.ensemble, made.scenario.prior, chosen), chosen
+    return solved(world, 1, **options), options_of(campaign(world, 1).scenario, **options)
 
 
 @functools.cache
@@ -163,17 +152,12 @@ def test_a_statement_gives_the_sigma_of_an_estimate_that_has_it(
 
 
 def test_without_rates_the_shutter_is_asked_for_or_where_it_rolls_the_rates() -> None:
-    made, unknown = campaign(World()), np.full(3, np.nan)
-    images = [
-        dataclasses.replace(image, star_tracker_rate_rad_s=unknown)
-        for image in made.ensemble.images
-    ]
-    made = dataclasses.replace(made, ensemble=Ensemble(tuple(images)))
+    made, unknown = campaign(World(), 1), np.full(3, np.nan)
+    ensemble = each_image(made.ensemble, lambda *_: {'star_tracker_rate_rad_s': unknown})
+    made = dataclasses.replace(made, ensemble=ensemble)
 
     def estimated(**stated: Any) -> tuple[Estimate, CalibrationOptions]:
-        sigma = made.scenario.star_tracker_sigma_arcsec
-        chosen = CalibrationOptions(star_tracker_sigma_arcsec=sigma, **stated)
-        return estimate_calibration(made.ensemble, made.scenario.prior, chosen), chosen
+        return estimate_of(made, **stated), options_of(made.scenario, **stated)
 
     def total(found: tuple[Estimate, CalibrationOptions]) -> SigmaPart:
         return next(part for part in sigma_budget(*found) if part.cause == 'total')
@@ -200,23 +184,6 @@ def test_a_value_that_the_images_contradict_is_not_asked_for() -> None:
     """Attitudes in axes of another epoch are off by as much as they turn."""
     found = estimate(World(smooth_arcsec=1000.0))
     assert not [row for row in statements(sigma_budget(*found), *found) if 'slow' in row.option]
-
-
-@pytest.mark.parametrize('names', [['velocity'], ['field'], ['velocity', 'field']])
-def test_known_unknowns_leave_their_schur_complement(names: list[str]) -> None:
-    found, _ = estimate(RAM)
-    errors, layout = found.posterior.errors, found.linear.layout
-    assert errors is not None
-    bare = dataclasses.replace(errors, excess=np.zeros_like(errors.excess))
-    T = budget._known(errors, found, names)
-    known = layout.of(names)
-    size = np.linalg.norm(errors.root, axis=1, keepdims=True)
-    root = errors.root / np.where(size > 0, size, 1.0)
-    C = root @ root.T
-    left = C - C[:, known] @ np.linalg.pinv(C[np.ix_(known, known)], rcond=1e-12) @ C[known]
-    np.testing.assert_allclose(root @ T @ T.T @ root.T, left, atol=1e-6)
-    seen = budget._Seen(np.stack([root.T @ root] * 2), root.reshape(1, -1, root.shape[1]))
-    np.testing.assert_allclose(budget._gain(bare, T, seen), np.trace(C - left), rtol=1e-6)
 
 
 def test_known_unknowns_do_not_depend_on_their_units() -> None:
@@ -251,23 +218,6 @@ def test_known_shapes_add_the_information_that_they_hide() -> None:
 
 def test_an_error_that_no_two_observations_share_is_noise() -> None:
     assert parts(World(3))['star places'].map_arcsec == 0.0
-
-
-def test_the_covariance_is_the_root_with_its_parts() -> None:
-    found, _ = estimate(FIELDS)
-    errors = found.posterior.errors
-    assert errors is not None
-    again = with_shared_errors(
-        found.posterior,
-        found.sums,
-        found.linear,
-        dataclasses.replace(found.weights, errors=()),
-    )
-    assert again.errors is not None
-    assert set(errors.shared) - set(again.errors.shared) >= {'star places'}
-    # The part of the place errors on top of independent noise.
-    gone = (errors.excess - again.errors.excess)[0, 0]
-    assert 0.0 < gone < sum(one[0, 0] for one in errors.shared.values())
 
 
 def test_without_an_alignment_no_star_tracker_is_a_cause() -> None:

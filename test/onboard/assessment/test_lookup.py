@@ -14,7 +14,6 @@ from starcal_ros.assessment.lookup import Derivatives, line_of_sight_table, Line
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import ProductError
 from starcal_ros.records import MapCovariance
 
 COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
@@ -146,16 +145,6 @@ def test_many_pixels_are_as_each_alone() -> None:
             np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14, err_msg=name)
 
 
-def test_an_alignment_alone_has_no_shape() -> None:
-    covariance = np.zeros((13, 13))
-    covariance[11, 11] = (50 * ARCSECOND_RAD) ** 2
-    centre = LENS.parameters[3:5][None]
-    table = line_of_sight_table(LENS, MapCovariance(covariance), centre)
-    assert table.shape_sigma_arcsec[0] == 0.0
-    # A rotation about y moves what lies along z by its whole angle.
-    assert table.sigma_arcsec[0] == pytest.approx(50.0, rel=1e-5)
-
-
 def test_a_pixel_without_a_line_of_sight_is_nan() -> None:
     folded = LENS.replace(k1=-12.0, k2=0.0, k3=0.0)
     table = line_of_sight_table(folded, MapCovariance(covariance_of(LENS)), PIXELS)
@@ -199,10 +188,3 @@ def test_a_file_comes_back_to_the_last_bit(
         assert tuple(back.files) == COLUMNS
     for column, values in columns_of(table).items():
         np.testing.assert_array_equal(back[column], values, column)
-
-
-@pytest.mark.parametrize('name', ['a.txt', 'a.fits', 'a', 'a.CSV.gz'])
-def test_another_ending_is_refused(table: LineOfSightTable, tmp_path: Path, name: str) -> None:
-    with pytest.raises(ProductError, match=f'{name}: ends neither in .csv'):
-        write_lookup_table(table, tmp_path / name)
-    assert not list(tmp_path.iterdir())

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Contradictions of priors and departures from the model, each with its number."""
+"""Contradictions of priors, departures from the model and lost lines, each with its number."""
 
 from __future__ import annotations
 
@@ -9,16 +9,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_pointings import displaced, estimated, HEIGHT, honesty, of_random_pointings, WIDTH  # type: ignore[import-not-found]
+from worlds import (  # type: ignore[import-not-found]
+    displaced,
+    each_image,
+    estimate_of,
+    estimated,
+    HEIGHT,
+    honesty,
+    of_random_pointings,
+    WIDTH,
+)
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.model_checks import model_checks
+from starcal_ros.assessment.model_checks import detector_step, model_checks
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
-from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks
+from starcal_ros.records import Amplitude, Ensemble, HeldTerm, ModelChecks, StarObservations
 from studies import worlds
 
 CORNER_PX = float(np.hypot(WIDTH, HEIGHT)) / 2.0
@@ -84,16 +91,12 @@ def test_a_narrow_prior_of_the_principal_point_that_is_wrong_is_named(off_px: fl
 
 def with_velocity_off(ensemble: Ensemble, wrong_m_s: Floats) -> Ensemble:
     """The ensemble with the aberration of a velocity that the observer does not have."""
-    images = []
-    for image in ensemble.images:
+
+    def moved(_: int, image: StarObservations) -> dict[str, Floats]:
         e = image.direction_icrf + wrong_m_s / SPEED_OF_LIGHT_M_S
-        e /= np.linalg.norm(e, axis=1)[:, None]
-        images.append(dataclasses.replace(image, direction_icrf=e))
-    return Ensemble(tuple(images))
+        return {'direction_icrf': e / np.linalg.norm(e, axis=1)[:, None]}
 
-
-def unmoved(pixels: Floats) -> Floats:
-    return np.zeros_like(pixels)
+    return each_image(ensemble, moved)  # type: ignore[no-any-return]
 
 
 WRONG_M_S = 60e3 * np.array([0.6, 0.0, -0.8])  # twice the Earth's: its sign is wrong
@@ -106,7 +109,7 @@ def test_a_velocity_off_its_prior_is_found_and_named() -> None:
     terms = [held(model_checks(found), f'velocity_{axis}_m_s') for axis in 'xyz']
     assert max(term.significance for term in terms) > LIMIT_SIGMA
     assert np.linalg.norm([term.estimated for term in terms] + WRONG_M_S) < 0.1 * 60e3
-    assert honesty(given, found, unmoved)[0] < 2.0
+    assert honesty(given, found, np.zeros_like)[0] < 2.0
 
 
 def test_a_velocity_that_is_wrong_beyond_its_prior_is_in_the_sigma_and_named() -> None:
@@ -116,7 +119,7 @@ def test_a_velocity_that_is_wrong_beyond_its_prior_is_in_the_sigma_and_named() -
     found = estimated(given, ensemble)
     checks = model_checks(found)
     assert amplitude(checks, 'change from image to image').likelihood_ratio > 50.0
-    assert honesty(given, found, unmoved)[0] < 2.0
+    assert honesty(given, found, np.zeros_like)[0] < 2.0
     terms = [held(checks, f'velocity_{axis}_m_s') for axis in 'xyz']
     assert np.linalg.norm([term.estimated for term in terms] + WRONG_M_S) < 0.1 * 60e3
     assert max(term.significance for term in terms) > 4 * LIMIT_SIGMA
@@ -126,10 +129,7 @@ def test_a_time_of_readout_that_is_stated_wrong_is_named_beside_that_of_the_star
     """The record had the difference of both, and 0 as what is assumed."""
     world = worlds.World(rate_deg_s=0.42, row_s=20e-6, tracker_arcsec=5.0)
     made = worlds.simulate(world, 2)
-    sigma = made.scenario.star_tracker_sigma_arcsec
-    stated: dict[str, Any] = {'shutter': 'rolling', 'readout_s': -0.02}
-    options = CalibrationOptions(star_tracker_sigma_arcsec=sigma, **stated)
-    found = estimate_calibration(made.ensemble, made.scenario.prior, options)
+    found = estimate_of(made, shutter='rolling', readout_s=-0.02)
     readout = held(model_checks(found), 'readout_s')
     assert readout.assumed == -0.02
     # By stars that know it to some milliseconds: 1024 rows of 20 us.
@@ -157,13 +157,11 @@ def test_the_step_the_field_and_the_predictions_are_in_the_record() -> None:
 def breathing(ensemble: Ensemble, scales: Floats) -> Ensemble:
     """The ensemble with each image scaled about its middle."""
     middle = np.array([WIDTH - 1, HEIGHT - 1]) / 2.0
-    images = tuple(
-        dataclasses.replace(
-            image, measured_px=image.measured_px + scale * (image.measured_px - middle)
-        )
-        for image, scale in zip(ensemble.images, scales, strict=True)
-    )
-    return Ensemble(images)
+
+    def scaled(k: int, image: StarObservations) -> dict[str, Floats]:
+        return {'measured_px': image.measured_px + scales[k] * (image.measured_px - middle)}
+
+    return each_image(ensemble, scaled)  # type: ignore[no-any-return]
 
 
 @pytest.mark.slow
@@ -203,11 +201,8 @@ def test_a_lens_that_warms_is_no_velocity(sigma_m_s: float) -> None:
     """
     made = worlds.simulate(worlds.World(48, 'strip', tracker_arcsec=2.0), 1)
     scales = 6e-5 * np.sqrt(3.0) * np.linspace(-1.0, 1.0, 48)  # a ramp of unit rms
-    options = CalibrationOptions(
-        star_tracker_sigma_arcsec=(2.0,) * 3, shutter='global', velocity_sigma_m_s=sigma_m_s
-    )
-    ensemble = breathing(made.ensemble, scales)
-    found = estimate_calibration(ensemble, made.scenario.prior, options)
+    made = dataclasses.replace(made, ensemble=breathing(made.ensemble, scales))
+    found = estimate_of(made, shutter='global', velocity_sigma_m_s=sigma_m_s)
     mean, covariance, layout = (
         found.posterior.mean,
         found.posterior.covariance,
@@ -248,7 +243,45 @@ def test_a_velocity_that_takes_the_place_of_a_tilt_is_no_contradiction() -> None
     lens: dict[str, Any] = {'model': 'equidistant', 'field_deg': 90.0, 'corner': -0.02}
     stars: dict[str, Any] = {'magnitude_limit': 5.3, 'zero_point_dn': 8e5, 'bright_px': 0.03}
     made = worlds.simulate(worlds.World(40, 'small', lens=tilted, **lens, **stars), 1)
-    options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0,) * 3, shutter='global')
-    found = estimate_calibration(made.ensemble, made.scenario.prior, options)
+    found = estimate_of(made, shutter='global')
     terms = [term for term in model_checks(found).held if 'velocity' in term.name]
     assert 3.0 < max(term.significance for term in terms) <= LIMIT_SIGMA
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('across', 'share'), [('u', 0.2), ('u', 0.85), ('v', 0.5)])
+def test_a_lost_line_is_found_where_it_is(across: str, share: float) -> None:
+    given = of_random_pointings(7)
+    axis = 'uv'.index(across)
+    place_px = share * (WIDTH, HEIGHT)[axis]
+
+    def lost(pixels: Floats) -> Floats:
+        moved = np.zeros_like(pixels)
+        moved[:, axis] = -(pixels[:, axis] > place_px).astype(float)
+        return moved
+
+    step = detector_step(estimated(given, displaced(true_observations(given), lost)))
+    assert (step.across, step.moved) == (across, across) and step.p_value < 1e-9
+    assert abs(step.place_px - place_px) < 0.8 * WIDTH / 97 + 2.0  # of the places, and the stars
+    assert -1.0 < step.size_px < -0.3  # the field takes the rest
+
+
+def test_columns_that_are_shifted_along_themselves_are_found() -> None:
+    given = of_random_pointings(8)
+
+    def shifted(pixels: Floats) -> Floats:
+        return np.stack([0.0 * pixels[:, 0], 0.3 * (pixels[:, 0] > 400.0)], axis=-1)
+
+    step = detector_step(estimated(given, displaced(true_observations(given), shifted)))
+    assert (step.across, step.moved) == ('u', 'v') and step.p_value < 1e-6
+    assert abs(step.place_px - 400.0) < WIDTH / 48 and step.size_px > 0.15
+
+
+@pytest.mark.slow
+def test_a_sound_detector_has_no_step() -> None:
+    """Twelve detectors: the least of their p-values is under 1e-3 in 1 of 80 runs."""
+    p_values = []
+    for seed in range(1, 13):
+        given = of_random_pointings(seed, images=6)
+        p_values.append(detector_step(estimated(given, true_observations(given))).p_value)
+    assert min(p_values) > 1e-3

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation.centroids import cramer_rao_covariance, true_observations
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.assessment.observability import (
     coverage,
     ensemble_status,
@@ -22,7 +21,7 @@ from starcal_ros.assessment.observability import (
     predicted_sigma,
     weakest_direction,
 )
-from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
+from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
@@ -45,11 +44,6 @@ FREE = [k for k, name in enumerate(PARAMETER_NAMES) if name in NAMES]
 @functools.cache
 def ensemble() -> Ensemble:
     return true_observations(SCENARIO)
-
-
-@functools.cache
-def without_noise() -> Ensemble:
-    return true_observations(SCENARIO, centroid_noise=False, attitude_noise=False)
 
 
 @functools.cache
@@ -90,22 +84,6 @@ def test_predicted_sigma_at_the_truth_is_the_cramer_rao_bound() -> None:
     found = predicted_sigma(ensemble(), TRUTH, apart)[:8]
     bound = np.sqrt(np.diag(cramer_rao_covariance(SCENARIO)))
     np.testing.assert_allclose(found, bound, rtol=0.01)
-
-
-def test_the_order_of_names_is_that_of_the_parameters() -> None:
-    turned = dataclasses.replace(OPTIONS, estimate=NAMES[::-1])
-    np.testing.assert_array_equal(
-        predicted_sigma(ensemble(), PRIOR, turned), predicted_sigma(ensemble(), PRIOR, OPTIONS)
-    )
-    names = ensemble_status(ensemble(), PRIOR, turned).parameter_names
-    assert names[:8] == tuple(name for name in PARAMETER_NAMES if name in NAMES)
-
-
-def test_twice_the_images_have_half_the_variance() -> None:
-    twice = Ensemble(ensemble().images * 2)
-    options = dataclasses.replace(OPTIONS, star_tracker_slow_arcsec=1e-6)  # images share it
-    one, two = (predicted_sigma(e, PRIOR, options) for e in (ensemble(), twice))
-    np.testing.assert_allclose(two * np.sqrt(2), one, rtol=1e-9)
 
 
 def test_a_first_star_tracker_without_images_leaves_the_camera_known() -> None:
@@ -194,60 +172,6 @@ def test_every_corner_of_the_detector_has_its_cell() -> None:
     assert found.sum() == 4
 
 
-def sight_sigma_arcsec(covariance: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    pixels = pixel_grid(TRUTH.camera, columns, rows)
-    return line_of_sight_table(TRUTH.camera, MapCovariance(covariance), pixels).sigma_arcsec
-
-
-def sampled_directions(samples: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Lines of sight (k, n, 3) of a 5-column grid in the star tracker frame, and at the mean (n, 3).
-
-    Cameras and alignments are drawn from the covariance of the solve about the truth.
-    """
-    rng = np.random.default_rng(5)
-    estimated = [*FREE, 10, 11, 12]
-    C = covariance()[np.ix_(estimated, estimated)]
-    sigma = np.sqrt(np.diag(C))
-    draws = rng.multivariate_normal(np.zeros(11), C / np.outer(sigma, sigma), samples) * sigma
-    pixels = pixel_grid(TRUTH.camera, 5, rows)
-    mounting = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw)
-    found = []
-    for draw in draws:
-        parameters = TRUTH.camera.parameters.copy()
-        parameters[FREE] += draw[:8]
-        camera = dataclasses.replace(TRUTH.camera, parameters=parameters)
-        # camera_from_star_tracker <- exp(-[dtheta x]) camera_from_star_tracker (Eq. 11).
-        turned = mounting * Rotation.from_rotvec(draw[8:])
-        found.append(turned.apply(line_of_sight(camera, pixels)))
-    return np.array(found), mounting.apply(line_of_sight(TRUTH.camera, pixels))
-
-
-@pytest.mark.slow
-def test_the_line_of_sight_map_is_what_the_covariance_scatters() -> None:
-    found, mean = sampled_directions(2000, 4)
-    scatter_rad = np.sqrt(((found - mean) ** 2).sum(axis=2).mean(axis=0))
-    expected = sight_sigma_arcsec(covariance(), 5, 4)
-    # 2000 draws of two angles: 1.6 % each; the worst of 20 pixels within four of those.
-    np.testing.assert_allclose(scatter_rad / ARCSECOND_RAD, expected, rtol=0.065)
-
-
-def test_the_map_sigma_is_the_scatter_that_a_common_turn_leaves() -> None:
-    found, mean = sampled_directions(500, 5)
-    left = []
-    for one in found:
-        turn, _ = Rotation.align_vectors(one, mean)
-        left.append(((one - turn.apply(mean)) ** 2).sum(axis=1))
-    fx = TRUTH.camera.parameters[0]
-    scatter_px = fx * np.sqrt(np.mean(left))
-    # Eight modes of unlike strength in 500 draws: 3 % or so.
-    pixels = pixel_grid(TRUTH.camera, 5, 5)
-    table = line_of_sight_table(TRUTH.camera, MapCovariance(covariance()), pixels)
-    sigma_rad = table.shape_sigma_arcsec * ARCSECOND_RAD
-    expected_px = fx * np.sqrt(np.mean(sigma_rad**2))
-    assert scatter_px == pytest.approx(expected_px, rel=0.10)
-
-
 def test_the_map_does_not_mind_what_the_alignment_takes_up() -> None:
     # The principal point unknown by 20 px, the alignment turned so as to undo it.
     C = np.zeros((13, 13))
@@ -255,44 +179,10 @@ def test_the_map_does_not_mind_what_the_alignment_takes_up() -> None:
     fx = TRUTH.camera.parameters[0]
     left_px = map_sigma_px(TRUTH.camera, MapCovariance(C))
     # Off the axis by r a turn shears by r^2: what 20 px leave at the corner (r = 0.23) is 1 px.
-    assert left_px.max() < 20.0 * 0.23**2 * 1.5
+    assert 0.1 < left_px.max() < 20.0 * 0.23**2 * 1.5
     C[11, 11] = (20.0 / fx) ** 2
     C[3, 11] = C[11, 3] = 20.0 * 20.0 / fx
     np.testing.assert_array_equal(map_sigma_px(TRUTH.camera, MapCovariance(C)), left_px)
-    # The whole line of sight does mind, one way or the other: 20 px are 2300 arcsec.
-    C[3, 11] = C[11, 3] = 0.0
-    C[11, 11] = 0.0
-    whole = sight_sigma_arcsec(C, 25, 20)
-    np.testing.assert_allclose(whole, 20 / fx / ARCSECOND_RAD, rtol=0.1)
-
-
-def test_an_alignment_alone_is_seen_by_each_line_of_sight_but_its_own_axis() -> None:
-    C = np.zeros((13, 13))
-    C[12, 12] = (100 * ARCSECOND_RAD) ** 2  # roll
-    found = sight_sigma_arcsec(C, 3, 3)
-    e = line_of_sight(TRUTH.camera, pixel_grid(TRUTH.camera, 3, 3))
-    expected = 100 * np.hypot(e[:, 0], e[:, 1])
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def unlike_images() -> Ensemble:
-    """Twenty images: each of the ten once with all its stars and once with every tenth."""
-    images = []
-    for image in ensemble().images:
-        images += [image, image.select(np.arange(len(image)) % 10 == 3)]
-    return Ensemble(tuple(images), {'no_match': 1})
-
-
-def test_the_most_informative_images_are_kept() -> None:
-    everything = unlike_images()
-    kept = keep_most_informative(everything, PRIOR, dataclasses.replace(OPTIONS, max_images=10))
-    assert len(kept.images) == 10
-    assert kept.refused == everything.refused
-    assert [i.time_ns for i in kept.images] == sorted(i.time_ns for i in kept.images)
-    # The thin images hold a tenth of the information: sqrt(1.1) is 5 % of sigma.
-    before, after = (predicted_sigma(e, PRIOR, OPTIONS) for e in (everything, kept))
-    assert (after <= 1.06 * before)[:8].all()
-    assert min(len(image) for image in kept.images) > 100
 
 
 def least_mean_variance(information: np.ndarray, count: int, unit: np.ndarray) -> float:
@@ -369,7 +259,8 @@ def test_the_image_that_is_left_out_is_worth_least() -> None:
         worth = [np.trace(np.linalg.solve(scaled.sum(axis=0), one)) for one in scaled]
         del left[int(np.argmin(worth))]
     limit = dataclasses.replace(OPTIONS, max_images=4)
-    kept = keep_most_informative(Ensemble(images), PRIOR, limit)
+    kept = keep_most_informative(Ensemble(images, {'no_match': 1}), PRIOR, limit)
+    assert kept.refused == {'no_match': 1}
     assert [one.time_ns for one in kept.images] == [images[k].time_ns for k in left]
 
 

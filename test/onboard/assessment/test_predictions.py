@@ -1,24 +1,37 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Predictions of images, stars and cells by the others: 1 on sound data, more at a fault."""
+"""Predictions of images, stars and cells by the others, and the residuals that are left."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
-from random_pointings import displaced, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from worlds import displaced, each_image, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 
+from starcal_ground.products import read_residuals, write_residuals
+from starcal_ground.simulation import centroids as simulated_centroids
+from starcal_ground.simulation import scenario
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment import predictions as predictions_module
-from starcal_ros.assessment.predictions import predicted_residuals, predictions
+from starcal_ros.assessment.predictions import (
+    predicted_residuals,
+    predictions,
+    Residuals,
+    residuals_of,
+)
 from starcal_ros.camera import line_of_sight, project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import ProductError
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.star_equations import whitening
 from starcal_ros.records import Ensemble, ResidualBin, StarObservations
 from studies.worlds import ripple
@@ -39,12 +52,12 @@ def worst_of(bins: list[ResidualBin]) -> ResidualBin:
 def with_noise(ensemble: Ensemble, factor: Callable[[int, StarObservations], Floats]) -> Ensemble:
     """The ensemble with more noise: so many sigma of each star of each image."""
     rng = np.random.default_rng(14)
-    images = []
-    for k, image in enumerate(ensemble.images):
+
+    def noisy(k: int, image: StarObservations) -> dict[str, Floats]:
         sigma_px = np.sqrt(image.covariance_px2[:, [0, 2]]) * factor(k, image)[:, None]
-        noise_px = sigma_px * rng.normal(size=sigma_px.shape)
-        images.append(dataclasses.replace(image, measured_px=image.measured_px + noise_px))
-    return Ensemble(tuple(images))
+        return {'measured_px': image.measured_px + sigma_px * rng.normal(size=sigma_px.shape)}
+
+    return each_image(ensemble, noisy)  # type: ignore[no-any-return]
 
 
 def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
@@ -148,20 +161,6 @@ def test_a_part_that_scatters_more_is_named(by: str) -> None:
     assert found[-1].normalised > 1.2 > 1.0 > found[0].normalised
 
 
-def test_a_bad_part_of_the_detector_shows_in_the_cells() -> None:
-    """A bubble of 60 px in a corner of the window, 0.4 px: too small for the field."""
-    given = of_random_pointings(15, images=12)
-
-    def bubble(pixels: Floats) -> Floats:
-        inside = np.linalg.norm(pixels - [1180.0, 900.0], axis=1) < 60.0
-        return np.stack([0.35 * inside, -0.25 * inside], axis=-1)
-
-    bins = bins_of(given, displaced(true_observations(given), bubble))
-    worst = worst_of(bins)
-    assert (worst.by, worst.high) == ('cell', max(one.high for one in bins if one.by == 'cell'))
-    assert worst.normalised > 1.0 + 3.5 * worst.sigma
-
-
 def torn(ensemble: Ensemble, size_px: float = 0.3) -> Ensemble:
     """The ensemble whose last image has a shape of its own, as of a shutter that sticks."""
     last = ensemble.images[-1]
@@ -170,19 +169,16 @@ def torn(ensemble: Ensemble, size_px: float = 0.3) -> Ensemble:
     return Ensemble((*ensemble.images[:-1], dataclasses.replace(last, measured_px=moved_px)))
 
 
-def test_a_bad_image_shows_in_its_part() -> None:
-    given = of_random_pointings(16, images=8)
-    bins = bins_of(given, torn(true_observations(given)))
-    assert worst_of(bins).by == 'image' and worst_of(bins).high == 7.0
-    assert worst_of(bins).normalised > 1.1
+def of_a_cell(_: int, image: StarObservations) -> dict[str, Floats]:
+    inside = (np.abs(image.measured_px - [980.0, 580.0]) < 80.0).all(axis=1)
+    return {'measured_px': image.measured_px + np.outer(inside, [0.3, 0.0])}
 
 
-FAULTS = {
-    'cell': lambda x, m: 0.3 * ((np.abs(x - [980.0, 580.0]) < 80.0).all(axis=1)),
-    'brightness': lambda x, m: 0.1 * (m > 7.2),
-    'image': None,
-}
-"""Displacements along u of stars at pixels x of magnitudes m, by the part that shows them."""
+def of_faint_stars(_: int, image: StarObservations) -> dict[str, Floats]:
+    return {'measured_px': image.measured_px + np.outer(image.magnitude > 7.2, [0.1, 0.0])}
+
+
+FAULTS = {'cell': of_a_cell, 'brightness': of_faint_stars, 'image': None}
 
 
 @pytest.mark.parametrize('by', list(FAULTS))
@@ -192,16 +188,8 @@ def test_a_fault_is_seen_in_its_part(by: str) -> None:
     ensemble, fault = true_observations(given), FAULTS[by]
     sound = worst_of(bins_of(given, ensemble))
     assert sound.normalised < 1.0 + 3.5 * sound.sigma
-    images = tuple(
-        dataclasses.replace(
-            image,
-            measured_px=image.measured_px
-            + np.outer(fault(image.measured_px, image.magnitude), [1.0, 0.0]),
-        )
-        for image in ensemble.images
-        if fault
-    )
-    worst = worst_of(bins_of(given, Ensemble(images) if fault else torn(ensemble, 0.4)))
+    faulty = each_image(ensemble, fault) if fault else torn(ensemble, 0.4)
+    worst = worst_of(bins_of(given, faulty))
     assert worst.by == by
     assert worst.normalised > 1.0 + 5.0 * worst.sigma
 
@@ -249,13 +237,13 @@ def of_three_fields() -> tuple[Scenario, Ensemble]:
         for image in ensemble.images
         for one in image.catalog_id.tolist()
     }
-    images = []
-    for image in ensemble.images:
+
+    def moved(_: int, image: StarObservations) -> dict[str, Floats]:
         seen = line_of_sight(given.truth.camera, image.measured_px)
         turn = np.array([off[one] for one in image.catalog_id.tolist()])
-        moved_px = project(given.truth.camera, seen + turn) - image.measured_px
-        images.append(dataclasses.replace(image, measured_px=image.measured_px + moved_px))
-    return given, Ensemble(tuple(images))
+        return {'measured_px': project(given.truth.camera, seen + turn)}
+
+    return given, each_image(ensemble, moved)
 
 
 def test_an_image_is_predicted_where_stars_come_again() -> None:
@@ -283,3 +271,85 @@ def test_places_of_stars_that_the_model_has_are_no_fault() -> None:
     weights = dataclasses.replace(found.weights, errors=unshared)
     blind = predictions(dataclasses.replace(found, weights=weights))
     assert min(one.normalised for one in blind if one.by == 'star') > 1.3
+
+
+SCENARIO = dataclasses.replace(scenario.scenario('small', seed=4), image_count=8)
+
+
+@pytest.fixture(scope='module', params=['hierarchical', 'per_image', 'single'])
+def left(request: pytest.FixtureRequest) -> Residuals:
+    ensemble = simulated_centroids.true_observations(SCENARIO)
+    options = CalibrationOptions(
+        method=request.param,
+        star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec,
+        velocity_sigma_m_s=10.0,
+    )
+    estimate = estimate_calibration(ensemble, SCENARIO.prior, options)
+    return residuals_of(estimate, ensemble, np.full(len(estimate.table), np.nan))
+
+
+def test_attitude_errors_are_those_of_the_star_tracker(left: Residuals) -> None:
+    """Whatever the method: the stars show the errors that the simulation has put in."""
+    put_in = []
+    for index in range(SCENARIO.image_count):
+        exact, reported = (
+            Rotation.from_quat(
+                scenario.scene(SCENARIO, index, attitude_noise=noise).icrf_from_star_tracker_xyzw
+            )
+            for noise in (False, True)
+        )
+        put_in.append((exact.inv() * reported).as_rotvec() / ARCSECOND_RAD)
+    off = left.attitude_error_arcsec - np.array(put_in)
+    # What is common to all images went into the alignment.
+    off -= off.mean(axis=0)
+    # Distortion that is not known exactly turns all images alike: 5 sigma covers the stars' noise.
+    assert (np.abs(off) < 5 * left.attitude_sigma_arcsec).all()
+    # Around every axis what is left is a small part of the errors.  The sigma of the method single
+    # does not show it: the errors are in its residuals, which give the centroids their variance.
+    varied = np.array(put_in) - np.mean(put_in, axis=0)
+    assert (np.sqrt((off**2).mean(axis=0)) < 0.25 * np.sqrt((varied**2).mean(axis=0))).all()
+
+
+def test_rms_of_images(left: Residuals) -> None:
+    for k, rms in enumerate(left.image_rms_px()):
+        here = left.residual_px[(left.image == k) & left.used]
+        assert rms == pytest.approx(np.sqrt(np.mean(here**2)), rel=1e-12)  # rounding
+    nothing = dataclasses.replace(left, used=np.zeros_like(left.used))
+    assert np.isnan(nothing.image_rms_px()).all()
+
+
+def test_written_and_read_is_equal(left: Residuals, tmp_path: Path) -> None:
+    path = tmp_path / 'residuals.npz'
+    write_residuals(left, path)
+    again = read_residuals(path)
+    for field in dataclasses.fields(left):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(left, field.name))
+    first = path.read_bytes()
+    write_residuals(left, path)
+    assert path.read_bytes() == first
+
+
+def test_bad_files_are_named(left: Residuals, tmp_path: Path) -> None:
+    path = tmp_path / 'residuals.npz'
+    with pytest.raises(ProductError, match='cannot be read'):
+        read_residuals(path)
+    write_residuals(left, path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ProductError, match=str(path)):
+        read_residuals(path)
+    path.write_text('not an archive')
+    with pytest.raises(ProductError, match='not a NumPy archive'):
+        read_residuals(path)
+    write_residuals(dataclasses.replace(left, image=left.image + 100), path)
+    with pytest.raises(ProductError, match='images that are not there'):
+        read_residuals(path)
+    write_residuals(dataclasses.replace(left, measured_px=left.measured_px[1:]), path)
+    with pytest.raises(ProductError, match='measured_px'):
+        read_residuals(path)
+    write_residuals(left, path)
+    with np.load(path) as archive:
+        columns = {name: archive[name] for name in archive.files if name != 'used'}
+    np.savez(path, **columns)
+    with pytest.raises(ProductError, match="key 'used' is missing"):
+        read_residuals(path)

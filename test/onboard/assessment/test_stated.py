@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_pointings import estimated, honesty, of_random_pointings  # type: ignore[import-not-found]
 from sample_records import model_checks  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
+from worlds import estimated, honesty, of_random_pointings  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ros.arrays import Floats

@@ -5,26 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 
-from four_images import (  # type: ignore[import-not-found]
-    CAMERA,
-    COLOUR,
-    Dense,
-    dense,
-    HEIGHT,
-    IMAGES,
-    OWN,
-    prior_precision,
-    SHAPE,
-    Small,
-    WIDTH,
-)
+from four_images import Dense, dense, IMAGES, OWN, prior_precision, SHAPE, Small  # type: ignore[import-not-found]
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation.equations import (
-    chain,
     Equations,
     equations,
     information_of_images,
@@ -32,7 +19,7 @@ from starcal_ros.estimation.equations import (
     stars_alone,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.unknowns import Layout, unknowns_in_state
+from starcal_ros.estimation.unknowns import unknowns_in_state
 
 # Finite differences leave 1e-10 of a derivative, and attitude errors of 20 arcsec, which enter the
 # derivatives of the star trackers to first order, 1e-8.
@@ -125,34 +112,6 @@ def test_an_image_that_its_star_tracker_alone_holds_follows_it(given: Small) -> 
     assert arrow.back[1][:3, at] == pytest.approx(-entry[1], abs=1e-9)
 
 
-def test_the_sums_do_not_depend_on_the_order_of_stars_and_images(given: Small) -> None:
-    order = np.lexsort((np.random.default_rng(1).random(len(given.table)), given.table.image))
-    table = dataclasses.replace(
-        given.table,
-        **{
-            name: getattr(given.table, name)[order]
-            for name in (
-                'image',
-                'catalog_id',
-                'star',
-                'direction_icrf',
-                'magnitude',
-                'measured_px',
-                'covariance_px2',
-            )
-        },
-    )
-    colour = dataclasses.replace(given.layout['colour'], of_star=COLOUR[order])
-    entries = tuple(colour if e.name == 'colour' else e for e in given.layout.entries)
-    shuffled = dataclasses.replace(
-        given, table=table, keep=given.keep[order], layout=Layout(entries)
-    )
-    one, other = given.sums(), shuffled.sums()
-    for name in ('blocks', 'field_information', 'field_cross'):
-        a, b = getattr(one, name), getattr(other, name)
-        assert b == pytest.approx(a, rel=1e-9, abs=1e-11 * np.abs(a).max())
-
-
 def test_a_star_behind_the_camera_is_named(given: Small) -> None:
     direction = given.table.direction_icrf.copy()
     direction[3] *= -1.0
@@ -160,28 +119,6 @@ def test_a_star_behind_the_camera_is_named(given: Small) -> None:
     behind = dataclasses.replace(given, table=table)
     with pytest.raises(NotObservable, match='a star has no image'):
         star_sums(behind.linear())
-
-
-def test_the_chain_turns_camera_columns_into_unknowns(given: Small) -> None:
-    E = chain(given.problem, given.layout, IMAGES)
-    p = len(CAMERA.parameters)
-    for k in range(IMAGES):
-        above_k = given.problem.above_reference_k[k]
-        factor = 1.0 + given.state.focal @ [above_k, above_k**2]
-        assert np.diag(E[k])[:3] == pytest.approx(factor)
-        assert E[k][:3, p] == pytest.approx(given.state.parameters[:3] * above_k)
-        assert E[k][:3, p + 1] == pytest.approx(given.state.parameters[:3] * above_k**2)
-        # Rows: camera, velocity, colour and read-out, errors of rates, rotation, residual.
-        of_stars = np.r_[np.arange(p + 2, p + 7), E.shape[2] - 4 + np.arange(3)]
-        of_stars = np.r_[of_stars, np.arange(p + 7, p + 10)]
-        assert E[k][p:-1][:, of_stars] == pytest.approx(np.eye(11))
-        scale, stretch, shear, *decentring = E[k][:p, -9:-4].T
-        assert scale[:3] == pytest.approx([1.0, 0.0, 1.0]) and not scale[3:].any()
-        assert stretch[:3] == pytest.approx([1.0, 0.0, -1.0]) and not stretch[3:].any()
-        assert shear[:3] == pytest.approx([0.0, 1.0, 0.0]) and not shear[3:].any()
-        per_px = given.state.parameters[0] / (0.25 * (WIDTH**2 + HEIGHT**2))
-        assert np.array(decentring) == pytest.approx(per_px * np.eye(p)[8:])
-        assert E[k][-1, -1] == 1.0 and not E[k][-1, :-1].any() and not E[k][:-1, -1].any()
 
 
 def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one(
@@ -210,14 +147,3 @@ def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one
     assert arrow.information / np.sqrt(np.outer(size, size)) == pytest.approx(
         each.sum(axis=0) / np.sqrt(np.outer(size, size)), abs=1e-9
     )
-
-
-def test_an_image_without_stars_and_star_tracker_has_no_information(given: Small) -> None:
-    sigma = given.problem.star_tracker_sigma_rad.copy()
-    sigma[2] = np.inf
-    problem = dataclasses.replace(given.problem, star_tracker_sigma_rad=sigma)
-    without = dataclasses.replace(given, keep=given.keep & (given.table.image != 2))
-    layout = unknowns_in_state(problem, given.state)
-    _, sums = stars_alone(problem, given.state, layout, without.measurements())
-    each = information_of_images(sums, problem, given.state, layout)
-    assert not each[2].any() and all(each[k].any() for k in (0, 1, 3))

@@ -7,8 +7,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from random_pointings import displaced, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
+from worlds import displaced, estimated, normalised_error, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 
 from bench.narrow import bound_px, scenario_of
 from starcal_ground import calibrate
@@ -19,11 +19,10 @@ from starcal_ground.simulation.scenario import Scenario, scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.assessment.observability import map_error_px, map_sigma_px
-from starcal_ros.camera import CameraModel, lens, pixel_grid, project_jacobians
-from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.camera import CameraModel, lens, pixel_grid
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble
 
 #           k1   k2    k3    p1     p2     k4    k5   k6
@@ -175,86 +174,14 @@ def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
         p = len(found.geometry.camera.parameters)
         assert found.covariance.shape == (p + 3, p + 3)
         free = [*found.linear.problem.free, p, p + 1, p + 2]
-        turn = (
-            Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
-            * Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw)
-        ).as_rotvec()
-        error = np.r_[found.geometry.camera.parameters - made.truth.camera.parameters, turn][free]
-        covariance = found.covariance[np.ix_(free, free)]
-        sigma = np.sqrt(np.diag(covariance))
-        whitened = np.linalg.solve(
-            np.linalg.cholesky(covariance / np.outer(sigma, sigma)), error / sigma
-        )
-        squares, count = squares + float(whitened @ whitened), count + len(free)
+        chi2 = normalised_error(found, made.truth, free)
+        squares, count = squares + chi2, count + len(free)
         camera = found.geometry.camera
         pixels = pixel_grid(camera, 25, 20)
         table = line_of_sight_table(camera, found.map_covariance, pixels)
         assert (table.sigma_arcsec > 0).all()
     # Chi^2 with `count` degrees of freedom, 5 sigma on either side.
     assert abs(squares / count - 1.0) < 5 * np.sqrt(2 / count)
-
-
-@each_model
-def test_blocks_equal_the_dense_normal_matrices(model: str) -> None:
-    made = wide(model)
-    ensemble = true_observations(made)
-    table = star_table(ensemble.images)
-    camera = made.truth.camera
-    star_tracker_from_icrf = Rotation.from_quat(
-        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
-    ).inv()
-    alignment = Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
-    rotations = (alignment * star_tracker_from_icrf).as_matrix()
-    everything = np.ones(len(table), bool)
-    measurements = arrange(table, everything, table.covariance_px2)
-    cost, blocks = normal_blocks(measurements, model, camera.parameters, rotations)
-    pixels, J_parameters, J_rotation = project_jacobians(
-        camera, np.einsum('nij,nj->ni', rotations[table.image], table.direction_icrf)
-    )
-    residual = (table.measured_px - pixels)[..., None]
-    J = np.concatenate([J_parameters, J_rotation, residual], axis=-1)
-    uu, uv, vv = table.covariance_px2.T
-    W = np.linalg.inv(np.array([[uu, uv], [uv, vv]]).transpose(2, 0, 1))
-    products = np.swapaxes(J, 1, 2) @ W @ J
-    dense = np.zeros_like(blocks)
-    np.add.at(dense, table.image, products)
-    unit = 1 / np.sqrt(np.einsum('mii->mi', dense))
-    scaled = (blocks - dense) * unit[:, :, None] * unit[:, None, :]
-    # Sums of some hundred products in another order.
-    np.testing.assert_allclose(scaled, 0.0, rtol=0, atol=1e-11)
-    assert cost == pytest.approx(0.5 * dense[:, -1, -1].sum(), rel=1e-12)
-    # Parameters of each image, as where temperature changes them, are the same numbers.
-    own = np.tile(camera.parameters, (len(rotations), 1))
-    each_cost, each = normal_blocks(measurements, model, own, rotations)
-    assert each_cost == pytest.approx(cost, rel=1e-12)
-    np.testing.assert_allclose(
-        (each - blocks) * unit[:, :, None] * unit[:, None, :], 0, atol=1e-11
-    )
-
-
-@pytest.mark.parametrize(
-    ('options', 'says'),
-    [
-        ({'estimate': ('fx', 'p1')}, 'estimate: p1 is not a parameter of the lens model equidist'),
-        ({'prior_sigma': (0.0,) * 10}, 'prior_sigma: 10 numbers, but the lens model equidistant'),
-    ],
-)
-def test_options_of_another_model_are_refused(options: dict[str, object], says: str) -> None:
-    made = wide('equidistant')
-    chosen = CalibrationOptions(**options)  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match=says):
-        estimate_calibration(true_observations(made), made.truth, chosen)
-
-
-def test_a_prior_sigma_of_every_parameter() -> None:
-    made = wide('equidistant')
-    tight = (1e-3, 1e-3, 1e-3, 0.0, 0.0, 1e-6, 1e-6, 1e-6, 1e-6)
-    chosen = CalibrationOptions(prior_sigma=tight, velocity_sigma_m_s=10.0)
-    found = estimate_calibration(true_observations(made), made.truth, chosen)
-    sigma = np.sqrt(np.diag(found.covariance))[[1, 5, 6, 7, 8]]
-    assert (sigma <= np.array(tight)[[1, 5, 6, 7, 8]]).all()
-    # A change that lasts over all images may be in the focal length: 0.01 px at most here.
-    assert (np.sqrt(np.diag(found.covariance))[[0, 2]] < 0.01).all()
 
 
 def test_mirrored_images_are_named() -> None:

@@ -79,15 +79,6 @@ def test_a_step_equals_the_dense_one(m: int, damping: float) -> None:
     )
 
 
-def test_without_blocks_it_is_plain_least_squares() -> None:
-    rng = np.random.default_rng(1)
-    J, r = rng.normal(size=(30, 5)), rng.normal(size=30)
-    shared, blocks = solve_arrow(plain(J, r), 0.0)
-    expected = np.linalg.lstsq(J, -r, rcond=None)[0]
-    np.testing.assert_allclose(shared, expected, rtol=0, atol=1e-13)
-    assert blocks.shape == (0, 3)
-
-
 def decays(
     unit: np.ndarray,
 ) -> tuple[Callable[[np.ndarray], NormalEquations], Move, Callable[[np.ndarray], np.ndarray]]:
@@ -151,35 +142,6 @@ def test_the_units_of_the_unknowns_do_not_matter() -> None:
     other = levenberg_marquardt(START / units, *decays(unit)[:2])
     assert other.iterations == one.iterations
     np.testing.assert_allclose(other.state * units, one.state, rtol=1e-13)
-
-
-def test_a_start_at_the_minimum_stays() -> None:
-    evaluate, move, _ = decays(np.ones(4))
-    first = levenberg_marquardt(START, evaluate, move)
-    again = levenberg_marquardt(first.state, evaluate, move)
-    assert again.converged and again.iterations <= 2
-    np.testing.assert_allclose(again.state, first.state, rtol=1e-8)
-
-
-def test_exact_data_leave_no_cost() -> None:
-    rng = np.random.default_rng(3)
-    J, truth = rng.normal(size=(20, 4)), np.array([1.0, -2.0, 3.0, 4.0])
-    solution = levenberg_marquardt(np.zeros(4), lambda x: plain(J, J @ (x - truth)), add)
-    assert solution.converged
-    np.testing.assert_allclose(solution.state, truth, rtol=0, atol=1e-9)
-
-
-def test_the_cost_never_rises() -> None:
-    evaluate, move, _ = decays(np.ones(4))
-    accepted: list[float] = []
-
-    def watched(x: np.ndarray, shared: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-        accepted.append(evaluate(x).cost)
-        return move(x, shared, blocks)
-
-    levenberg_marquardt(START, evaluate, watched)
-    assert len(accepted) > 5
-    assert (np.diff(accepted) <= 0).all()
 
 
 def test_a_column_without_data_is_not_observable() -> None:

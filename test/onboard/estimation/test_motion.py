@@ -3,28 +3,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import math
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from worlds import campaign, each_image, estimate_of, solved  # type: ignore[import-not-found]
 
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.tracker_errors import measured_rates
 from starcal_ros.records import Ensemble, StarObservations
 from studies.worlds import Campaign, simulate, World
 
 ROLLING = World(rate_deg_s=0.42, row_s=20e-6, tracker_arcsec=5.0)
 READOUT_S = 20e-6 * 1024
-
-
-def estimated(made: Campaign, **options: object) -> Estimate:
-    sigma = made.scenario.star_tracker_sigma_arcsec
-    chosen = CalibrationOptions(star_tracker_sigma_arcsec=sigma, **options)  # type: ignore[arg-type]
-    return estimate_calibration(made.ensemble, made.scenario.prior, chosen)
 
 
 def of_focal(found: Estimate, made: Campaign) -> tuple[np.ndarray, np.ndarray]:
@@ -34,19 +29,20 @@ def of_focal(found: Estimate, made: Campaign) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_known_time_of_readout_is_corrected() -> None:
-    made = simulate(ROLLING, 2)
-    error_px, sigma_px = of_focal(estimated(made, shutter='rolling', readout_s=READOUT_S), made)
+    made = campaign(ROLLING, 2)
+    known = solved(ROLLING, 2, shutter='rolling', readout_s=READOUT_S)
+    error_px, sigma_px = of_focal(known, made)
     assert (np.abs(error_px) < 3.0 * sigma_px).all() and sigma_px.max() < 0.06
-    error_px, sigma_px = of_focal(estimated(made, shutter='global'), made)
+    error_px, sigma_px = of_focal(estimate_of(made, shutter='global'), made)
     assert np.abs(error_px / sigma_px).max() > 30.0
-    backwards = estimated(made, shutter='rolling', readout_s=-READOUT_S)
+    backwards = estimate_of(made, shutter='rolling', readout_s=-READOUT_S)
     error_px, sigma_px = of_focal(backwards, made)
     assert np.abs(error_px / sigma_px).max() > 30.0
 
 
 def test_an_unknown_time_of_readout_is_in_the_sigma() -> None:
-    made = simulate(ROLLING, 2)
-    error_px, sigma_px = of_focal(estimated(made), made)
+    made = campaign(ROLLING, 2)
+    error_px, sigma_px = of_focal(solved(ROLLING, 2), made)
     assert (np.abs(error_px) < 3.0 * sigma_px).all() and sigma_px.max() > 0.4
 
 
@@ -55,7 +51,7 @@ def test_the_noise_of_the_centroids_is_no_time_of_readout() -> None:
     """With derivatives at the measured pixels the rms was 1.7."""
     in_sigma = []
     for seed in range(8):
-        found = estimated(simulate(dataclasses.replace(ROLLING, row_s=0.0), seed))
+        found = estimate_of(simulate(dataclasses.replace(ROLLING, row_s=0.0), seed))
         (at,) = np.arange(found.linear.layout.count)[found.linear.layout.places['readout']]
         in_sigma.append(found.posterior.mean[at] / math.sqrt(found.posterior.covariance[at, at]))
     assert np.sqrt(np.mean(np.square(in_sigma))) < 1.3
@@ -67,7 +63,7 @@ def test_an_offset_of_the_stamps_is_in_the_sigma_of_the_pointing() -> None:
     true = Rotation.from_quat(made.scenario.truth.star_tracker_from_camera_xyzw)
     held = {'estimate': ('fx', 'skew', 'fy', 'distortion'), 'shutter': 'global'}
     for stamp_sigma_s, is_covered in ((0.0, False), (0.05, True)):
-        found = estimated(made, stamp_sigma_s=stamp_sigma_s, **held)
+        found = estimate_of(made, stamp_sigma_s=stamp_sigma_s, **held)
         q = Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw)
         error_rad = (q.inv() * true).as_rotvec()
         chi2 = error_rad @ np.linalg.solve(found.covariance[10:, 10:], error_rad)
@@ -75,11 +71,10 @@ def test_an_offset_of_the_stamps_is_in_the_sigma_of_the_pointing() -> None:
         assert np.linalg.norm(error_rad) > 12.0 * ARCSECOND_RAD
 
 
-def with_rates(made: Campaign, every: int = 3, **fields: object) -> Campaign:
-    """Return a campaign whose every third image, or so, has other fields."""
-    images = list(made.ensemble.images)
-    images[::every] = [dataclasses.replace(one, **fields) for one in images[::every]]  # type: ignore[arg-type]
-    return dataclasses.replace(made, ensemble=Ensemble(tuple(images)))
+def with_fields(made: Campaign, change: Callable[[int], dict[str, object]]) -> Campaign:
+    """Return a campaign whose images have other fields, by their number."""
+    ensemble = each_image(made.ensemble, lambda k, _: change(k))
+    return dataclasses.replace(made, ensemble=ensemble)
 
 
 UNKNOWN = np.full(3, np.nan)
@@ -91,17 +86,17 @@ def test_without_any_rate_the_turn_of_a_low_orbit_is_in_the_sigma(
 ) -> None:
     """Left out where the shutter is unknown, focal lengths were 9 to 16 sigma off."""
     made = simulate(dataclasses.replace(ROLLING, rate_deg_s=0.055), 2)
-    made = with_rates(made, 1, star_tracker_rate_rad_s=UNKNOWN)
-    found = estimated(made, **stated)
+    made = with_fields(made, lambda _: {'star_tracker_rate_rad_s': UNKNOWN})
+    found = estimate_of(made, **stated)
     layout = found.linear.layout
     assert {'readout', 'stamps'} < set(layout.places) and 'rates' not in layout
     error_px, sigma_px = of_focal(found, made)
     assert (np.abs(error_px) < 3.0 * sigma_px).all() and np.abs(error_px).max() > 0.1
-    error_px, sigma_px = of_focal(estimated(made, shutter='global'), made)
+    error_px, sigma_px = of_focal(estimate_of(made, shutter='global'), made)
     assert np.abs(error_px / sigma_px).max() > 8.0
     # A global shutter shows no turn: as good as with a rate of zero.
     still = simulate(dataclasses.replace(ROLLING, rate_deg_s=0.0), 2)
-    _, known_px = of_focal(estimated(still, shutter='global'), still)
+    _, known_px = of_focal(estimate_of(still, shutter='global'), still)
     assert sigma_px == pytest.approx(known_px, rel=0.1)
 
 
@@ -134,10 +129,12 @@ def test_without_any_rate_a_camera_turns_as_its_images_do_or_as_an_orbit(
 @pytest.mark.parametrize('stated', [{}, {'shutter': 'rolling', 'readout_s': READOUT_S}])
 def test_an_image_without_a_rate_turns_as_the_others_do(stated: dict[str, object]) -> None:
     """One of them left out the read-out of all: the sigma was too small by 30."""
-    made = simulate(ROLLING, 2)
-    error_px, sigma_px = of_focal(estimated(made, **stated), made)
-    partly = with_rates(made, star_tracker_rate_rad_s=UNKNOWN)
-    found = estimated(partly, **stated)
+    made = campaign(ROLLING, 2)
+    error_px, sigma_px = of_focal(solved(ROLLING, 2, **stated), made)
+    partly = with_fields(
+        made, lambda k: {'star_tracker_rate_rad_s': UNKNOWN} if k % 3 == 0 else {}
+    )
+    found = estimate_of(partly, **stated)
     error_px, partly_px = of_focal(found, partly)
     assert 'readout' in found.linear.layout and 'rates' in found.linear.layout
     assert (np.abs(error_px) < 3.0 * partly_px).all()
@@ -164,7 +161,7 @@ def test_rates_by_samples_with_errors_of_their_own_show_no_absent_readout(
     in_sigma = []
     for seed in range(4):
         made = simulate(dataclasses.replace(NOISY, filter_s=filter_s), seed)
-        found = estimated(made, **stated)
+        found = estimate_of(made, **stated)
         error_px, sigma_px = of_focal(found, made)
         in_sigma.append(error_px / sigma_px)
     assert np.sqrt(np.mean(np.square(in_sigma))) < 1.5 and np.abs(in_sigma).max() < 3.0
@@ -190,7 +187,7 @@ def test_rates_whose_sender_states_no_sigma_show_no_absent_readout(claim: float)
             for one, error in zip(made.ensemble.images, errors, strict=True)
         ]
         made = dataclasses.replace(made, ensemble=Ensemble(tuple(images)))
-        error_px, sigma_px = of_focal(estimated(made), made)
+        error_px, sigma_px = of_focal(estimate_of(made), made)
         in_sigma.append(error_px / sigma_px)
     # 24 errors of which about half are independent: an rms of 1 to a fifth.
     assert np.sqrt(np.mean(np.square(in_sigma))) < 1.5 and np.abs(in_sigma).max() < 3.5
@@ -232,12 +229,8 @@ def test_the_velocity_is_as_uncertain_as_the_least_certain_image(
     recorded: tuple[float, float], asked: float, sigma_m_s: float
 ) -> None:
     made = simulate(World(images=6), 0)
-    images = [
-        dataclasses.replace(one, velocity_sigma_m_s=recorded[k == 5])
-        for k, one in enumerate(made.ensemble.images)
-    ]
-    made = dataclasses.replace(made, ensemble=Ensemble(tuple(images)))
-    found = estimated(made, velocity_sigma_m_s=asked)
+    made = with_fields(made, lambda k: {'velocity_sigma_m_s': recorded[k == 5]})
+    found = estimate_of(made, velocity_sigma_m_s=asked)
     assert ('velocity' in found.linear.layout) == (sigma_m_s > 0)
     if sigma_m_s:
         np.testing.assert_array_equal(found.linear.layout['velocity'].sigma, sigma_m_s)

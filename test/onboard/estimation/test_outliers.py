@@ -51,13 +51,6 @@ def apart(table: StarTable) -> Groups:
     return Groups('cells', np.arange(len(table)), np.arange(len(table)))
 
 
-def test_sound_stars_are_all_used() -> None:
-    table, residual = usual()
-    kept = fits(residual, table)
-    assert kept.all()
-    assert len(dropped_stars(table, kept)) == 0
-
-
 def test_an_outlier_is_left_out_alone_at_the_length_of_its_residual() -> None:
     table, residual = usual()
     u, v = 4.6 * SIGMA_PX * np.array([0.6, -0.8])
@@ -198,23 +191,6 @@ def test_few_images_of_a_star_tracker_of_unknown_noise_have_no_misfits() -> None
     error, variance = attitudes(rng, 12, 4.0)
     error[5, 1] = 400.0  # a jump of a degree
     assert np.flatnonzero(judged(error, variance, is_stated=False)).tolist() == [5]
-
-
-def test_sound_images_are_no_misfits() -> None:
-    rng = np.random.default_rng(3)
-    for m in (3, 6, 40):
-        for _ in range(50):
-            assert not judged(*attitudes(rng, m)).any()
-
-
-@pytest.mark.parametrize('m', [4, 12, 36])
-@pytest.mark.parametrize('axis', [0, 1, 2])
-def test_an_attitude_that_jumps_is_a_misfit(m: int, axis: int) -> None:
-    error, variance = attitudes(np.random.default_rng(4), m, 0.5)
-    error[1, axis] -= 9.0
-    assert np.flatnonzero(judged(error, variance)).tolist() == [1]
-    error[1, axis] += 6.0
-    assert not judged(error, variance).any()
 
 
 def test_the_limit_is_by_the_stated_noise_and_the_number_of_attitudes() -> None:

@@ -10,28 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from worlds import each_image, errors_of, normalised_error, with_noise  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.assessment.observability import (
-    estimated_names,
-    keep_most_informative,
-    predicted_sigma,
-)
+from starcal_ros.assessment.observability import estimated_names, predicted_sigma
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.problem import (
-    geometry_at,
-    METHODS,
-    parameters_at,
-    parameters_chain,
-    reference_degc,
-    turns,
-    turns_chain,
-)
+from starcal_ros.estimation.problem import geometry_at, METHODS, reference_degc
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
@@ -85,27 +73,20 @@ def observed(
     tracker_arcsec: tuple[float, ...] = TRACKER_ARCSEC,
 ) -> Ensemble:
     """Observations with the temperature-dependent camera; noise if a seed is given."""
-    rng = np.random.default_rng(seed)
-    images = []
-    for image, degc in zip(stars(), temperatures_degc, strict=True):
-        icrf_from_star_tracker = Rotation.from_quat(image.icrf_from_star_tracker_xyzw)
-        camera_from_icrf = alignment_of(degc, rate_rad) * icrf_from_star_tracker.inv()
+
+    def at_temperature(k: int, image: StarObservations) -> dict[str, object]:
+        degc = float(temperatures_degc[k])
+        star_tracker_from_icrf = Rotation.from_quat(image.icrf_from_star_tracker_xyzw).inv()
+        camera_from_icrf = alignment_of(degc, rate_rad) * star_tracker_from_icrf
         pixels = project(camera_of(degc, focal), camera_from_icrf.apply(image.direction_icrf))
-        if seed is not None:
-            uu, uv, vv = image.covariance_px2.T
-            L = np.linalg.cholesky(np.array([[uu, uv], [uv, vv]]).transpose(2, 0, 1))
-            pixels = pixels + np.einsum('nij,nj->ni', L, rng.normal(size=pixels.shape))
-            error = rng.normal(size=3) * np.array(tracker_arcsec) * ARCSECOND_RAD
-            icrf_from_star_tracker = icrf_from_star_tracker * Rotation.from_rotvec(error)
-        images.append(
-            dataclasses.replace(
-                image,
-                measured_px=pixels,
-                icrf_from_star_tracker_xyzw=icrf_from_star_tracker.as_quat(),
-                temperature_degc=float(degc),
-            )
-        )
-    return Ensemble(tuple(images))
+        return {'measured_px': pixels, 'temperature_degc': degc}
+
+    exact: Ensemble = each_image(Ensemble(stars()), at_temperature)
+    return exact if seed is None else with_noise(exact, seed, tracker_arcsec)
+
+
+def with_temperatures(ensemble: Ensemble, degc: np.ndarray) -> Ensemble:
+    return each_image(ensemble, lambda k, _: {'temperature_degc': float(degc[k])})  # type: ignore[no-any-return]
 
 
 def options(method: str = 'hierarchical', order: int = 2, **other: object) -> CalibrationOptions:
@@ -128,15 +109,6 @@ def found(ensemble: Ensemble, chosen: CalibrationOptions) -> tuple[Estimate, Tem
     return estimate, estimate.thermal
 
 
-def error_of(estimate: Estimate) -> np.ndarray:
-    """Camera and alignment at the reference less the truth: (13,), angles in rad."""
-    one, true = (
-        Rotation.from_quat(g.star_tracker_from_camera_xyzw) for g in (estimate.geometry, TRUTH)
-    )
-    parameters = estimate.geometry.camera.parameters - TRUTH.camera.parameters
-    return np.asarray(np.r_[parameters, -(one.inv() * true).as_rotvec()])
-
-
 @pytest.mark.parametrize(
     ('temperatures_degc', 'expected'),
     [
@@ -150,42 +122,8 @@ def error_of(estimate: Estimate) -> np.ndarray:
 def test_the_reference_is_the_multiple_of_ten_nearest_the_mean(
     temperatures_degc: np.ndarray, expected: float
 ) -> None:
-    images = observed((), np.zeros(3)).images
-    ensemble = Ensemble(
-        tuple(
-            dataclasses.replace(image, temperature_degc=float(degc))
-            for image, degc in zip(images, temperatures_degc, strict=False)
-        )
-    )
-    assert reference_degc(ensemble) == expected
-
-
-@pytest.mark.parametrize('focal', [(), (3e-5,), (3e-5, -2e-7)])
-def test_derivatives_by_camera_and_focal_terms(focal: tuple[float, ...]) -> None:
-    above_k = np.array([-30.0, 0.0, 12.0])
-    x = np.r_[TRUTH.camera.parameters, focal]
-    chain = parameters_chain(x[:10], x[10:], above_k)
-    assert chain.shape == (3, 10, 10 + len(focal))
-    for k in range(len(x)):
-        # Bilinear: a central difference is exact, but for the rounding of parameters of 2000.
-        step = np.eye(len(x))[k] * 1e-3 * max(abs(x[k]), 1e-3)
-        high, low = (parameters_at((x + s)[:10], (x + s)[10:], above_k) for s in (step, -step))
-        numerical = (high - low) / (2 * step[k])
-        np.testing.assert_allclose(chain[:, :, k], numerical, rtol=1e-6, atol=1e-6)
-
-
-def test_derivatives_by_alignment_and_its_rate() -> None:
-    above_k = np.array([-30.0, 0.0, 12.0])
-    rate = np.array([2.0, -1.0, 3.0]) * 1e-5
-    chain = turns_chain(rate, above_k)
-    for k in range(6):
-        step = 1e-6
-        angles, more = np.split(np.eye(6)[k] * step, 2)
-        before = turns(rate, above_k)
-        after = turns(rate + more, above_k) * Rotation.from_rotvec(-angles)
-        turned = -(after * before.inv()).as_rotvec() / step
-        # The series ends at a twelfth of the squared turn: (1e-3)^2 / 12 of 30 degrees.
-        np.testing.assert_allclose(chain[:, :, k], turned, rtol=0, atol=2e-5)
+    few = Ensemble(stars()[: len(temperatures_degc)])
+    assert reference_degc(with_temperatures(few, temperatures_degc)) == expected
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -197,7 +135,7 @@ def test_without_noise_the_truth_comes_back(method: str, order: int) -> None:
     assert terms.reference_degc == REFERENCE_DEGC
     fx, edge = TRUTH.camera.parameters[0], 0.23 * TRUTH.camera.parameters[0]
     # 1e-6 px at the edge of the field: residuals are of 1e-9 px.
-    error = error_of(estimate)
+    error = errors_of(estimate, TRUTH)
     assert np.abs(error[:5]).max() < 1e-6 and np.abs(error[10:] * fx).max() < 1e-6
     dT = np.abs(TEMPERATURES_DEGC - REFERENCE_DEGC).max()
     for k, (got, true) in enumerate(zip(terms.focal_per_degc, FOCAL[:order], strict=True), 1):
@@ -228,10 +166,7 @@ def test_the_reported_sigmas_are_true(method: str) -> None:
         estimate, terms = found(observed(FOCAL, rate_rad, seed=seed, tracker_arcsec=tracker),
                                 options(method))  # fmt: skip
         assert len(terms.focal_per_degc) == 2, terms.note
-        scale = np.sqrt(np.diag(estimate.covariance))[rows]
-        C = estimate.covariance[np.ix_(rows, rows)] / np.outer(scale, scale)
-        error = error_of(estimate)[rows] / scale
-        camera.append(error @ np.linalg.solve(C, error))
+        camera.append(normalised_error(estimate, TRUTH, rows))
         focal.append((np.array(terms.focal_per_degc) - FOCAL) / terms.focal_per_degc_sigma)
         if method != 'per_image':
             got = np.array(terms.alignment_rate_rad_per_degc)
@@ -250,9 +185,7 @@ def test_the_reported_sigmas_are_true(method: str) -> None:
 def test_temperatures_that_nobody_asks_for_change_no_bit(method: str) -> None:
     plain = options(method, order=0, alignment_temperature=False)
     warm = observed((), np.zeros(3), seed=1)
-    unknown = Ensemble(
-        tuple(dataclasses.replace(i, temperature_degc=float('nan')) for i in warm.images)
-    )
+    unknown = with_temperatures(warm, np.full(10, np.nan))
     one, other = (estimate_calibration(e, PRIOR, plain) for e in (warm, unknown))
     assert one.thermal is None
     # Asked for, but not to be had: said, and the same numbers.
@@ -276,29 +209,9 @@ def test_temperatures_that_nobody_asks_for_change_no_bit(method: str) -> None:
 )
 def test_what_the_images_do_not_carry_is_left_out(temperatures: np.ndarray, note: str) -> None:
     ensemble = observed((), np.zeros(3), np.nan_to_num(temperatures), seed=1)
-    ensemble = Ensemble(
-        tuple(
-            dataclasses.replace(image, temperature_degc=float(degc))
-            for image, degc in zip(ensemble.images, temperatures, strict=True)
-        )
-    )
-    _, terms = found(ensemble, options())
+    _, terms = found(with_temperatures(ensemble, temperatures), options())
     assert not terms.focal_per_degc and not terms.alignment_rate_rad_per_degc
     assert note in terms.note
-
-
-def test_terms_that_are_none_stay_within_their_sigma() -> None:
-    """What is asked for is estimated: no test of significance decides."""
-    for focal, rate_rad in ((FOCAL[:1], RATE_RAD), ((), np.zeros(3))):
-        _, terms = found(observed(focal, rate_rad, seed=1), options())
-        assert terms.note == ''
-        off = (np.array(terms.focal_per_degc) - [*focal, *[0.0] * (2 - len(focal))]) / np.array(
-            terms.focal_per_degc_sigma
-        )
-        off_rate = (np.array(terms.alignment_rate_rad_per_degc) - rate_rad) / np.array(
-            terms.alignment_rate_rad_per_degc_sigma
-        )
-        assert max(np.abs(off).max(), np.abs(off_rate).max()) < 4.0
 
 
 def test_a_changing_camera_fits_only_where_it_is_asked_for() -> None:
@@ -348,21 +261,6 @@ def test_terms_that_the_images_do_not_carry_are_infinite_and_cost_nothing() -> N
     of_temperature = np.array(['temperature' in name for name in names])
     assert of_temperature.sum() == 5 and np.isinf(sigma[of_temperature]).all()
     np.testing.assert_array_equal(sigma[~of_temperature], predicted_sigma(ensemble, TRUTH, plain))
-
-
-def test_images_that_tell_of_the_temperature_are_kept() -> None:
-    temperatures = np.array([15.0, 14.0, 40.0, 16.0, 15.5, -20.0, 14.5, 15.2, 13.0, 15.7])
-    ensemble = observed(FOCAL[:1], RATE_RAD, temperatures)
-    chosen = options(order=1, max_images=4)
-    plain = dataclasses.replace(chosen, focal_temperature_order=0, alignment_temperature=False)
-    kept, without = (keep_most_informative(ensemble, TRUTH, o) for o in (chosen, plain))
-    assert {40.0, -20.0} <= {image.temperature_degc for image in kept.images}
-    assert not {40.0, -20.0} <= {image.temperature_degc for image in without.images}
-
-
-def test_per_image_has_no_rate() -> None:
-    with pytest.raises(OptionError, match='alignment_temperature: the method per_image'):
-        estimate_calibration(observed(), PRIOR, options('per_image', alignment_temperature=True))
 
 
 def test_the_camera_at_a_temperature() -> None:

@@ -22,7 +22,6 @@ from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import residuals_px
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.problem import Problem
 from starcal_ros.estimation.search import minimise, Minimum, problem_of, start_of
@@ -157,20 +156,6 @@ def unit_of(minimum: Minimum, images: int) -> np.ndarray:
     return np.asarray(np.r_[sigma, np.full(3 * images, angle)])
 
 
-def test_residuals_are_measured_minus_predicted() -> None:
-    problem, minimum = searched(ensemble(), EIGHT)
-    table, state = star_table(ensemble().images), minimum.state
-    residual_px = residuals_px(problem, state, table)
-    rotations = state.camera_from_icrf.as_matrix()
-    for k in (0, 17, 40, len(table) - 1):
-        direction_camera = rotations[table.image[k]] @ table.direction_icrf[k]
-        (expected_px,) = table.measured_px[k] - predicted_px(
-            state.parameters, direction_camera[None]
-        )
-        # Roundings of 1000 px.
-        np.testing.assert_allclose(residual_px[k], expected_px, rtol=0, atol=1e-10)
-
-
 def test_the_same_minimum() -> None:
     _, minimum = searched(ensemble(), EIGHT)
     residuals, unit = numerical(ensemble(), minimum), unit_of(minimum, 5)
@@ -207,15 +192,3 @@ def test_the_same_covariance(thermal: bool) -> None:
     # / 12 that is left out of the derivative by the attitudes, 3e-9; the series of the turn by the
     # temperature ends at a twelfth of its square, (3e-3)^2.
     assert np.abs((ours - dense) / np.outer(sigma, sigma)).max() < (1e-5 if thermal else 1e-6)
-
-
-def test_the_prior_of_the_tracker_is_in_the_cost() -> None:
-    # With a tighter tracker the alignment is another one.
-    sigmas = [
-        np.sqrt(np.diag(shared_covariance(searched(ensemble(), options)[1].normal)))[-3]
-        for options in (
-            dataclasses.replace(EIGHT, star_tracker_sigma_arcsec=(size,) * 3)
-            for size in (0.1, 3600.0)
-        )
-    ]
-    assert sigmas[0] < 1e-2 * sigmas[1]

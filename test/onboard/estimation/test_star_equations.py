@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, project, project_jacobians
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.estimation.star_equations import (
     arrange,
     normal_blocks,
@@ -54,8 +55,9 @@ def made(sizes: tuple[int, ...] = SIZES, seed: int = 1) -> tuple[StarTable, np.n
 def dense_blocks(
     table: StarTable, keep: np.ndarray, camera: CameraModel, rotations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened squared residual (n,) of the kept stars and J' W J (m, 14, 14), star by star."""
-    blocks, squared = np.zeros((table.image_count, 14, 14)), []
+    """Whitened squared residuals (n,) of the kept stars, and J' W J (m, p + 4, p + 4)."""
+    size = len(camera.parameters) + 4
+    blocks, squared = np.zeros((table.image_count, size, size)), []
     for k in np.nonzero(keep)[0]:
         R = rotations[table.image[k]]
         pixel, J_parameters, J_rotation = project_jacobians(camera, R @ table.direction_icrf[k])
@@ -68,18 +70,33 @@ def dense_blocks(
     return np.array(squared), blocks
 
 
-def test_blocks_equal_the_dense_normal_matrices() -> None:
+RATIONAL = [-0.05, 0.1, 0.2, 4e-4, -3e-4, 0.35, 0.1, 0.02]
+COEFFICIENTS = {
+    'plumb_bob': RATIONAL[:5],
+    'rational_polynomial': RATIONAL,
+    'thin_prism': [*RATIONAL, 2e-3, -1e-3, -1.5e-3, 5e-4],
+    'tilted': [*RATIONAL, 2e-3, -1e-3, -1.5e-3, 5e-4, 0.02, -0.03],
+    'equidistant': [-0.02, 0.01, -0.004, 5e-4],
+}
+
+
+@pytest.mark.parametrize('model', LENSES)
+def test_blocks_equal_the_dense_normal_matrices(model: str) -> None:
     table, rotations = made()
+    parameters = np.r_[CAMERA_MODEL.parameters[:5], COEFFICIENTS[model]]
+    camera = CameraModel(CAMERA_MODEL.width, CAMERA_MODEL.height, parameters, model)
     keep = np.random.default_rng(2).uniform(size=len(table)) < 0.8
-    squared, expected = dense_blocks(table, keep, CAMERA_MODEL, rotations)
-    cost, blocks = normal_blocks(
-        arrange(table, keep, table.covariance_px2), 'plumb_bob', CAMERA_MODEL.parameters, rotations
-    )
-    assert cost == pytest.approx(0.5 * squared.sum(), rel=1e-12)
+    squared, expected = dense_blocks(table, keep, camera, rotations)
+    measurements = arrange(table, keep, table.covariance_px2)
+    # Parameters of each image, as where temperature changes them, are the same numbers.
+    own = np.tile(parameters, (len(rotations), 1))
     unit = 1 / np.sqrt(np.einsum('mii->i', expected))
-    # Sums of 120 products in another order: a few roundings of the diagonal.
-    scaled = (blocks - expected) * np.outer(unit, unit)
-    np.testing.assert_allclose(scaled, 0.0, rtol=0, atol=3e-13)
+    for of_camera in (parameters, own):
+        cost, blocks = normal_blocks(measurements, model, of_camera, rotations)
+        assert cost == pytest.approx(0.5 * squared.sum(), rel=1e-12)
+        # Sums of 120 products in another order: a few roundings of the diagonal.
+        scaled = (blocks - expected) * np.outer(unit, unit)
+        np.testing.assert_allclose(scaled, 0.0, rtol=0, atol=1e-11)
     for k, n in enumerate(np.bincount(table.image[keep], minlength=len(SIZES))):
         assert blocks[k].any() == (n > 0)
 

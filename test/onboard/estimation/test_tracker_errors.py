@@ -203,8 +203,8 @@ def test_the_sigma_of_the_mean_covers_white_noise_and_walks(
     assert low < rms < high
 
 
-@pytest.mark.parametrize('size', [0.6, 1.0, 4.0, 20.0, 100.0, 1000.0])
-@pytest.mark.parametrize('m', [3, 5, 24])
+@pytest.mark.parametrize('size', [0.6, 1.0, 1000.0])
+@pytest.mark.parametrize('m', [3, 24])
 def test_the_images_outweigh_a_stated_sigma(size: float, m: int) -> None:
     rng = np.random.default_rng(9)
     over, sizes = [], []
@@ -219,53 +219,6 @@ def test_the_images_outweigh_a_stated_sigma(size: float, m: int) -> None:
     assert 1.0 < np.median(sizes) < 2.0
 
 
-def test_white_noise_is_found_with_its_sigma_and_walks_are_not_noise() -> None:
-    rng = np.random.default_rng(4)
-    white = [found_of(1.5 * rng.normal(size=(30, 3))) for _ in range(20)]
-    assert np.mean([f.noise for f in white]) == pytest.approx(1.5, rel=0.08)
-    assert np.mean([f.likelihood_ratio for f in white]) < 2.0
-    assert min(f.likelihood_ratio for f in white) >= 0.0
-    slow = [found_of(0.5 * rng.normal(size=(30, 3)) + walk(rng, 30, 8, 4.0)) for _ in range(20)]
-    assert 2.0 < np.median([f.slow for f in slow]) < 8.0
-    assert np.median([f.noise for f in slow]) < 1.5
-    assert min(f.likelihood_ratio for f in slow) > 10.0
-    assert all(f.correlation.endswith(' s') for f in slow)
-
-
-def test_the_variance_by_the_stars_is_no_noise_of_the_star_tracker() -> None:
-    rng = np.random.default_rng(5)
-    noises = []
-    for _ in range(30):
-        error = math.sqrt(1.0 + 3.0) * rng.normal(size=(40, 3))
-        noises.append(found_of(error, 3.0).noise)
-    assert np.mean(noises) == pytest.approx(1.0, rel=0.2)
-    assert found_of(0.01 * rng.normal(size=(40, 3)), 3.0).noise < 1.0
-    # Few stars beside a star tracker a hundred times better: it keeps its weight.
-    found = found_of(100.0 * rng.normal(size=(16, 3)), 1e4)
-    assert found.working < 12.0 and found.covariance.max() < 30.0
-
-
-def test_errors_that_depend_on_the_attitude_are_named() -> None:
-    rng = np.random.default_rng(6)
-    fields = Rotation.random(4, random_state=rng)
-    which = rng.integers(0, 4, 40)
-    error = 4.0 * rng.normal(size=(4, 3))[which] + 0.3 * rng.normal(size=(40, 3))
-    found = found_of(error, attitudes=fields[which])
-    assert found.correlation.endswith(' deg')
-    # Images of one field share their error: the mean has four, not forty.
-    assert found.working / math.sqrt(40.0) > 1.0
-
-
-def test_a_data_sheet_counts_where_images_are_few() -> None:
-    rng = np.random.default_rng(7)
-    error = rng.normal(size=(4, 3))
-    unstated, small, large = (found_of(error, stated_slow=s).slow for s in (0.0, 0.1, 10.0))
-    assert small < 0.2 < unstated < 5.0 < large
-    assert found_of(5.0 * error, is_stated=False).noise > found_of(5.0 * error).noise
-    # A slow error that lasts longer than the campaign stays in the mean at its prior's size.
-    assert found_of(error, stated_slow=10.0).working / 2.0 > 5.0
-
-
 def test_times_may_be_equal() -> None:
     error = np.random.default_rng(8).normal(size=(5, 3))
     attitudes = Rotation.random(5, random_state=np.random.default_rng(1))
@@ -275,12 +228,12 @@ def test_times_may_be_equal() -> None:
 
 
 def test_groups_of_neighbours_give_the_posterior_of_all_images() -> None:
-    # 180 images of a slow walk, by themselves and in 60 groups of three.
+    # A slow walk: 100 images by themselves, and with one more in 51 groups of two.
     rng = np.random.default_rng(4)
-    error = rng.normal(size=(180, 3)) + walk(rng, 180, 90.0, 2.0)
-    whole, found = found_of(error, most=180), found_of(error, most=60)
-    assert found.covariance.shape == (60, 60) and whole.covariance.shape == (180, 180)
-    assert np.array_equal(found.group, np.arange(180) // 3)
+    error = rng.normal(size=(101, 3)) + walk(rng, 101, 50.0, 2.0)
+    whole, found = found_of(error[:100]), found_of(error)
+    assert found.covariance.shape == (51, 51) and whole.covariance.shape == (100, 100)
+    assert np.array_equal(found.group, np.arange(101) // 2)
     assert found.noise == pytest.approx(whole.noise, rel=0.02)
     assert found.slow == pytest.approx(whole.slow, rel=0.05)
     assert found.working == pytest.approx(whole.working, rel=0.05)

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The list of unknowns: each derivative is that of an independent projection."""
+"""The list of unknowns: each derivative is that of an independent projection; a row adds one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import math
 from four_images import (  # type: ignore[import-not-found]
     ASSUMED,
     CAMERA,
-    cosine,
     Dense,
     HEIGHT,
     IMAGES,
@@ -26,21 +25,38 @@ from four_images import (  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.special import eval_jacobi
+from worlds import each_image, estimated, of_random_pointings  # type: ignore[import-not-found]
 
-from starcal_ros.arrays import Floats
+from starcal_ground.planning.plan import prospect, target
+from starcal_ground.simulation.centroids import true_observations
+from starcal_ground.simulation.scenario import Scenario
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.assessment.budget import sigma_budget, statements
+from starcal_ros.assessment.gate import GateOptions, model_gate
+from starcal_ros.assessment.model_checks import model_checks
+from starcal_ros.assessment.remedies import remedy_against
 from starcal_ros.camera import CameraModel, project, rotation_jacobian
 from starcal_ros.camera.lens import LENSES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation import unknowns
 from starcal_ros.estimation import unknowns as module
+from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_columns, tracker_turns
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import attitude_errors
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import (
     Assumptions,
+    Given,
+    Kind,
     Layout,
     moved,
+    PriorTest,
+    Unknown,
     unknowns_in_state,
     unknowns_of,
 )
+from starcal_ros.records import Ensemble, GateCheck, StarObservations
 
 # Finite differences are exact to 1e-10 of a column; attitude errors of 20 arcsec enter the
 # derivatives of the star trackers to first order, which leaves their square: 1e-8.
@@ -224,26 +240,6 @@ def test_octaves_are_of_wavelengths_down_to_a_width_its_half_and_its_quarter(
     assert {'field_9_0_u_px', 'field_0_6_v_px', 'field_1_0_v_px'} <= set(entry.labels)
 
 
-def test_an_amplitude_of_one_is_about_the_rms_of_its_octave_along_each_axis(
-    given: Small,
-) -> None:
-    entry = given.layout['field']
-    assert entry.functions is not None and entry.octave is not None
-    u, v = (size * (np.arange(60) + 0.5) / 60 - 0.5 for size in (WIDTH, HEIGHT))
-    grid = np.stack([np.repeat(u, 60), np.tile(v, 60)])
-    phi = entry.functions(grid)
-    t = len(entry) // 2
-    for axis in (slice(0, t), slice(t, 2 * t)):
-        for octave in range(3):
-            terms = entry.octave[axis] == octave
-            variance = (entry.sigma[axis][terms, None] ** 2 * phi[terms] ** 2).sum(axis=0)
-            # The mean square is one over the longer domain of the cosines, of which the longest
-            # waves have their extremes beyond the detector: 0.8 on it.
-            assert np.sqrt(variance.mean()) == pytest.approx(1.0, abs=0.22)
-    k = entry.labels.index('field_3_1_u_px')
-    assert phi[k] == pytest.approx(cosine(grid[0], 3, WIDTH) * cosine(grid[1], 1, HEIGHT))
-
-
 def test_the_field_has_the_next_radial_term_of_a_lens_free_of_lower_ones(given: Small) -> None:
     entry = given.layout['field']
     assert entry.functions is not None and entry.term is not None
@@ -350,3 +346,86 @@ def test_the_camera_follows_a_large_turn_of_the_alignment(given: Small) -> None:
     after = attitude_errors(given.problem, state, state.camera_from_icrf)
     assert after == pytest.approx(before, abs=1e-14)
     assert np.array_equal(state.parameters, given.state.parameters)
+
+
+MASS_ICRF = np.array([0.6, 0.8, 0.0])
+
+
+TRUE_ARCSEC = 2.0  # at 90 degrees five hundred times the Sun's: a few images show it
+
+
+def row(sigma_arcsec: float) -> Kind:
+    """The deflection of light by a mass: stars move away from it."""
+
+    def make(given: Given) -> Unknown:
+        def turn(_: Floats, directions: Floats, image: Indices) -> Floats:
+            mass = np.einsum('mij,j->im', given.camera_from_icrf, MASS_ICRF)[:, image]
+            turns = np.cross(directions, mass, axis=0) / (1.0 - (mass * directions).sum(axis=0))
+            return np.asarray(ARCSECOND_RAD * turns[:, None])
+
+        sigma = np.array([sigma_arcsec])
+        return Unknown('mass', ('deflection_arcsec',), sigma, np.zeros(1), turn=turn)
+
+    return Kind(
+        make,
+        cause='light by a mass',
+        assumption=lambda layout, *_: f'{layout["mass"].sigma[0]:g} arcsec assumed',
+        option=lambda *_: ('deflection_arcsec', 'known', 0.0),
+        remedy='point away from the mass',
+        tested=PriorTest(('deflection',), 'state the mass', is_added=True),
+    )
+
+
+def deflected(made: Scenario) -> Ensemble:
+    """Observations whose catalog has the stars where they were without the mass."""
+
+    def moved(_: int, image: StarObservations) -> dict[str, Floats]:
+        e = image.direction_icrf
+        cosine = (e @ MASS_ICRF)[:, None]
+        e = e - TRUE_ARCSEC * ARCSECOND_RAD * (e * cosine - MASS_ICRF) / (1.0 - cosine)
+        return {'direction_icrf': e / np.linalg.norm(e, axis=1, keepdims=True)}
+
+    return each_image(true_observations(made), moved)  # type: ignore[no-any-return]
+
+
+def solved(monkeypatch: pytest.MonkeyPatch, sigma_arcsec: float) -> Estimate:
+    monkeypatch.setitem(unknowns.UNKNOWNS, 'mass', row(sigma_arcsec))
+    made = of_random_pointings(3)
+    return estimated(made, deflected(made))  # type: ignore[no-any-return]
+
+
+def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is estimated and planned for, its cause is in the budget, and its prior is tested."""
+    found, options = solved(monkeypatch, 3.0), CalibrationOptions()
+    layout, at = found.linear.layout, found.linear.layout.of(['mass'])
+    assert layout.field_at[-1] == layout.count - 1  # the field stays the last
+    error = found.posterior.mean[at].item() - TRUE_ARCSEC
+    sigma = float(found.posterior.covariance[at, at].item()) ** 0.5
+    # By chance a normal error is beyond four sigma in one of 16,000.
+    assert abs(error) < 4.0 * sigma < 0.1 * TRUE_ARCSEC
+    parts = {part.cause: part for part in sigma_budget(found, options)}
+    part, total = parts['light by a mass'], parts['total']
+    assert part.assumption == '3 arcsec assumed'
+    assert 0.0 < part.map_arcsec < total.map_arcsec
+    assert remedy_against(part.cause) == 'point away from the mass'
+    # If the whole sigma came from it, none would be left where the option is stated.
+    (row,) = statements((total, dataclasses.replace(total, cause=part.cause)), found, options)
+    assert (row.option, row.after_arcsec) == ('deflection_arcsec', 0.0)
+    assert check_of(found).passed
+    wanted, more = target(found, 'deflection_arcsec'), deflected(of_random_pointings(3)).images[:1]
+    now, after = prospect(found, more, options).variances([0], wanted.squares)
+    assert after < now == pytest.approx(sigma**2)
+
+
+def test_the_check_of_a_prior_of_an_added_unknown_names_its_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    check = check_of(solved(monkeypatch, 0.1))
+    assert check.passed is False
+    assert check.note.startswith('the stars add 2.') and check.note.endswith('; state the mass')
+
+
+def check_of(found: Estimate) -> GateCheck:
+    checks = model_gate(model_checks(found), GateOptions())
+    (check,) = (check for check in checks if 'deflection' in check.name)
+    return check

@@ -130,20 +130,6 @@ def test_a_wrong_attitude_never_matches() -> None:
     assert refused == 100
 
 
-@pytest.mark.parametrize('jump_deg', [0.5, 8.0, 180.0])
-def test_a_jump_of_the_star_tracker(jump_deg: float) -> None:
-    one, image = shown(3)
-    right = Rotation.from_quat(one.icrf_from_star_tracker_xyzw)
-    for axis in np.eye(3):
-        attitude = (right * Rotation.from_rotvec(np.radians(jump_deg) * axis)).as_quat()
-        if jump_deg < 1.0:
-            # Within the search: the stars are right, and the jump shows in the alignment.
-            assert_right(observed(image, attitude), one)
-        else:
-            with pytest.raises(ImageRefused, match='no_match'):
-                observed(image, attitude)
-
-
 def test_hot_pixels_and_missing_and_strange_stars() -> None:
     one, _ = shown(1)
     rng = np.random.default_rng(7)
@@ -257,16 +243,15 @@ def test_a_mirrored_image_matches_nothing() -> None:
         observed(mirrored, one.icrf_from_star_tracker_xyzw)
 
 
-def test_too_few_stars_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_few_stars_are_refused() -> None:
     one, image = shown(0)
-    used = observed(image, one.icrf_from_star_tracker_xyzw)
-    monkeypatch.setattr('starcal_ros.identification.star_finder._MIN_STARS', 1000)
-    refused = observed(image, one.icrf_from_star_tracker_xyzw)
+    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    search = StarSearch(catalog(), CentroidOptions(min_snr=400.0))
+    refused, _ = observe_stars(exposure, PRIOR, search)
     assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
-    assert f'{len(used)} stars measured, 1000 needed' in refused.detail
+    assert ' stars measured, ' in refused.detail
     # What became of the others is told all the same.
-    assert refused.refused_stars == used.refused_stars
-    np.testing.assert_array_equal(refused.refused_px, used.refused_px)
+    assert refused.refused_stars['faint'] > 100 and len(refused.refused_px) > 100
 
 
 def test_refused_stars_are_told_with_their_places() -> None:

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from bench.lost_in_space import find_sky
 from bench.narrow import scenario_of
 from starcal_ground.blind.bright_sources import bright_sources
-from starcal_ground.blind.pattern_index import pattern_index
 from starcal_ground.blind.search import SkyMatch
 from starcal_ground.simulation.scenario import Scenario, scenario, Scene
 from starcal_ros.constants import ARCSECOND_RAD
@@ -223,20 +222,3 @@ def test_stars_are_found_without_attitude_in_the_region_of_the_catalog(field_deg
         assert isinstance(sky, SkyMatch) and not sky.mirrored
         off_px = sky.xy_px - true_px(one, catalog.id[sky.catalog_index])
         assert (np.hypot(*off_px.T) < 3.0).all()
-
-
-def test_random_points_are_no_stars_of_a_deep_catalog() -> None:
-    camera, rng = given(0.3).prior.camera, np.random.default_rng(5)
-    for _ in range(2):
-        points = rng.uniform([0, 0], [camera.width, camera.height], (18, 2))
-        assert find_sky(points, camera, sky_of(0.3), try_mirrored=True) is None
-
-
-@pytest.mark.parametrize('scale', [0, -8])
-def test_a_pattern_lies_within_its_disc(scale: int) -> None:
-    catalog = sky_of(0.3)
-    index = pattern_index(catalog, scale)
-    assert len(index.grid.patterns) > 100_000
-    places = catalog.direction_icrs[index.stars(np.arange(len(index.grid.patterns)))]
-    apart = np.linalg.norm(places[:, :1] - places[:, 1:], axis=2)
-    assert apart.max() <= 2 * 2 * math.sin(index.radius_rad / 2)

@@ -7,7 +7,6 @@ import dataclasses
 import functools
 from pathlib import Path
 
-import cv2
 import erfa
 import numpy as np
 import pytest
@@ -185,16 +184,6 @@ def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: Setup) -> Non
     assert passed(setup, track, -90, -80, 5, -70, -60, 6) == [late, late, taken, late, late, taken]
 
 
-def test_a_recording_that_plays_twice_counts_once(setup: Setup) -> None:
-    first, _ = observe.observe_next(image(), attitudes(), setup, observe.Track(setup.prior))
-    assert not first.refusal
-    later = dataclasses.replace(first, time_ns=first.time_ns + 1, pixel_digest='another')
-    ensemble = Ensemble().add(first).add(later)
-    again = dataclasses.replace(first, attitude_gap_s=0.125)
-    ensemble = ensemble.add(again)
-    assert ensemble.images == (first, later) and dict(ensemble.refused) == {'duplicate': 1}
-
-
 MS = 1_000_000
 LATER = 1000 * S
 SHOWN_AGAIN: dict[str, tuple[list[tuple[int, int]], dict[str, int]]] = {
@@ -355,21 +344,6 @@ def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
     assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
 
 
-def test_a_frame_that_is_shown_again_is_refused_once_its_stamp_is_new(
-    setup: Setup,
-) -> None:
-    held = attitudes(1)
-    for sample in attitude_samples(SCENARIO, 2):
-        held.add(sample.time_ns, sample)
-    first, track = observe.observe_next(image(1), held, setup, observe.Track(setup.prior))
-    stuck = Image(image(2).time_ns, image(1).pixels)
-    again, track = observe.observe_next(stuck, held, setup, track)
-    assert (first.refusal, again.refusal) == ('', 'frozen')
-    assert again.attitude_gap_s == 0.5
-    next_one, _ = observe.observe_next(image(2), held, setup, track)
-    assert next_one.refusal == ''
-
-
 def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
     setup: Setup,
 ) -> None:
@@ -402,8 +376,7 @@ def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
     u, v = np.rint(plain.measured_px[0]).astype(int)
     dark = np.full(image().pixels.shape, 32, np.uint16)
     dark[v, u] = 60
-    cv2.imwrite(str(tmp_path / 'dark.png'), dark)
-    made = load_setup(values(camera_yaml, dark_frame=str(tmp_path / 'dark.png')))
+    made = load_setup(values(camera_yaml, dark_frame=write_png(tmp_path / 'dark.png', dark)))
     found = observe.observe_next(image(), attitudes(), made)[0]
     assert found.refused_stars['hot_pixel'] == 1
     assert plain.catalog_id[0] not in found.catalog_id

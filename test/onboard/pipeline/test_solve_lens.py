@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_pointings import honesty, of_random_pointings  # type: ignore[import-not-found]
+from worlds import honesty, of_random_pointings  # type: ignore[import-not-found]
 
 from starcal_ground.bags.reader import read_observations
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
-from starcal_ros.arrays import Floats
 from starcal_ros.camera.projection import convert
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
@@ -71,10 +70,6 @@ def test_a_lens_that_cannot_be_estimated_loses_without_a_traceback(source: str) 
         estimate_calibration(Ensemble(tuple(images)), given.prior, options)
 
 
-def unmoved(pixels: Floats) -> Floats:
-    return np.zeros_like(pixels)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('model', 'coefficients', 'chosen'),
@@ -101,4 +96,4 @@ def test_the_smallest_model_that_leaves_no_field_is_chosen(
     assert prior.camera.model == found.geometry.camera.model and prior.camera.model in chosen
     # Where no model of those that converge is free of a field, the field is in the estimate.
     assert found.termination == 'converged'
-    assert honesty(given, found, unmoved)[0] < 2.0
+    assert honesty(given, found, np.zeros_like)[0] < 2.0

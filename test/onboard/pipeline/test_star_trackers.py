@@ -17,7 +17,7 @@ from starcal_ground.bags import topics
 from starcal_ground.bags.reader import log_damage
 from starcal_ground.bags.topics import Topics
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import BagError, OptionError
+from starcal_ros.errors import OptionError
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup
@@ -136,13 +136,6 @@ def test_one_that_is_not_in_the_bag_is_named_and_the_rest_used(
     assert used(records) == {'' if which == 'other' else 'other': 10}
     (warning,) = caplog.messages
     assert says in warning
-
-
-def test_a_bag_without_any_attitude_is_refused(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / 'none') as writer:
-        writer.write_image('/image', images()[0], 'camera')
-    with pytest.raises(BagError, match='no topic of type geometry_msgs/msg/QuaternionStamped'):
-        topics.choose_topics([tmp_path / 'none'], Topics(), setup_with())
 
 
 @pytest.mark.parametrize(

@@ -168,12 +168,3 @@ def test_agrees_with_the_whole_chain_of_erfa(time_s):
     away_mas = np.linalg.norm(ours - expected, axis=1) / MAS_RAD
     # The same theory; pmsafe treats the light time of the motion its own way: 0.00006 mas.
     assert away_mas.max() < 0.001
-
-
-@pytest.mark.parametrize('time_s', TIMES_S)
-def test_terrestrial_time_agrees_with_astropy(time_s):
-    day_jd, rest = tt_julian_date(time_s * NANOSECONDS_PER_SECOND + 123_456_789)
-    time = Time(time_s, 0.123456789, format='unix', scale='utc').tt
-    # astropy adds its two parts as days: 1e-16 of a day is 10 ps, a few of these.
-    away_s = ((time.jd1 - day_jd) + (time.jd2 - rest)) * 86400
-    assert abs(away_s) < 1e-9

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -135,10 +134,3 @@ def test_a_wide_star_on_a_hot_pixel_does_without_it() -> None:
     ):
         found = refuse_on_hot_pixels(star, np.array([refusal], np.uint8), hot, WIDTH, 7, 2.0)
         assert found.tolist() == [expected]
-
-
-def test_a_quiet_detector_has_none() -> None:
-    quiet = dataclasses.replace(SCENARIO, detector=dataclasses.replace(DETECTOR, hot_fraction=0.0))
-    shown = [(rendering.render(quiet, scenario.scene(quiet, k), k).pixels, k) for k in range(3)]
-    seen = tuple((pixels, Rotation.from_euler('x', k, degrees=True)) for pixels, k in shown)
-    assert len(learnt(seen).index) == 0
