@@ -32,7 +32,7 @@ with open(sys.argv[1], 'rb') as stream:
     print(sum(len(message.data) for _, _, message in make_reader(stream).iter_messages()))
 """
 
-# The start-up file of the ROS wheels restarts Python from a shell, and an installed package has its
+# The start-up file of the ROS wheels restarts Python from a shell; an installed package has its
 # bytecode: to compile this one takes a quarter of a second.
 _NOT_OF_A_SHELL = ('_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'PYTHONDONTWRITEBYTECODE')
 
