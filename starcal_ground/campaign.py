@@ -232,15 +232,20 @@ def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
     return Campaign(setup, observations, ensemble, calibration, residuals, notes)
 
 
-def _with_repeats(observations: Sequence[StarObservations]) -> tuple[StarObservations, ...]:
-    """Observations with images that repeat an earlier one refused, so that a sentence says so."""
+def _with_repeats(observations: tuple[StarObservations, ...]) -> tuple[StarObservations, ...]:
+    """
+    Observations with images that repeat an earlier one refused, so that a sentence says so.
+
+    The same object where none does: what is written already needs no second writing.
+    """
     marked, seen = [], Ensemble()
     for one in observations:
         if not one.refusal and (words := seen.repeats(one)):
             one = replace(one, refusal='duplicate', detail=words)
         seen = seen.add(one)
         marked.append(one)
-    return tuple(marked)
+    unchanged = all(one is other for one, other in zip(marked, observations, strict=True))
+    return observations if unchanged else tuple(marked)
 
 
 def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:

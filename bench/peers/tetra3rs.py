@@ -33,8 +33,8 @@ def _index(field_deg: float) -> Any:
     """Index of the sky for a field of view; made once."""
     import tetra3rs
 
-    fields = {'min_fov_deg': 0.9 * field_deg, 'max_fov_deg': 1.1 * field_deg}
-    stars = {'star_max_magnitude': 9.0, 'epoch_proper_motion_year': 2026.5}
+    fields: dict[str, Any] = {'min_fov_deg': 0.9 * field_deg, 'max_fov_deg': 1.1 * field_deg}
+    stars: dict[str, Any] = {'star_max_magnitude': 9.0, 'epoch_proper_motion_year': 2026.5}
     return tetra3rs.SolverDatabase.generate_from_gaia(**fields, **stars)
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
-import hashlib
 import math
 import time
 
@@ -38,6 +37,7 @@ from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.sky.catalog import cone, StarCatalog
+from starcal_ros.stars.frame_checks import fingerprint, sample_rows
 
 ADVICE = 'take 20 frames over the whole sky, stars to the corners, 1 to 10 s each'
 FEWEST_IMAGES = 3
@@ -56,6 +56,7 @@ _BRIEF_S = 4.0  # enough for seven of eight simulated cameras of 6 to 117 degree
 _CENTROID_PX = 0.3  # 1-sigma of the centroid of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
+_DETAIL_STEP_PX = 16  # 5,000 pixels of a megapixel give the range of its detail to 2 %
 # The brightest unsaturated stars are compared with the catalog in brightness.
 _MOST_OF_PEAK, _SAME_STAR_PX, _MOST_BRIGHT = 0.9, 2.0, 40
 # Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
@@ -192,7 +193,7 @@ def _sources(
     """Sources of the images that differ, their size, and words on each copy by its stamp."""
     seen: list[_Sources] = []
     size = (0, 0)
-    first_ns: dict[bytes, int] = {}
+    first_ns: dict[str, int] = {}
     exposures: list[copies.Exposure] = []
     found: dict[int, str] = {}
     for image in images:
@@ -204,7 +205,7 @@ def _sources(
                 f'images of {size[0]} x {size[1]} and of {width} x {height}: give those of one'
                 ' camera and mode'
             )
-        digest = hashlib.blake2b(image.pixels.tobytes()).digest()
+        digest = fingerprint(image, sample_rows(image.pixels)).digest
         if digest in first_ns:
             found[image.time_ns] = copies.equal_to(first_ns[digest])
             continue
@@ -222,10 +223,11 @@ def _sources(
 def count_of_stars(pixels: Pixels, sources: BrightSources) -> int:
     """Number of sources of an image that may be stars; 0 of anything but the night sky."""
     height, width = pixels.shape
-    places = np.stack(np.meshgrid(np.arange(0, width, 8), np.arange(0, height, 8)), axis=-1)
+    step = _DETAIL_STEP_PX
+    places = np.stack(np.meshgrid(np.arange(0, width, step), np.arange(0, height, step)), axis=-1)
     level_dn = sources.background.level_at(places.reshape(-1, 2))
     # The sky of a star camera by day is bright and uneven, but smooth.
-    low, high = np.percentile(pixels[::8, ::8].ravel() - level_dn, [10, 90])
+    low, high = np.percentile(pixels[::step, ::step].ravel() - level_dn, [10, 90])
     brightest = np.rint(sources.xy_px[:_BRIGHTEST]).astype(np.int64)
     peaks_dn = sources.peak_dn[:_BRIGHTEST] - sources.background.level_at(brightest)
     # In a picture of anything by day or by lamps, peaks are hardly above the rest of its detail.

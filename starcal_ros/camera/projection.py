@@ -155,6 +155,11 @@ class CameraModel(Record):
         """Found by `field_radius_rad`, by the margin in px: each image asks for the same one."""
         return {}
 
+    @functools.cached_property
+    def _ros_fit(self) -> tuple[CameraModel, float]:
+        """Result of `ros_fit`, for which the budget and ``camera_info`` of a calibration ask."""
+        return nearest_camera(self, self.model, ('skew',))
+
     @property
     def opencv_coefficients(self) -> Floats:
         """Distortion (c,) in OpenCV's order: for cv2, or cv2.fisheye if ``equidistant``."""
@@ -451,7 +456,7 @@ def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is a
     rotation, which only the alignment could take up, so some error stays.
     """
-    return nearest_camera(camera, camera.model, ('skew',))
+    return camera._ros_fit
 
 
 def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from starcal_ros.arrays import AnyArray, Floats, Indices, Pixels
@@ -55,6 +54,8 @@ class DetectorFrames:
             raise ImageRefused(
                 'bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}'
             )
+        import cv2  # 15 MB, which a calibrator does without
+
         # Clipping noise below the dark level at zero would bias the background.
         below = np.minimum(dark, dark.dtype.type(self.pedestal_dn))
         raised = cv2.add(pixels, dark.dtype.type(self.pedestal_dn) - below)

@@ -13,7 +13,6 @@ import functools
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -264,6 +263,8 @@ def _background(
 
 def smooth_mesh(mesh: Singles) -> Singles:
     """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
+    import cv2  # 15 MB, which a calibrator does without
+
     mesh = np.ascontiguousarray(mesh, np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
 
@@ -286,6 +287,8 @@ def detect(
     Local maxima of the background-free image under a Gaussian matched filter; single lit pixels
     (hot pixels, cosmic rays) are left out by their sharpness.  Positions are good to about 0.2 px.
     """
+    import cv2  # 15 MB, which a calibrator does without
+
     height, width = pixels.shape
     # One array of the size of the image: the pages of each further one take as long as the filter.
     image: Any = cv2.resize(background.level_mesh, (width, height))
@@ -354,6 +357,8 @@ def brightest_near(
     The signal-to-noise ratio is 0 where that pixel is not star-like.  Windows must lie 4 px inside
     the image.
     """
+    import cv2  # 15 MB, which a calibrator does without
+
     centre = np.rint(predicted_px).astype(np.int64)
     half = reach_px + _RIM_PX
     windows = windows_about(pixels, centre, half).astype(np.float32)

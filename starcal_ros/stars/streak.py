@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import functools
 import math
 
-import cv2
 import numpy as np
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
@@ -144,6 +143,8 @@ def _extents(
 
     Also the share (n,) of its window that each fills.
     """
+    import cv2  # 15 MB, which a calibrator does without
+
     centre = np.rint(xy_px).astype(np.int64)
     stamps, outside = detection.stamps_at_edges(pixels, centre, half_px)
     stamps -= background.level_at(centre)[:, None, None]
