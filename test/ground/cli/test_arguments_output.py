@@ -73,13 +73,6 @@ _OWN = '--params HERE/bag/params.yaml -o'
 _IMPORT = 'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
 PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
     'folder of the bag': (_nothing, f'calibrate HERE/bag {_OWN} HERE/bag'),
-    'folder of the bag, by another name': (
-        _nothing, f'calibrate HERE/bag {_OWN} HERE/out/../bag/.',
-    ),
-    'folder of the bag, by a link': (
-        lambda here: (here / 'link').symlink_to(here / 'bag'),
-        f'calibrate HERE/bag {_OWN} HERE/link',
-    ),
     'folder of the file': (_nothing, f'calibrate HERE/bag/tiny_0.mcap {_OWN} HERE/bag'),
     'observations of the folder': (
         _nothing, f'calibrate HERE/out/observations.mcap {_OWN} HERE/out',

@@ -173,7 +173,6 @@ def test_lookup_writes_the_columns_of_the_interface_document(
     ('file', 'options', 'words'),
     [
         ('a.csv', ('--points', '1'), ['--points', '1 is not within 2 to 2000']),
-        ('a.fits', (), ['a.fits', '.csv', '.npz']),
         ('a', (), ['.csv', '.npz']),
         ('none/a.csv', (), ['none', 'cannot be written']),
     ],

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from bench.frames import load_set_up
-from starcal_ground.planning import plan
 from starcal_ground.planning.plan import (
     Cone,
     expected_noise_px2,
@@ -61,12 +60,6 @@ def _taken(ensemble: Ensemble, planned: Plan) -> Ensemble:
         )
     )
     return dataclasses.replace(ensemble, images=(*ensemble.images, *more.images))
-
-
-@pytest.fixture(autouse=True)
-def few_candidates(planned: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quarter of what `planned` had, for claims that are not of their number."""
-    monkeypatch.setattr(plan, '_CANDIDATES', 40)
 
 
 def test_a_pointing_is_the_attitude_of_the_simulation() -> None:

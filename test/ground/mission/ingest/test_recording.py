@@ -23,13 +23,13 @@ from mission_files import (  # type: ignore[import-not-found]
 )
 import numpy as np
 import pytest
+from starcal_tool import Answer, assert_refused, Starcal  # type: ignore[import-not-found]
 import yaml
 
 import starcal_ground
 from starcal_ground.bags import reader
 from starcal_ground.bags.frames import read_telemetry
 from starcal_ground.bags.reader import Topics
-from starcal_ground.cli.main import main
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Image
 
@@ -55,21 +55,27 @@ def digests_of_originals(made: starcal_ground.Calibration) -> dict[str, str]:
     return {name.removeprefix(start): value for name, value in known if name.startswith(start)}
 
 
-def run(aem: Path, *images_of: Path, bag: Path | None = None, more: Sequence[object] = ()) -> int:
-    """Exit status of an import of images with attitudes, by default into `bag` beside these."""
-    places = ['--attitude', aem, '-o', bag or aem.parent / 'bag']
-    return main(['import', '--images', *map(str, (*images_of, *places, *more))])
+@pytest.fixture
+def run(starcal: Starcal) -> Starcal:
+    """Import images with attitudes, by default into `bag` beside these."""
+
+    def imported(
+        aem: Path, *images_of: Path, bag: Path | None = None, more: Sequence[object] = ()
+    ) -> Answer:
+        places = ['--attitude', aem, '-o', bag or aem.parent / 'bag']
+        return starcal('import', '--images', *images_of, *places, *more)
+
+    return imported
 
 
 @pytest.mark.slow
 def test_the_imported_bag_gives_the_calibration_of_the_original(
-    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    night: Path, tmp_path: Path, run: Starcal
 ) -> None:
     aem, bag = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag'
     velocities = ['--velocity', write_velocities(tmp_path / 'velocity.csv')]
     prior = ['--camera', TINY / 'camera.yaml', '--alignment', *ALIGNMENT]
-    assert run(aem, night / '*.fits', more=[*velocities, *prior]) == 0
-    out = capsys.readouterr().out
+    out = run(aem, night / '*.fits', more=[*velocities, *prior]).out
     assert '10 images' in out and 'params.yaml -o DIR' in out
     found = list(reader.read_images([bag], '/camera/image_raw'))
     for a, b in zip(found, images(), strict=True):
@@ -89,11 +95,11 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
     assert record['scale'] == {'offset': 0.0, 'step': 1.0, 'dtype': images()[0].pixels.dtype.name}
 
 
-def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, capsys) -> None:
+def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, run: Starcal) -> None:
     kernels = write_ck(tmp_path)
     bag = tmp_path / 'bag.mcap'
     attitude = ['--attitude', *kernels, '--star-tracker', FRAME_ID]
-    assert run(kernels[0], night / '*.fits', bag=bag, more=attitude) == 0
+    assert run(kernels[0], night / '*.fits', bag=bag, more=attitude).status == 0
     topics = Topics('/camera/image_raw', '/star_tracker/attitude')
     held = read_telemetry([bag], topics).attitudes
     for image in images()[1:-1]:
@@ -102,7 +108,7 @@ def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, capsys)
 
 
 @pytest.mark.slow
-def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -> None:
+def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, run: Starcal) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     start = aem.read_text().index('META_START')
     second = aem.read_text()[start:].replace('STARTRACKER_1', 'ST-2')
@@ -110,9 +116,9 @@ def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -
     bag = tmp_path / 'bag'
     more = ['--camera', TINY / 'camera.yaml', '--star-tracker', 'STARTRACKER_1']
     more += ['--more-star-trackers', 'ST-2', '--alignment', *ALIGNMENT]
-    assert run(aem, night / '*.fits', more=more) == 2
-    assert '--alignment: 4 numbers, 8 are needed' in capsys.readouterr().err
-    assert run(aem, night / '*.fits', more=[*more, *ALIGNMENT]) == 0
+    few = run(aem, night / '*.fits', more=more)
+    assert_refused(few, '--alignment: 4 numbers, 8 are needed')
+    assert run(aem, night / '*.fits', more=[*more, *ALIGNMENT]).status == 0
     first, other = (
         [raw.data for raw in reader.read_raw([bag], [topic])]
         for topic in ('/star_tracker/attitude', '/ST_2/attitude')
@@ -125,7 +131,7 @@ def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, capsys) -
     assert values['more_alignments'] == list(ALIGNMENT)
 
 
-def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, capsys) -> None:
+def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, run: Starcal) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     lines = aem.read_text().splitlines()
     start = lines.index('DATA_START') + 1
@@ -133,22 +139,22 @@ def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, capsys)
     # The middle third is missing: a gap, and what is after the end.
     kept = lines[: start + count // 3] + lines[start + 2 * count // 3 : -4] + ['DATA_STOP']
     aem.write_text('\n'.join(kept) + '\n')
-    assert run(aem, night / '*.fits') == 0
-    out = capsys.readouterr().out
+    out = run(aem, night / '*.fits').out
     assert 'images are in gaps of up to' in out and 'have no attitude about them' in out
 
 
-def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsys) -> None:
+def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, run: Starcal) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     aem.write_text(aem.read_text().replace('2026-05-15T07:', '2027-05-15T07:'))
-    assert run(aem, night / '*.fits') == 2
-    error = capsys.readouterr().err
     spans = [
         f'{utc_text(times[0])} to {utc_text(times[-1])}'
         for times in ([image.time_ns for image in images()], [time for time, _ in attitudes()])
     ]
-    assert f'the images are from {spans[0]}, the attitudes of another time, from 2027' in error
-    assert spans[1].replace('2026', '2027') in error and error.count('\n') == 1
+    assert_refused(
+        run(aem, night / '*.fits'),
+        f'the images are from {spans[0]}, the attitudes of another time, from 2027',
+        spans[1].replace('2026', '2027'),
+    )
 
 
 @pytest.mark.parametrize(
@@ -166,27 +172,27 @@ def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsy
         ),
     ],
 )
-def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, found: str) -> None:
+def test_bad_input_is_one_line(
+    night: Path, tmp_path: Path, run: Starcal, line: str, found: str
+) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     given = line.format(night=night, aem=aem, camera=TINY / 'camera.yaml').split()
-    assert run(aem, Path(given[0]), more=given[1:]) == 2
-    error = capsys.readouterr().err
-    assert found in error and error.count('\n') == 1
+    assert_refused(run(aem, Path(given[0]), more=given[1:]), found)
 
 
 def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
-    night: Path, tmp_path: Path, capsys
+    night: Path, tmp_path: Path, run: Starcal
 ) -> None:
     (tmp_path / 'bag').mkdir()
     camera = shutil.copy(TINY / 'camera.yaml', tmp_path / 'bag/camera.yaml')
     for images_of in ('[0-3].fits', '*.fits'):
         aem = write_aem(tmp_path / 'a.aem')
-        status = run(aem, night / images_of, more=['--camera', camera])
-        assert status == 0, capsys.readouterr().err
+        answer = run(aem, night / images_of, more=['--camera', camera])
+        assert answer.status == 0, answer
     assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
 
 
-def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> None:
+def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, run: Starcal) -> None:
     (tmp_path / 'cut.fits').write_bytes(b'nothing')
     with (tmp_path / 'huge.fits').open('wb') as file:
         file.write(fits.PrimaryHDU(np.zeros((2, 2))).header.tostring().encode())
@@ -195,22 +201,21 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> N
             file.write(f'NAXIS{axis}  = {11000:20}'.ljust(80).encode())
         file.truncate(2880 * (2 + 11000 * 11000 * 8 // 2880))
     aem = write_aem(tmp_path / 'a.aem')
-    assert run(aem, night / '0.fits', tmp_path / '*.fits') == 2
-    assert not (tmp_path / 'bag').exists()
-    first, second = capsys.readouterr().err.splitlines()
+    answer = run(aem, night / '0.fits', tmp_path / '*.fits')
+    assert answer.status == 2 and not (tmp_path / 'bag').exists()
+    first, second = answer.err.splitlines()
     assert 'cut.fits: not an image in FITS, TIFF or PNG' in first
     assert 'huge.fits: needs more than 1 GB of memory to be read' in second
 
 
-def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, capsys) -> None:
+def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, run: Starcal) -> None:
     for number, image in enumerate(images()[:3]):
         upside_down = Image(image.time_ns, image.pixels[::-1].copy())
         header = {'DATE-AVG': date(image.time_ns), 'ROWORDER': 'BOTTOM-UP'}
         write_fits(tmp_path / f'{number}.fits', upside_down, **header)
     aem = write_aem(tmp_path / 'a.aem')
-    assert run(aem, tmp_path / '*.fits') == 0
     note = 'pixels of the images: rows last to first (ROWORDER)'
-    assert note in capsys.readouterr().out
+    assert note in run(aem, tmp_path / '*.fits').out
     assert note in json.loads((tmp_path / 'bag/import.json').read_text())['notes']
     read = list(reader.read_images([tmp_path / 'bag'], '/camera/image_raw'))
     for one, image in zip(read, images(), strict=False):
@@ -219,7 +224,7 @@ def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, capsys) -> N
 
 @pytest.mark.slow
 def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_them(
-    night: Path, tmp_path: Path
+    night: Path, tmp_path: Path, run: Starcal
 ) -> None:
     """Of two bags with files of one name, and of the observations of their calibration."""
     aem, prior = write_aem(tmp_path / 'a.aem'), ['--camera', str(TINY / 'camera.yaml')]
@@ -230,7 +235,7 @@ def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_th
             shutil.copy(path, folder / f'{k}.fits')
         files = (folder / '*.fits',)
         flipped = [*prior, '--alignment', *ALIGNMENT, '--flip', 'top-bottom']
-        assert run(aem, *files, bag=tmp_path / name, more=flipped) == 0
+        assert run(aem, *files, bag=tmp_path / name, more=flipped).status == 0
     pixels_of, originals = reader.origin_of([tmp_path / 'one', tmp_path / 'two'])
     assert pixels_of == 'mirrored top to bottom (--flip)'
     names = [str(tmp_path / 'night' / f'{k}.fits') for k in range(5)]
@@ -240,24 +245,25 @@ def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_th
 
 
 @pytest.mark.slow
-def test_observations_carry_the_originals_of_their_bag(night: Path, tmp_path: Path) -> None:
+def test_observations_carry_the_originals_of_their_bag(
+    night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
+) -> None:
     aem, bag, out = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'out'
-    assert run(aem, night / '*.fits') == 0
+    assert run(aem, night / '*.fits').status == 0
     params = ['--params', str(TINY / 'params.yaml'), '--no-report', '--quiet']
     for given, made in ((bag, out), (out / 'observations.mcap', tmp_path / 'again')):
-        assert main(['calibrate', str(given), '-o', str(made), *params]) == 0
+        assert starcal('calibrate', given, '-o', made, *params).status == 0
         originals = digests_of_originals(starcal_ground.read_calibration(made))
         assert {*originals} == {str(aem), *map(str, night.iterdir())}
     # The block for signatures of the report has them.
-    assert main(['report', str(tmp_path / 'again')]) == 0
+    assert starcal('report', tmp_path / 'again').status == 0
     page = (tmp_path / 'again' / 'report.html').read_text()
     assert all(digest in page for digest in originals.values())
 
 
-def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:
+def test_a_coarse_scale_is_named(tmp_path: Path, run: Starcal) -> None:
     for number, image in enumerate(images()[:3]):
         write_fits(tmp_path / f'{number}.fits', image, 'float32')
     aem = write_aem(tmp_path / 'a.aem')
-    assert run(aem, tmp_path / '*.fits', more=['--value-range', 0, 2e6]) == 0
-    out = capsys.readouterr().out
+    out = run(aem, tmp_path / '*.fits', more=['--value-range', 0, 2e6]).out
     assert 'a step of 16 bit is' in out and 'pixel values are 0 + 30.7692308 DN' in out
