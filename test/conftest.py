@@ -356,6 +356,7 @@ class Client:
         self._executor.add_node(self.node)
         self._diagnostics: list[Any] | None = None
         self._statuses: list[Any] | None = None
+        self._services: dict[str, Any] = {}
 
     def until(self, condition: Callable[[], object], timeout_s: float = START_S) -> None:
         """Spin until a condition holds; fail after the timeout."""
@@ -375,14 +376,13 @@ class Client:
         """
         Call a service; without an answer after some time, call it once more.
 
-        A node may receive a request before discovery of the client; then its answer is lost.
+        A node may receive a request before discovery of the client; then its answer is lost.  The
+        client stays: once it has had an answer, that of a later call is not lost.
         """
-        client = self.node.create_client(kind, name)
-        try:
-            self.until(client.service_is_ready, timeout_s)
-            return self.ask(client, kind.Request(**fields), timeout_s, again_s)
-        finally:
-            self.node.destroy_client(client)
+        if name not in self._services:
+            self._services[name] = self.node.create_client(kind, name)
+        self.until(self._services[name].service_is_ready, timeout_s)
+        return self.ask(self._services[name], kind.Request(**fields), timeout_s, again_s)
 
     def ask(
         self, service: Any, request: Any, timeout_s: float = START_S, again_s: float = 40.0

@@ -264,8 +264,8 @@ ACTIVATIONS = {
         'a',
     ),
     'forced dry run': ('activate a; solve b 2 dry_run force', 'would be activated: ', 'a'),
-    'a forced one that misses a new requirement': (
-        'activate a 2 force; require map=1e-6px; open A; rollback',
+    'a forced one that misses another requirement': (
+        'require f=1e-6px; open A; activate a 0 force; require map=1e-6px; open A; rollback',
         'no calibration is active',
         '',
     ),
