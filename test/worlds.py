@@ -136,7 +136,11 @@ def solved(world: World, seed: int, **options: object) -> Estimate:
 
 @functools.cache
 def _folder_of_these_sources() -> Path:
-    """Return the folder of estimates by the sources as they are; those by others are removed."""
+    """
+    Return the folder of estimates by the sources as they are.
+
+    One other folder stays, which a run that began with other sources may still use.
+    """
     digest = hashlib.sha256(f'{sys.version} {np.__version__} {scipy.__version__}'.encode())
     for folder in ('starcal_ros', 'starcal_ground/simulation', 'studies'):
         for path in sorted((ROOT / folder).rglob('*.py')):
@@ -144,9 +148,9 @@ def _folder_of_these_sources() -> Path:
     kept = ESTIMATES / digest.hexdigest()[:16]
     ESTIMATES.mkdir(parents=True, exist_ok=True)
     with _locked(ESTIMATES / 'lock'):
-        for other in ESTIMATES.iterdir():
-            if other.is_dir() and other != kept:
-                shutil.rmtree(other)
+        others = [one for one in ESTIMATES.iterdir() if one.is_dir() and one != kept]
+        for old in sorted(others, key=lambda one: one.stat().st_mtime)[:-1]:
+            shutil.rmtree(old)
         kept.mkdir(exist_ok=True)
     return kept
 

@@ -22,14 +22,7 @@ from starcal_ros.camera import (
     project_jacobians,
     project_parameters,
 )
-from starcal_ros.camera.lens import (
-    coefficient_jacobian,
-    distort,
-    distort_jacobian,
-    fold_radius2,
-    ideal_points,
-    LENSES,
-)
+from starcal_ros.camera.lens import fold_radius2, LENSES
 from starcal_ros.camera.projection import convert, ros_fit
 
 #           k1   k2    k3    p1     p2     k4    k5   k6
@@ -126,25 +119,6 @@ def test_derivatives_by_a_passive_rotation(camera: CameraModel) -> None:
         central = (project(camera, ahead) - project(camera, behind)) / (2 * h)
         # The third derivative is a few times the first: h^2 of it is left out.
         np.testing.assert_allclose(J[..., axis], central, rtol=0, atol=10 * h**2 * size)
-
-
-@each_camera
-def test_derivative_of_the_distortion(camera: CameraModel) -> None:
-    xy = ideal_points(camera.model, line_of_sight(camera, pixel_grid(camera, 9, 7)))
-    J = distort_jacobian(camera.model, xy, camera.distortion)
-    for axis in range(2):
-        step = xy.astype(complex)
-        step[:, axis] += 1e-30j
-        exact = distort(camera.model, step, camera.distortion).imag / 1e-30
-        np.testing.assert_allclose(J[..., axis], exact, rtol=0, atol=1e-12)
-    of_coefficients = coefficient_jacobian(camera.model, xy, camera.distortion)
-    assert of_coefficients.shape == (2, len(camera.distortion), len(xy))
-    for k in range(len(camera.distortion)):
-        coefficients = camera.distortion.astype(complex)
-        coefficients[k] += 1e-30j
-        exact = distort(camera.model, xy, coefficients).imag.T / 1e-30
-        size = np.abs(exact).max()
-        np.testing.assert_allclose(of_coefficients[:, k], exact, rtol=0, atol=1e-12 * size)
 
 
 def fold_angle(camera: CameraModel) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from worlds import each_image  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
@@ -26,7 +27,7 @@ from starcal_ros.estimation.options import CalibrationOptions, estimated_paramet
 from starcal_ros.estimation.problem import Problem
 from starcal_ros.estimation.search import minimise, Minimum, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
-from starcal_ros.records import Ensemble
+from starcal_ros.records import Ensemble, StarObservations
 from studies.trials import shared_covariance
 
 Residuals = Callable[[np.ndarray], np.ndarray]
@@ -57,23 +58,23 @@ def ensemble() -> Ensemble:
 @functools.cache
 def warm() -> Ensemble:
     """The same with temperatures, whose camera and alignment change with them."""
-    images = []
     A = Rotation.from_quat(SCENARIO.truth.star_tracker_from_camera_xyzw).inv()
     centre_px = SCENARIO.truth.camera.parameters[3:5]
-    for image, dT in zip(ensemble().images, (-30.0, 10.0, -12.0, 25.0, 3.0), strict=True):
+    above_k = (-30.0, 10.0, -12.0, 25.0, 3.0)
+
+    def warmed(k: int, image: StarObservations) -> dict[str, object]:
+        dT = above_k[k]
         turn = Rotation.from_rotvec(-np.array([1e-5, -2e-5, 1e-4]) * dT)
         reported = Rotation.from_quat(image.icrf_from_star_tracker_xyzw) * (A.inv() * turn * A)
         factor = 1.0 + 5e-5 * dT + 2e-6 * dT**2
-        images.append(
-            dataclasses.replace(
-                image,
-                # fx, skew and fy together scale the image about the principal point.
-                measured_px=centre_px + factor * (image.measured_px - centre_px),
-                icrf_from_star_tracker_xyzw=reported.as_quat(),
-                temperature_degc=20.0 + dT,
-            )
-        )
-    return Ensemble(tuple(images))
+        return {
+            # fx, skew and fy together scale the image about the principal point.
+            'measured_px': centre_px + factor * (image.measured_px - centre_px),
+            'icrf_from_star_tracker_xyzw': reported.as_quat(),
+            'temperature_degc': 20.0 + dT,
+        }
+
+    return each_image(ensemble(), warmed)  # type: ignore[no-any-return]
 
 
 def searched(given: Ensemble, options: CalibrationOptions) -> tuple[Problem, Minimum]:

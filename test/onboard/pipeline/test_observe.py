@@ -10,6 +10,7 @@ from pathlib import Path
 import erfa
 import numpy as np
 import pytest
+from sample_sky import errors_sigma  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 from tiny_campaign import attitudes, image, SCENARIO, TRUTH, values, write_png  # type: ignore[import-not-found]
 
@@ -323,10 +324,7 @@ def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) ->
     # The noise of the image alone is left, and nothing is cut off at zero below the dark level.
     assert found.noise_dn == pytest.approx(1.2, rel=0.1)
     assert found.background_dn == pytest.approx(np.median(dark), abs=0.3)
-    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
-    off_px = found.measured_px - np.array([place[number] for number in found.catalog_id])
-    sigma_px = np.sqrt(found.covariance_px2[:, [0, 2]])
-    assert np.sqrt(np.mean((off_px / sigma_px) ** 2)) < 1.3
+    assert np.sqrt(np.mean(errors_sigma(one, found) ** 2)) < 1.3
 
 
 def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:

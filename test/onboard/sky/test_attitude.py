@@ -220,16 +220,6 @@ def test_any_rate_late_doubled_and_out_of_order(rate_hz: float) -> None:
         assert angle_between(held.at(int(time_ns), 2.0)[0], turned(time_ns)) < 1e-14
 
 
-def test_a_dropout_of_minutes_costs_its_own_images_alone() -> None:
-    before, after = steady(10.0, 20.0), steady(10.0, 20.0, START_NS + 300 * S)
-    held = history([*before, *after], keep_s=3600.0, jump_s=10.0)
-    assert refusal(held, START_NS + 100 * S) == 'attitude_gap'
-    assert refusal(held, START_NS - S) == 'no_attitude'
-    for dt_s in (19, 301):
-        assert held.at(START_NS + dt_s * S + 1, 2.0)[1] == pytest.approx(0.1)
-    assert held.latest_ns == START_NS + 320 * S
-
-
 @pytest.mark.parametrize('wrong_s', [-(10**9), -4000, -60, 60, 4000, 10**9, 9 * 10**8])
 def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
     """A sample stamped in the future does not make the others too old to keep."""
