@@ -28,7 +28,7 @@ from scipy.special import stdtr
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.estimation.amplitudes import interval_factor
+from starcal_ros.estimation.amplitudes import interval_factor, LOG_SIGMA
 from starcal_ros.estimation.limits import FEWEST, MOST_CORRELATED
 from starcal_ros.estimation.problem import canonical_xyzw, Problem, State
 from starcal_ros.records import StarObservations, StarTrackerAlignment
@@ -39,7 +39,6 @@ _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
 _LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma; more where errors are larger
 _BEYOND = 1.0  # the grid ends a factor of e above the RMS of the errors at least
 _NOISE_SIGMA = 0.5  # prior 1-sigma of ln n: data sheets are right to a factor of 1.6
-_UNSTATED_SIGMA = 3.0  # the same where no sigma is stated: within a factor of 20
 _WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
 _STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
@@ -130,7 +129,8 @@ def tracker_errors(
 
     Notes
     -----
-    The stated sigma is a prior of the noise: log-normal, with the tails of wrong data sheets.
+    The stated sigma is a prior of the noise: log-normal, with the tails of wrong data sheets.  A
+    guess has the prior of any amplitude about it.
     """
     (m, count), group = error.shape, correlations.group
     size = np.bincount(group)
@@ -192,10 +192,10 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     log_rms = 0.5 * math.log(max(float((error**2).mean()), 1e-300))
     more = max(math.ceil((log_rms + _BEYOND - _LOG_NOISE[-1]) / step), 0)
     log_noise: Floats = np.append(_LOG_NOISE, _LOG_NOISE[-1] + step * np.arange(1, more + 1))
-    unstated = -0.5 * (log_noise / _UNSTATED_SIGMA) ** 2
+    unstated = -0.5 * (log_noise / LOG_SIGMA) ** 2
     if not is_stated:
         return log_noise, log_noise, unstated
-    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * _NOISE_SIGMA / _UNSTATED_SIGMA)
+    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * _NOISE_SIGMA / LOG_SIGMA)
     right, wrong = -0.5 * (log_noise / _NOISE_SIGMA) ** 2, odds + unstated
     return log_noise, np.where(wrong > right, log_noise, 0.0), np.logaddexp(right, wrong)
 

@@ -64,7 +64,6 @@ EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
 _NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
 _BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
-_STARS_PER_NODE = 40  # 80 residuals determine a variance to 16 %
 _NODE_SIGMA = 0.5  # prior 1-sigma of a log factor: cores and wings of bright stars
 _LEAST_FREEDOM = 0.1  # floor of the freedom of two axes: one star of few keeps none
 
@@ -180,10 +179,7 @@ def _brightness(
     which each counts as ``counted`` (n,) stars, with a normal prior of the logarithms: few stars,
     or none that differ, give factors near 1.
     """
-    count = min(_NODES, len(ratio) // _STARS_PER_NODE)
-    if count < 2:
-        return (), ()
-    nodes = np.unique(np.quantile(magnitude, np.linspace(0.0, 1.0, count)))
+    nodes = np.unique(np.quantile(magnitude, np.linspace(0.0, 1.0, _NODES)))
     if len(nodes) < 2:
         return (), ()
     place = np.rint((magnitude - nodes[0]) / np.ptp(nodes) * _BINS).astype(np.int64)

@@ -115,7 +115,7 @@ def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -
     logs, slows, noises, covariances, of_mean = [], [], [], [], []
     log_likelihoods, plain = [], []
     # One of fifty data sheets states no more than none.
-    right, wrong = (norm(0.0, size).logpdf for size in (0.5, 3.0))
+    right, wrong = (norm(0.0, size).logpdf for size in (0.5, 4.0))
     sheets = []
     rms = math.sqrt((error**2).mean())
     for b in -2.1 + 0.35 * np.arange(15 + max(math.ceil((math.log(rms) - 1.8) / 0.35), 0)):
