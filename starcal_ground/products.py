@@ -269,6 +269,19 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
             )
 
 
+def check_maker(bag: Path, record: Path) -> None:
+    """
+    Check that a bag is new, or was made by the command that keeps such a record beside it.
+
+    Raises ProductError naming the bag: replaced, it would not be that of the files beside it.
+    """
+    if os.path.lexists(bag) and not os.path.lexists(record):
+        raise ProductError(
+            f'{bag}: was made by another command, without {record.name}: give another name or'
+            ' remove its folder'
+        )
+
+
 def _is_own(path: Path) -> bool:
     with contextlib.suppress(OSError, ValueError), untrusted.regular_file(path, False) as file:
         return is_marked(file)

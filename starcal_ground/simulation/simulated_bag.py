@@ -213,6 +213,7 @@ def write_bag(
     truth, params, camera, table = (writer.file.with_name(name) for name in beside)
     tables = [] if scenario.table is None else [table]
     products.check_outputs((*writer.outputs(), truth, params, camera, *tables))
+    products.check_maker(writer.file, truth)
     length_px = mistakes.smear_px if mistakes.smear_px > 1 else 0
     turn_rad = length_px / float(scenario.truth.camera.parameters[0])
     scenario = dataclasses.replace(

@@ -96,7 +96,7 @@ def _options_of(path: Path, options: image_series.ImageOptions) -> image_series.
 
 def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -> None:
     """
-    `check_outputs` of a bag and the files beside it; a prior camera that lies there stays.
+    `check_outputs` of a bag and the files beside it, which an import made; a prior camera stays.
 
     Raises ProductError naming the file.
     """
@@ -104,7 +104,9 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     prior = [params] if camera else []
     if camera and not products.same_as_one_of(copied, [camera]):
         prior.append(copied)
-    products.check_outputs((*BagWriter(bag).outputs(), record, *prior), inputs)
+    writer = BagWriter(bag)
+    products.check_outputs((*writer.outputs(), record, *prior), inputs)
+    products.check_maker(writer.file, record)
 
 
 def _files_beside(bag: Path) -> tuple[Path, Path, Path]:

@@ -245,6 +245,19 @@ def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_th
 
 
 @pytest.mark.slow
+def test_imports_and_simulations_do_not_replace_each_other(
+    night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
+) -> None:
+    """Each may be repeated: the files beside a bag would else be those of another one."""
+    aem, imported, simulated = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'sim'
+    for _ in range(2):
+        assert run(aem, night / '*.fits').status == 0
+        assert starcal('simulate', '-o', simulated, '--scenario', 'tiny').status == 0
+    assert_refused(starcal('simulate', '-o', imported, '--scenario', 'tiny'), 'without truth.json')
+    assert_refused(run(aem, night / '*.fits', bag=simulated), 'without import.json')
+
+
+@pytest.mark.slow
 def test_observations_carry_the_originals_of_their_bag(
     night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
 ) -> None:
