@@ -5,9 +5,10 @@ Rows of a table as series in time with their trends, and the change by each cali
 Model of a series of measurements with known sigmas: a constant, a drift with time, a coefficient
 of temperature, and steps between two neighbouring measurements.  Terms enter one by one, the most
 significant first, while its p-value is below a limit, and leave again where another term has made
-them superfluous (stepwise regression).  Candidates are judged by an F-test whose variance is that
-of the residuals, but at least that of the sigmas; the p-value of a step is multiplied by the
-number of places that it could stand at (Bonferroni).
+them superfluous (stepwise regression).  A candidate is judged by its fall of chi^2, twice: against
+the sigmas, and against the scatter of the residuals alone (F-test).  The larger p-value counts, so
+neither sigmas that are too small nor a few residuals that happen to be small make a finding.  The
+p-value of a step is multiplied by the number of places that it could stand at (Bonferroni).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import chdtrc, fdtrc
 
 from starcal_ground.comparison import alignment_difference_rad
 from starcal_ground.mission.trend.trend_table import COMPUTED, Row
@@ -145,8 +146,9 @@ def _p_values(A: Floats, b: Floats, chosen: list[int], trials: Floats) -> Floats
     is_new = remaining > 1e-12 * np.sum(A**2, axis=0)
     gain = np.where(is_new, (b @ left) ** 2 / np.where(is_new, remaining, 1.0), 0.0)
     freedom = len(b) - len(chosen) - 1
-    F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
-    return np.asarray(np.minimum(trials * fdtrc(1, freedom, np.maximum(F, 0.0)), 1.0))
+    left_over = np.maximum(b @ b - gain, np.finfo(float).tiny)
+    by_scatter = fdtrc(1, freedom, gain * freedom / left_over)
+    return np.asarray(np.minimum(trials * np.maximum(by_scatter, chdtrc(1, gain)), 1.0))
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,17 @@ def test_sigmas_that_are_too_small_do_not_make_steps() -> None:
     assert found.terms == () and found.scatter == pytest.approx(20, rel=0.3)
 
 
+def test_a_drift_of_many_sigmas_is_found_in_few_calibrations() -> None:
+    """Seven in three years: the scatter of five residuals alone is no measure of the sigmas."""
+    years = np.arange(7) / 2
+    value = np.array([0.0, 12.0, 16.0, 31.0, 43.0, 55.0, 57.0])
+    found = trend_of(years * SECONDS_PER_YEAR, value, np.full(7, 10.0), np.full(7, np.nan))
+    (term,) = found.terms
+    # 57 in three years, of a known sigma of 10 over a spread of 2.6 years: 5.3 sigma.
+    assert term.kind == 'drift' and term.size == pytest.approx(20.4, abs=0.5)
+    assert term.sigma == pytest.approx(3.8, abs=0.1)
+
+
 def test_a_single_outlier_is_no_step() -> None:
     truth = np.zeros(N)
     truth[25] = 1.0
