@@ -157,11 +157,12 @@ class StarObserver(StarcalNode):
             for name, tracker in trackers.items()
             if tracker.unfit
         ]
+        lost = self.inputs.lost().get(self.resolve_topic_name('image'), 0)
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
             'images_waiting': len(self._queue),
-            'images_lost': self.inputs.lost().get(self.resolve_topic_name('image'), 0),
+            'images_lost': lost,
             'image_rate_hz': _short(self._image_arrivals.rate_hz()),
             'latency_median_s': _short(self._latency_s.median()),
             'latency_worst_s': _short(self._latency_s.largest()),
@@ -185,6 +186,9 @@ class StarObserver(StarcalNode):
             return WARN, '; '.join(why_not), numbers
         if bad_velocity := self._bad_velocity or self._doubt_of_velocity():
             return WARN, bad_velocity, numbers
+        if lost:
+            lost_images = f'{counted(lost, "image")} lost before they reached the node'
+            return WARN, f'{lost_images}: give DDS larger buffers (config/fastdds.xml)', numbers
         if not counts:
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers

@@ -87,9 +87,11 @@ def test_images_that_the_middleware_loses_are_counted(
 
     def is_counted() -> bool:
         images.publish(large)
-        return int(client.health()[2].get('images_lost', 0)) > 0
+        return 'lost before they reached the node' in client.health()[1]
 
     client.until(is_counted)
+    level, _, values = client.health()
+    assert level == b'\x01' and int(values['images_lost']) > 0
 
 
 def test_calibrator_diagnostics_match_the_document(
