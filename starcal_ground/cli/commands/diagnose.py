@@ -92,7 +92,9 @@ def _topic_notes(topic: TopicContent) -> Iterator[str]:
     yield topic.type_name.replace('/msg/', '/')
     rate = f' at {significant(topic.rate_hz, 3)} Hz' if topic.rate_hz else ''
     yield f'{counted(topic.count, "message")}{rate}'
-    yield f'{utc_text(topic.first_ns)} to {_clock(topic.last_ns)}'
+    first, last = utc_text(topic.first_ns), utc_text(topic.last_ns)
+    same_day = first.partition(' ')[0] == last.partition(' ')[0]
+    yield f'{first} to {_clock(topic.last_ns) if same_day else last}'
     if topic.count > 1:
         yield f'longest gap {significant(topic.longest_gap_s, 3)} s'
     yield from (f'{count} x {kind}' for kind, count in topic.kinds.items())
