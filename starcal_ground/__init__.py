@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         observations_of,
         write_calibration,
     )
+    from starcal_ground.bags.reader import read_observations
     from starcal_ground.comparison import compare
     from starcal_ground.mission.export.wcs import directions_icrf
     from starcal_ground.products import read_residuals
@@ -69,6 +70,7 @@ __all__ = [
     'plot',
     'project',
     'read_calibration',
+    'read_observations',
     'read_residuals',
     'undistort_maps',
     'write_calibration',
@@ -84,6 +86,7 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
         'directions_icrf': 'mission.export.wcs',
         'observations_of': 'api',
         'plot': 'report.page',
+        'read_observations': 'bags.reader',
         'read_residuals': 'products',
         'undistort_maps': 'undistortion',
         'write_calibration': 'api',

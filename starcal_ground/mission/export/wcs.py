@@ -73,7 +73,7 @@ def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
         system = _system(calibration, image, attitude[0], catalog)
         header = fits.Header(system.cards())
         if TIMES not in calibration.provenance:  # else the stamps are no times of exposure
-            header['DATE-OBS'] = utc_text(image.time_ns).removesuffix(' UTC').replace(' ', 'T')
+            header['DATE-AVG'] = utc_text(image.time_ns).removesuffix(' UTC').replace(' ', 'T')
         for line in exported.origin(calibration):
             header['COMMENT'] = exported.ascii_line(line)
         memory = io.BytesIO()
@@ -95,7 +95,7 @@ def directions_icrf(
     ----------
     calibration : Calibration
     image : StarObservations
-        The stars of the image; ``direction_icrf`` of the result is apparent as theirs is, with the
+        The stars of the image, as `read_observations` reads them; ``direction_icrf`` of the result is apparent as theirs is, with the
         aberration of light and, where a site was stated, refraction.
     pixels_px : (n, 2)
         (u, v); the centre of the first pixel is (0, 0).
@@ -116,10 +116,9 @@ def directions_icrf(
     Examples
     --------
     >>> import starcal_ground
-    >>> from starcal_ground.bags.reader import read_observations
     >>> calibration = starcal_ground.read_calibration('out')
-    >>> image = next(iter(read_observations(['out/observations.mcap'], '/observations')))
-    >>> direction, sigma_arcsec = starcal_ground.directions_icrf(calibration, image, [[320, 256]])
+    >>> images = starcal_ground.read_observations(['out/observations.mcap'], '/observations')
+    >>> direction, sigma_arcsec = starcal_ground.directions_icrf(calibration, next(images), [[320, 256]])
     >>> direction.shape, bool(sigma_arcsec[0] < 5.0)
     ((1, 3), True)
     """

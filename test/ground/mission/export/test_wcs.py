@@ -141,5 +141,5 @@ def test_images_without_a_time_have_no_date(
     for one, folder in ((made, tmp_path / 'a'), (undated, tmp_path / 'b')):
         folder.mkdir()
         export(one, 'wcs', folder, Request(observations=images[:1]))
-        dates.append('DATE-OBS' in fits.getheader(folder / 'image0001.wcs'))
+        dates.append('DATE-AVG' in fits.getheader(folder / 'image0001.wcs'))
     assert dates == [True, False]
