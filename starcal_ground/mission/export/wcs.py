@@ -95,8 +95,9 @@ def directions_icrf(
     ----------
     calibration : Calibration
     image : StarObservations
-        The stars of the image, as `read_observations` reads them; ``direction_icrf`` of the result is apparent as theirs is, with the
-        aberration of light and, where a site was stated, refraction.
+        The stars of the image, as `read_observations` reads them.  ``direction_icrf`` of the result
+        is apparent as theirs is, with the aberration of light and, where a site was stated,
+        refraction.
     pixels_px : (n, 2)
         (u, v); the centre of the first pixel is (0, 0).
 
@@ -118,7 +119,10 @@ def directions_icrf(
     >>> import starcal_ground
     >>> calibration = starcal_ground.read_calibration('out')
     >>> images = starcal_ground.read_observations(['out/observations.mcap'], '/observations')
-    >>> direction, sigma_arcsec = starcal_ground.directions_icrf(calibration, next(images), [[320, 256]])
+    >>> pixels_px = [[320, 256]]
+    >>> direction, sigma_arcsec = starcal_ground.directions_icrf(
+    ...     calibration, next(images), pixels_px
+    ... )
     >>> direction.shape, bool(sigma_arcsec[0] < 5.0)
     ((1, 3), True)
     """
