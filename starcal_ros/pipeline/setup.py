@@ -83,6 +83,18 @@ def check_site(site: SiteOptions) -> None:
         )
 
 
+def check_site_counts(site: SiteOptions) -> None:
+    """Raise `OptionError` for a statement about the observer that another one leaves unused."""
+    on_ground = site.observer == 'ground'
+    if not on_ground and (site.latitude_deg or site.longitude_deg):
+        raise OptionError('latitude_deg, longitude_deg: a site counts with observer: ground alone')
+    if on_ground and any(site.observer_velocity_m_s):
+        raise OptionError(
+            'observer_velocity_m_s: with observer: ground the site gives the velocity: leave it'
+            ' out, and state latitude_deg and longitude_deg'
+        )
+
+
 def check_field_of_stars(
     catalog: StarCatalog, magnitude_limit: float, camera: CameraModel
 ) -> None:
@@ -383,6 +395,7 @@ def option_groups(values: Mapping[str, object]) -> dict[str, Any]:
         options.from_mapping(kind, values)  # a value that is read elsewhere is checked here too
     _check_there(files_of(groups['frames']))
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
+    check_site_counts(groups['site'])
     requirements_of(groups['gate'].requirements)
     return groups
 

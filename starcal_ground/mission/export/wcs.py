@@ -95,9 +95,9 @@ def directions_icrf(
     ----------
     calibration : Calibration
     image : StarObservations
-        The stars of the image, as `read_observations` reads them.  ``direction_icrf`` of the result
-        is apparent as theirs is, with the aberration of light and, where a site was stated,
-        refraction.
+        The stars of the image, as `read_observations` reads them.  ``direction_icrf`` of the
+        result is apparent as theirs is, with the aberration of light and, where a site was
+        stated, refraction.
     pixels_px : (n, 2)
         (u, v); the centre of the first pixel is (0, 0).
 

@@ -123,6 +123,11 @@ def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
         ({'shutter': 'rolling'}, 'readout_s: not set, which shutter: rolling needs'),
         ({'readout_s': 0.03}, 'readout_s: 0.03 s, but shutter is unknown; set rolling'),
         ({'observer_velocity_m_s': [0, 0, 3e8]}, r'observer_velocity_m_s\[2\]: .* is not within'),
+        ({'latitude_deg': 41.0}, 'a site counts with observer: ground alone'),
+        (
+            {'observer': 'ground', 'observer_velocity_m_s': [0, 0, 3e4]},
+            'the site gives the velocity: leave it out',
+        ),
         ({'max_residual_rms': 1.0}, 'max_residual_rms: no such parameter'),
         ({'camera_info_url': ''}, 'camera_info_url: not set'),
         ({'prior_alignment': [0.0, 0.0, 0.0, 1e-4]}, 'prior_alignment: .* not a unit quaternion'),
