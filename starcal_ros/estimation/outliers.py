@@ -19,6 +19,9 @@ from starcal_ros.estimation.shared_errors import Groups
 from starcal_ros.estimation.star_equations import squared_sigmas, StarTable
 
 QUARTILE = float(ndtri(0.75))  # median size of normal errors of unit variance
+# With the limit of normal errors, 4.5 to 5, one of six attitudes was a misfit where data sheets
+# state far too little (test_worlds.py); a jump is far larger.
+_MISFIT_SIGMA = 6.0
 
 
 def fitting_stars(
@@ -114,9 +117,10 @@ def misfit_images(
     Notes
     -----
     Farther off the median about an axis than noise is by chance, both that of the stated sigma and
-    that of the scatter of the images: a star tracker that drifts has no misfits.  Where the sigma
-    is a guess, the scatter of few images alone is uncertain: the limit is that of Student's t.  If
-    more than a third would be misfits, the majority is unclear, and none is reported.
+    that of the scatter of the images: a star tracker that drifts has no misfits.  The limit is 6
+    sigma where a sigma is stated.  Where it is a guess, the scatter of few images alone is
+    uncertain: the limit is that of Student's t.  If more than a third would be misfits, the
+    majority is unclear, and none is reported.
     """
     misfit: Mask = np.zeros(len(seen), bool)
     # Of the variance of normal errors from the median of their squares: relative to the mean.
@@ -131,8 +135,8 @@ def misfit_images(
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
         chance = 0.5 * FALSE_ALARM_RATE / (3 * m)  # of each side of each axis
-        freedom = math.inf if is_stated else efficiency * (m - 1)
-        limit = -float(stdtrit(freedom, chance))
+        by_scatter = -float(stdtrit(efficiency * (m - 1), chance))
+        limit = _MISFIT_SIGMA if is_stated else by_scatter
         found = (left**2 > limit**2 * usual).any(axis=1)
         if 3 * np.count_nonzero(found) <= m:
             misfit[here] = found

@@ -10,6 +10,7 @@ import pytest
 from tools.tests_of_change import nearest_tests
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
