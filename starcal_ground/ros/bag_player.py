@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import contextlib
 import sys
 import threading
 import time
@@ -280,9 +279,13 @@ def _listen(executor: node.Executor) -> None:
     The thread of rclpy that answers a signal wakes the executors before it shuts ROS down: one
     that is quick to wait again is not woken another time, so no wait is without an end.
     """
-    with contextlib.suppress(ExternalShutdownException):
+    try:
         while executor.context.ok():
             executor.spin_once(timeout_sec=1.0)
+    except Exception:
+        # A signal may come after the loop has asked: a wait under construction then fails.
+        if executor.context.ok():
+            raise
 
 
 def _timeout() -> Duration:

@@ -527,7 +527,8 @@ def _spin(node: StarcalNode, executor: Executor) -> None:
         except ExternalShutdownException:
             return
         except Exception as error:
-            node.count_error(error)
+            if node.context.ok():  # else a signal came while a wait was under construction
+                node.count_error(error)
 
 
 def make_message(type_name: str, /, **fields: Any) -> Message:
