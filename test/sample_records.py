@@ -154,7 +154,7 @@ def model_checks() -> ModelChecks:
         field_worst_px=0.02,
         held=(
             HeldTerm('cx', 647.5, 648.25, 1.5),
-            HeldTerm('k3', 0.01, 0.02, 0.04),
+            HeldTerm('k3', 0.01, 0.02, 0.04, evidence=-1.5),
             HeldTerm('stamp_offset_s', 0.0, math.nan, math.nan),
         ),
         step=DetectorStep('u', 512.5, 'v', -0.015, 0.7),

@@ -333,7 +333,8 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         name = f'{one.name} as stated'
         yield GateCheck(name, '', math.nan, math.nan, '', one.passed, one.note)
     wrong = [one.name for one in found.statements if one.passed is False]
-    wrong += [t.name for t in found.held if t.significance > options.max_held_term_sigma]
+    # A distance that the evidence does not decide on may be the cause all the same.
+    wrong += [t.name for t in found.held if t.distance > options.max_held_term_sigma]
     remedy = remedy_against(CHANGE)
     if wrong:
         remedy = f'a wrong {wrong[0]} looks like it: first correct that'

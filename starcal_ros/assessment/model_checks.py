@@ -24,6 +24,7 @@ from starcal_ros.estimation.shared_errors import coarsest_cell_px
 from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
+_CLEAR_SIGMA = 5.0  # the default of the gate: a conflict that fails must be in the evidence too
 _STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
 _MARGIN = 0.1  # of the sides, where lenses leave residuals that look like steps: WISPR 0.25 px
 
@@ -99,15 +100,17 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     Return unknowns that are held or have a stated prior, with what the stars ask for.
 
     Each prior is tested by estimating again without it, a held parameter by estimating it: the
-    field and the shapes of the images absorb the conflict, the unknown itself hardly moves.  What
-    the stars alone do not determine is listed too, with NaN.
+    field and the shapes of the images absorb the conflict, the unknown itself hardly moves.  Free
+    unknowns also fit errors of the lens: more than `_CLEAR_SIGMA` counts where the data are as
+    much likelier without the prior, and otherwise as much as they are.  What the stars alone do
+    not determine is listed too, with NaN.
     """
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
         own = int(k - camera[0])
-        means, variances = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
+        means, variances, _ = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
         held, shown = float(estimate.linear.state.parameters[own]), _or_nan(variances[own])
         by_stars = held + float(means[own]) + 0.0 * shown
         terms.append(HeldTerm(layout.labels[k], held, by_stars, math.sqrt(shown)))
@@ -124,20 +127,25 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         test = entry.kind.tested
         if test is None or not tested.any():
             continue
-        means, variances = without_prior(estimate.sums, estimate.linear, entry.name, found)
+        means, variances, log_evidence = without_prior(
+            estimate.sums, estimate.linear, entry.name, found
+        )
+        gained = log_evidence - found.log_evidence
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
             shown = _or_nan(variance)
             off = float(layout.prior_offset[k] + mean) + 0.0 * shown
             # Errors that observations share are in both variances.
             prior2 = min(1.0 / layout.prior_precision[k], entry.plausible_sigma**2)
             sigma = math.sqrt(prior2 + shown * total[k] / working[k])
+            is_far = math.isinf(entry.plausible_sigma) and abs(off) > _CLEAR_SIGMA * sigma
+            evidence = gained if is_far and not gained > 0.5 * _CLEAR_SIGMA**2 else math.nan
             # What is not in the state is zero there, so far from its prior mean.
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
             if k in camera:
                 prior = float(problem.prior_parameters[k - camera[0]])
             label = layout.labels[k]
             name, unit = {**mountings, **test.as_stated}.get(label, (label, 1.0))
-            terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma))
+            terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma, evidence))
     return tuple(terms)
 
 

@@ -87,6 +87,7 @@ class Averaged:
     log_px: Floats
     weight: Floats
     term: Amplitudes
+    log_evidence: float
 
 
 def octave_prior(count: int, first: tuple[float, float] = UNSTATED) -> tuple[Floats, Floats]:
@@ -243,6 +244,7 @@ def averaged_field(
         amplitudes.log_px[-1] + shift,
         weight,
         _of_one(float(own[best, 0]), float(pull[best, 0])),
+        float(np.logaddexp.reduce(log_weight + np.logaddexp.reduce(log_share, axis=1))),
     )
 
 

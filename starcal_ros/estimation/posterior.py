@@ -25,6 +25,8 @@ from starcal_ros.estimation.amplitudes import (
     averaged_field,
     field_amplitudes,
     LEAST_PX,
+    LOG_CENTRE,
+    LOG_SIGMA,
     Shapes,
     shapes,
     ShapeSums,
@@ -92,6 +94,8 @@ class Posterior:
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
+    log_evidence : float
+        Log evidence of the data given the priors, up to a constant.
     layout : Layout
     errors : ErrorParts or None
         None before `with_shared_errors`.
@@ -106,6 +110,7 @@ class Posterior:
     shapes: Shapes
     last_octave: tuple[Floats, Floats]
     resolved: float
+    log_evidence: float
     layout: Layout
     errors: ErrorParts | None = None
 
@@ -151,7 +156,13 @@ def posterior(
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shapes.amplitudes if near else None)
         last = eliminated(normal, layout, found.sigma_px)
-    mean, covariance, last_octave, term = solver.solve(last, base)
+    mean, covariance, last_octave, term, log_evidence = solver.solve(last, base)
+    # The unknowns of the images, eliminated, and the prior of their amplitudes.
+    log_evidence += 0.5 * float(np.linalg.slogdet(last.covariance)[1].sum())
+    log_evidence += 0.5 * float((last.own * normal.c).sum())
+    log_px = np.log(found.sigma_px)
+    log_evidence -= len(normal.c) * float(log_px.sum())
+    log_evidence -= 0.5 * float((((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2).sum())
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
@@ -163,23 +174,29 @@ def posterior(
         shapes=found,
         last_octave=last_octave,
         resolved=resolved,
+        log_evidence=log_evidence,
         layout=layout,
     )
 
 
 def without_prior(
     sums: StarSums, linear: Linearisation, name: str, near: Posterior, held: int | None = None
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, float]:
     """
-    Return mean and variance (q,) of the unknowns of an entry without its prior.
+    Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
 
     With ``held`` only that number of the entry, which is held, is free.
 
     The amplitudes are estimated again: field and shapes may hide that a prior is wrong.  A free
     trend and a free velocity would absorb errors of the lens, so the trend keeps its value of the
-    posterior ``near`` with the prior.  The variance is that of the working weights;
+    posterior ``near`` with the prior, and its cost.  The variance is that of the working weights;
     infinite where stars show less than what is possible at all.
     """
+    at_trend = linear.layout.trend_at
+    trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
+    cost = 0.5 * float(
+        (stated * trend**2 - np.log(stated * np.diag(near.working)[at_trend])).sum()
+    )
     entries = []
     for entry in linear.layout.entries:
         if entry.name == name:
@@ -194,7 +211,7 @@ def without_prior(
     try:
         found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
-        return np.zeros(len(at)), np.full(len(at), np.inf)
+        return np.zeros(len(at)), np.full(len(at), np.inf), -np.inf
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
         shown = 1.0 / np.diag(found.working)[at] - precision
@@ -202,7 +219,7 @@ def without_prior(
         variance = np.where(seen, 1.0 / shown, np.inf)
         # The wide prior pulls a little: off + mean is the sum of both by their information.
         alone = (off + found.mean[at]) * (1.0 + precision * variance) - off
-    return np.where(seen, alone, 0.0), variance
+    return np.where(seen, alone, 0.0), variance, found.log_evidence - cost
 
 
 def _without_prior(entry: Unknown, held: int | None) -> Floats:
@@ -255,8 +272,8 @@ class _Solver:
 
     def solve(
         self, arrow: Equations, amplitudes: Amplitudes
-    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes]:
-        """Return mean (P,), covariance (P, P), last octave and lens term."""
+    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes, float]:
+        """Return mean (P,), covariance (P, P), last octave, lens term, and log evidence."""
         count = self.layout.count
         mean, covariance = np.zeros(count), np.zeros((count, count))
         information, left, free, gradient, back = self._of_field(arrow)
@@ -270,7 +287,14 @@ class _Solver:
         covariance[np.ix_(self.free, self.field)] = to_free * self.unit
         covariance[np.ix_(self.field, self.free)] = (to_free * self.unit).T
         covariance[np.ix_(self.free, self.free)] = free - to_free @ back.T
-        return mean, covariance, (field.log_px, field.weight), field.term
+        precision, offset = self.precision[self.free], self.layout.prior_offset[self.free]
+        stated = precision > 0
+        log_evidence = field.log_evidence + 0.5 * float(
+            np.linalg.slogdet(free)[1]
+            + gradient @ free @ gradient
+            + (np.log(precision[stated]) - precision[stated] * offset[stated] ** 2).sum()
+        )
+        return mean, covariance, (field.log_px, field.weight), field.term, log_evidence
 
     def resolved(self, arrow: Equations, covariance: Floats) -> float:
         """Return the number of shared unknowns that the data determine."""

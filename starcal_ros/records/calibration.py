@@ -216,7 +216,9 @@ class HeldTerm:
 
     ``assumed`` is the held or prior value, ``estimated`` that from the stars; ``sigma`` is the
     1-sigma of their difference if the assumption is true.  Both are NaN where the stars alone do
-    not determine it.
+    not determine it.  ``evidence`` is the log evidence of the data without the prior less that
+    with it: free unknowns also fit errors of the lens, which do not contradict a prior that
+    explains the data nearly as well.  It is NaN where the distance alone counts.
 
     >>> round(HeldTerm('cx', assumed=319.5, estimated=320.1, sigma=0.3).significance, 6)
     2.0
@@ -226,11 +228,23 @@ class HeldTerm:
     assumed: float
     estimated: float
     sigma: float
+    evidence: float = math.nan
+
+    @property
+    def distance(self) -> float:
+        """The difference over its sigma; NaN where it was not checked."""
+        return abs(self.estimated - self.assumed) / self.sigma
 
     @property
     def significance(self) -> float:
-        """The difference over its sigma; NaN where it was not checked."""
-        return abs(self.estimated - self.assumed) / self.sigma
+        """
+        The difference in sigmas, as far as the evidence allows; NaN where it was not checked.
+
+        Where the evidence counts, twice its log is the square of as many sigmas.
+        """
+        if math.isnan(self.evidence):
+            return self.distance
+        return min(self.distance, math.sqrt(max(2.0 * self.evidence, 0.0)))
 
 
 @dataclass(frozen=True)

@@ -200,6 +200,7 @@ def test_what_the_stars_alone_do_not_determine_is_not_checked() -> None:
     [
         {'statements': (StatementCheck('velocity', False, 'the velocity is opposite'),)},
         {'held': (HeldTerm('velocity', 0.0, 6e4, 1e3),)},
+        {'held': (HeldTerm('velocity', 0.0, 6e4, 1e3, evidence=3.0),)},  # which does not decide
     ],
 )
 def test_a_wrong_statement_is_named_where_it_looks_like_a_camera_that_changes(
@@ -211,3 +212,10 @@ def test_a_wrong_statement_is_named_where_it_looks_like_a_camera_that_changes(
     reasons = reasons_of(model_gate(checks, GateOptions()))
     assert any('a wrong velocity looks like it: first correct that' in one for one in reasons)
     assert not any('one focus' in one for one in reasons)
+
+
+@pytest.mark.parametrize(
+    ('evidence', 'sigmas'), [(math.nan, 12.0), (8.0, 4.0), (-3.0, 0.0), (1e3, 12.0)]
+)
+def test_a_distance_counts_as_much_as_the_evidence(evidence: float, sigmas: float) -> None:
+    assert HeldTerm('cx', 0.0, 12.0, 1.0, evidence).significance == pytest.approx(sigmas)
