@@ -665,6 +665,13 @@ def read_observations(
     Recorded observations of a topic.
 
     Those with impossible values, or that cannot be decoded, become refused ones.
+
+    Examples
+    --------
+    >>> import starcal_ground
+    >>> observed = starcal_ground.read_observations(['out/observations.mcap'], '/observations')
+    >>> len(next(observed).measured_px) > 10
+    True
     """
     for raw in read_raw(paths, Topics(observations=topic).read, on_damage):
         try:
