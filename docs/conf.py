@@ -181,7 +181,10 @@ def check_links(app: Sphinx, error: Exception | None) -> None:
     """Fail if a link within the site is broken: Sphinx checks those of the documents only."""
     broken = [] if error else broken_links(Path(app.outdir))
     if broken:
-        raise SphinxError(f'{len(broken)} broken links, such as\n' + '\n'.join(broken[:10]))
+        old = 'pages of an earlier site may be there: remove docs/_build first'
+        raise SphinxError(
+            f'{len(broken)} broken links ({old}), such as\n' + '\n'.join(broken[:10])
+        )
 
 
 def setup(app: Sphinx) -> None:

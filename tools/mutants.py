@@ -171,9 +171,10 @@ def _try(mutant: Mutant, tests: Tests, copies: Queue[Path]) -> tuple[Mutant, str
         ran = tests.get(f'{mutant.path}:{mutant.line}', ())[:MOST_TESTS]
         names = ran or list(map(str, nearest_tests([mutant.path])))
         (copy / 'tests.txt').write_text('\n'.join(names))
+        before = (copy / mutant.path).read_text()
         (copy / mutant.path).write_text(mutant.text())
         printed = _pytest(copy, '-x', '-q', '-p', 'no:cacheprovider', '@tests.txt')
-        (copy / mutant.path).write_text(mutant.path.read_text())
+        (copy / mutant.path).write_text(before)
     finally:
         copies.put(copy)
     return mutant, printed

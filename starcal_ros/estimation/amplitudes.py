@@ -17,7 +17,7 @@ is never a decision.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 import functools
 import math
@@ -110,7 +110,6 @@ def field_amplitudes(
     octave: Indices,
     near: Amplitudes | None = None,
     first: tuple[float, float] = UNSTATED,
-    starts_px: Sequence[float] = STARTS_PX[:3:2],
 ) -> Amplitudes:
     """
     Amplitudes of the octaves of a field by Fisher scoring.
@@ -124,11 +123,11 @@ def field_amplitudes(
         Amplitudes of the round before: the search starts there and from one other place.
     first : float, float
         Prior of the first octave, as of `octave_prior`.
-    starts_px : sequence of float
-        Where the search starts; the last is that beside ``near``.
     """
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count, first)
+    # The gradient vanishes near zero: a small amplitude and a large one.
+    starts_px = STARTS_PX[0], STARTS_PX[2]
     starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in starts_px]
     if near is not None:
         starts = [near.log_px, starts[-1]]

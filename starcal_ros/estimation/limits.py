@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 FALSE_ALARM_RATE = 1e-4
-"""Chance that a test finds a fault in sound data, at any of its places: each has a part of it.  A
-tenth of it would hide a drift of few images, ten times as much refuse one calibration in 100."""
+"""Chance that a test finds a fault in sound data, at any of its places: each has a part of it.
+
+Ten times less would hide a drift of few images, ten times more refuse one calibration in 100.  Two
+limits are wider by evidence: misfits of a stated star tracker, and priors that data contradict."""
 FEWEST = 3
 """Members of a group that are judged: of two that differ, either may be the wrong one."""
 MOST_CORRELATED = 100

@@ -212,23 +212,21 @@ def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise:
     return (stated_slow or noise) * math.exp(0.5 * log_sigma**2) * math.sqrt(shared)
 
 
-def groups_of(time_ns: Indices, most: int = MOST_CORRELATED) -> Indices:
+def groups_of(time_ns: Indices) -> Indices:
     """Return the group (m,) of each image: neighbours in time, of the same size but the last."""
     m = len(time_ns)
     group = np.empty(m, np.int64)
-    group[np.argsort(time_ns, kind='stable')] = np.arange(m) // -(-m // most)
-    return group if m > most else np.arange(m)
+    group[np.argsort(time_ns, kind='stable')] = np.arange(m) // -(-m // MOST_CORRELATED)
+    return group if m > MOST_CORRELATED else np.arange(m)
 
 
-def correlations_of(
-    time_ns: Indices, camera_from_icrf: Rotation, most: int = MOST_CORRELATED
-) -> Correlations:
+def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlations:
     """
     Return the correlations of slow errors of images at these stamps (m,) and attitudes.
 
-    Images are joined in at most so many groups of neighbours in time.
+    Images are joined in at most `MOST_CORRELATED` groups of neighbours in time.
     """
-    group = groups_of(time_ns, most)
+    group = groups_of(time_ns)
     size = np.bincount(group)
     order = np.argsort(group, kind='stable')
     some = order[np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size) < _MOST_MEMBERS]

@@ -16,7 +16,6 @@ from starcal_ros.arrays import Floats
 from starcal_ros.estimation import tracker_errors as module
 from starcal_ros.estimation.amplitudes import interval_factor
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.limits import MOST_CORRELATED
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.tracker_errors import (
     correlations_of,
@@ -36,14 +35,13 @@ def found_of(
     is_stated: bool = True,
     stated_slow: float = 0.0,
     attitudes: Rotation | None = None,
-    most: int = MOST_CORRELATED,
 ) -> TrackerErrors:
     """Posterior of errors (m, 3), an image a minute; attitudes far apart by default."""
     m = len(error)
     if attitudes is None:
         attitudes = Rotation.random(m, random_state=np.random.default_rng(77))
     time_ns = 10**18 + CADENCE_NS * np.arange(m)
-    correlations = correlations_of(time_ns, attitudes, most)
+    correlations = correlations_of(time_ns, attitudes)
     return tracker_errors(error, np.full((m, 3), variance), correlations, is_stated, stated_slow)
 
 
