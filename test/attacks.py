@@ -40,7 +40,7 @@ def drawn(count: int) -> Callable[[Any], Any]:
 
 
 @functools.cache
-def setup() -> Setup:
+def bag_setup() -> Setup:
     """Return the setup of the bag in the repository."""
     return read_setup(BAG / 'params.yaml')
 
@@ -50,13 +50,13 @@ def observations() -> tuple[StarObservations, ...]:
     """Return the observations of that bag."""
     image = reader.choose_topic([BAG], 'sensor_msgs/msg/Image')
     attitude = reader.choose_topic([BAG], 'geometry_msgs/msg/QuaternionStamped')
-    return tuple(topics.read([BAG], Topics(image, attitude), setup()))
+    return tuple(topics.read([BAG], Topics(image, attitude), bag_setup()))
 
 
 @functools.cache
 def calibration() -> Calibration:
     """Return the calibration of that bag, which passes the gate."""
-    solved = solve.solve(functools.reduce(Ensemble.add, observations(), Ensemble()), setup())
+    solved = solve.solve(functools.reduce(Ensemble.add, observations(), Ensemble()), bag_setup())
     assert solved.accepted, solved.reasons
     return solved
 

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 import shutil
 
-from attacks import calibration, observations, setup  # type: ignore[import-not-found]
+from attacks import bag_setup, calibration, observations  # type: ignore[import-not-found]
 from kept_state import full_disk  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
@@ -31,7 +31,7 @@ class Calibrators:
         self._times: Iterator[int] = itertools.count(1)
         self.states: dict[str, CalibratorState] = {}
         self.is_full = contextlib.ExitStack()
-        self.setup = dataclasses.replace(setup(), prior=calibration().geometry)
+        self.setup = dataclasses.replace(bag_setup(), prior=calibration().geometry)
         self.answer = Answer(True, '')  # to the last request
         self._candidate: Calibration = calibration()
         self._meanwhile: tuple[str, ...] = ()

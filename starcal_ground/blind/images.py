@@ -10,17 +10,17 @@ any is searched further.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+import dataclasses
 from dataclasses import dataclass
 import itertools
 import math
-import time
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.blind import search
 from starcal_ground.blind.bright_sources import bright_sources, BrightSources, smear
-from starcal_ground.blind.search import SkyMatch
+from starcal_ground.blind.search import Effort, SkyMatch
 from starcal_ground.blind.sky_fit import FOUND, Ranges, STATED
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
@@ -36,7 +36,7 @@ _OTHER_SCALES = (0.55, 1.8, 0.3, 3.3)
 _FEW = 3  # identified, with which no image is searched further
 FEWEST_SOURCES = 6
 _BLURRED_ENDS_PX = 1.0  # the blurred ends lengthen the sources of a streak by it
-_SEARCH_S = 10.0  # half of the 20 s of a diagnosis; reading and measuring take the rest
+_MOST_EFFORT = 2_500  # 10 to 15 s, most of a diagnosis; a real region of a detector took 1,518
 
 
 @dataclass
@@ -52,14 +52,10 @@ class ImageSearch:
 
     camera: CameraModel
     catalog: StarCatalog
-    deadline_s: float = math.inf
+    effort: Effort = dataclasses.field(default_factory=lambda: Effort(math.inf))
     mirrored: tuple[bool, ...] = (False, True)
     ranking: int = 0
     ranges: tuple[Ranges, ...] = (STATED,)
-
-    def is_over(self) -> bool:
-        """True if the processor time of the thread has reached the deadline."""
-        return time.thread_time() > self.deadline_s
 
     def guess(self, rankings: Sequence[Floats], rotations: Iterable[Rotation]) -> SkyMatch | None:
         """Match of an image with one of some rotations ``camera_from_icrf``."""
@@ -90,7 +86,7 @@ class ImageSearch:
                 self.catalog,
                 self.mirrored,
                 rounds,
-                self.deadline_s,
+                self.effort,
                 ranges,
             )
             if sky:
@@ -153,15 +149,15 @@ def identify_images(
     camera: CameraModel,
     catalog: StarCatalog,
     guesses: Guesses,
-    search_s: float = _SEARCH_S,
+    most: float = _MOST_EFFORT,
 ) -> Identified:
     """
     The first images that can be identified, in the order of their stamps.
 
-    ``guesses`` are tried before the sky is searched.  The search ends after ``search_s`` of
-    processor time of this thread.
+    ``guesses`` are tried before the sky is searched.  The search ends when it has cost
+    ``most`` (`Effort`).
     """
-    finder = ImageSearch(camera, catalog, time.thread_time() + search_s)
+    finder = ImageSearch(camera, catalog, Effort(most))
     looked_at: list[BrightSources] = []
     other_sizes: list[tuple[int, int]] = []
     solved: list[Solved] = []
@@ -188,7 +184,7 @@ def identify_images(
                 pending.append(bright)
             if len(pending) == _FEW and not solved:
                 pending = _look_up(finder, pending, solved, search.ROUNDS[0], _OTHER_SCALES)
-        if len(solved) == _IMAGES or searched == _SEARCHED or finder.is_over():
+        if len(solved) == _IMAGES or searched == _SEARCHED or finder.effort.is_spent:
             break
     for later in search.ROUNDS[1:]:
         pending = _look_up(finder, pending, solved, later)
@@ -207,7 +203,7 @@ def _look_up(
     unsolved = []
     for bright in pending:
         sky = None
-        if len(solved) < _FEW and not finder.is_over():
+        if len(solved) < _FEW and not finder.effort.is_spent:
             sky = finder.look_up(bright.sources.rankings, [searched], scales)
         if sky:
             solved.append(Solved(**vars(bright), sky=sky))

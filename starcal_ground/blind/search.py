@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import functools
 import itertools
 import math
-import time
 from typing import NamedTuple
 
 import numpy as np
@@ -49,9 +48,26 @@ _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
 _SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
+_A_LOOK_UP = 2  # candidates refined that cost as much as a look-up
 _KNOWN = 0.05  # half range of the focal length from which a field is searched with one
 _LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
 _CERTAIN_GAIN = 1.5  # such a gain that few false candidates reach and most true ones do
+
+
+@dataclass
+class Effort:
+    """
+    The cost that searches may still have, in candidates refined: they end alike on any machine.
+
+    A thousand take 4 to 8 s of processor time, with the indices that are made first.
+    """
+
+    left: float
+
+    @property
+    def is_spent(self) -> bool:
+        """True if a search must end."""
+        return self.left <= 0
 
 
 @dataclass(frozen=True)
@@ -97,7 +113,7 @@ def find_in_any(
     catalog: StarCatalog,
     mirrored: Sequence[bool] = (False,),
     rounds: Sequence[tuple[int, int]] = ROUNDS,
-    deadline_s: float = math.inf,
+    effort: Effort | None = None,
     ranges: Ranges = STATED,
 ) -> tuple[SkyMatch | None, int]:
     """
@@ -106,9 +122,10 @@ def find_in_any(
     ``rankings`` are selections (n, 2) of its sources, brightest first.  ``cameras`` are priors,
     one of them within ``ranges``: by default focal length within 25 %, principal point within 5 %
     of the width, distortion within 3 % of the radius.  The catalog is sorted by magnitude.
-    ``mirrored`` are the ways that each is tried, ``rounds`` a part of `ROUNDS`.  The search ends
-    when the processor time of the thread reaches ``deadline_s``.
+    ``mirrored`` are the ways that each is tried, ``rounds`` a part of `ROUNDS`.  The search takes
+    from ``effort`` and ends when that is spent.
     """
+    effort = effort or Effort(math.inf)
     views = [
         [
             _View(_image(xy_px, camera, turned, ranges), turned, k)
@@ -121,13 +138,14 @@ def find_in_any(
     for before, sources in rounds:
         chosen = [[view for view in group if len(view.image.xy_px) > before] for group in views]
         for view, candidates in _candidates(chosen, catalog, before, sources):
+            effort.left -= _A_LOOK_UP + len(candidates)
             for fit in _fits(view.image, catalog, candidates):
                 log10_p, radius_px = sky_fit.log10_p_value(view.image, catalog, fit)
                 log10_p += math.log10(len(mirrored))
                 if log10_p < MAX_LOG10_P_VALUE:
                     result = _result(view.image, catalog, fit, radius_px, log10_p, view.mirrored)
                     return result, view.ranking
-            if time.thread_time() > deadline_s:
+            if effort.is_spent:
                 return None, 0
     return None, 0
 

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
-import time
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ground.blind import search
 from starcal_ground.blind.bright_sources import bright_sources, BrightSources
 from starcal_ground.blind.images import FEWEST_SOURCES, ImageSearch
-from starcal_ground.blind.search import SkyMatch
+from starcal_ground.blind.search import Effort, SkyMatch
 from starcal_ground.images import copies
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
@@ -51,8 +50,8 @@ _HALF_FIELDS_DEG = (
     *((_PINHOLE, deg) for deg in (6.0, 4.0, 2.7)),
 )
 _SEARCHED = 4  # images that are searched over all focal lengths
-_SEARCH_S = 150.0  # processor time after which the search for a first camera ends
-_BRIEF_S = 4.0  # enough for seven of eight simulated cameras of 6 to 117 degrees
+_MOST_EFFORT = 20_000  # of the search for a first camera: 100 to 200 s of processor time
+_BRIEF_EFFORT = 500  # about 4 s: enough for seven of eight simulated cameras of 6 to 117 degrees
 _CENTROID_PX = 0.3  # 1-sigma of the centroid of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel
 _BRIGHTEST, _LEAST_CONTRAST = 20, 2.0
@@ -159,7 +158,9 @@ def from_stars(
     half_px = 0.5 * math.hypot(*size)
     usual = (_usual(size, half_px, model, math.radians(deg)) for model, deg in _HALF_FIELDS_DEG)
     first = _first_match(rich, priors, catalog) if priors and not too_few else None
-    first = first or _first_match(rich, list(usual), catalog, _BRIEF_S if too_few else _SEARCH_S)
+    first = first or _first_match(
+        rich, list(usual), catalog, _BRIEF_EFFORT if too_few else _MOST_EFFORT
+    )
     if first is None and too_few:
         raise NotFromStars(too_few)
     if first is None:
@@ -275,22 +276,22 @@ def _first_match(
     seen: Sequence[_Sources],
     cameras: Sequence[CameraModel],
     catalog: StarCatalog,
-    search_s: float = _SEARCH_S,
+    most: float = _MOST_EFFORT,
 ) -> tuple[ImageSearch, Rotation] | None:
     """The search that one of the cameras has identified an image for, and its rotation."""
-    deadline_s = time.thread_time() + search_s
+    effort = Effort(most)
     ordered = sorted(seen, key=lambda one: -one.stars)
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
         sky, ranking = search.find_in_any(
-            one.rankings, cameras, catalog, (False, True), search.ROUNDS[:1], deadline_s
+            one.rankings, cameras, catalog, (False, True), search.ROUNDS[:1], effort
         )
         if sky:
             better = _of_better_lens(sky, one.rankings[ranking], catalog)
             found = ImageSearch(better.camera, catalog)
             found.take(better, ranking)
             return found, better.camera_from_icrf
-        if time.thread_time() > deadline_s:
+        if effort.is_spent:
             break
     return None
 

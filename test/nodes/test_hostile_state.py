@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import time
 
-from attacks import calibration, CHANGES, digests, drawn, observations, setup, with_changes  # type: ignore[import-not-found]
+from attacks import bag_setup, calibration, CHANGES, digests, drawn, observations, with_changes  # type: ignore[import-not-found]
 from hypothesis import given
 import pytest
 
@@ -66,7 +66,7 @@ def restarted(folder: Path, key_file: object = '') -> CalibratorState:
     state = CalibratorState(time.time_ns)
     options = CalibratorOptions(state_dir=str(folder), state_key_file=str(key_file))
     with contextlib.suppress(StarcalError):  # then the node does not start
-        state.open(setup(), options)
+        state.open(bag_setup(), options)
     state.close()
     return state
 
@@ -75,7 +75,9 @@ def passes_the_gate(state: CalibratorState) -> bool:
     """No calibration is active that the gate refuses, by a call of the gate itself."""
     if state.active is None:
         return True
-    checks = judge(state.active, setup().prior, None, setup().gate, setup().calibration)
+    checks = judge(
+        state.active, bag_setup().prior, None, bag_setup().gate, bag_setup().calibration
+    )
     return not reasons_of(checks)
 
 

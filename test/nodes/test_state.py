@@ -11,7 +11,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from attacks import observations, setup  # type: ignore[import-not-found]
+from attacks import bag_setup, observations  # type: ignore[import-not-found]
 from calibrators import Calibrators  # type: ignore[import-not-found]
 from kept_state import full_disk  # type: ignore[import-not-found]
 import pytest
@@ -28,7 +28,7 @@ from starcal_ros.ros.state import CalibratorState
 def started(folder: Path | str = '', given: Setup | None = None) -> CalibratorState:
     """A state that is open, with the setup of the small bag or another one."""
     state = CalibratorState(itertools.count(1).__next__)
-    state.open(given or setup(), CalibratorOptions(state_dir=str(folder)))
+    state.open(given or bag_setup(), CalibratorOptions(state_dir=str(folder)))
     return state
 
 
@@ -119,7 +119,7 @@ def test_a_full_disk_costs_nothing_that_memory_holds(tmp_path: Path) -> None:
     assert (state.disk_free_bytes() or 0) > 0
     # The folder is let go of and taken up again before the disk has room: nothing is lost.
     state.close()
-    state.open(setup(), CalibratorOptions(state_dir=str(tmp_path)))
+    state.open(bag_setup(), CalibratorOptions(state_dir=str(tmp_path)))
     assert state.trouble == '' and state.status().images_saved == len(observations())
     state.close()
     state = started(tmp_path)
@@ -136,7 +136,7 @@ def test_an_image_that_comes_with_a_restart_is_added_to_those_on_disk(
     def long_add(*arguments: Any) -> Any:
         monkeypatch.undo()
         state.close()
-        state.open(setup(), CalibratorOptions(state_dir=str(tmp_path)))
+        state.open(bag_setup(), CalibratorOptions(state_dir=str(tmp_path)))
         return add(*arguments)
 
     monkeypatch.setattr(solving, 'add_to_ensemble', long_add)
@@ -151,9 +151,9 @@ def test_an_image_that_comes_with_a_restart_is_added_to_those_on_disk(
 
 def test_a_folder_of_another_camera_is_refused(tmp_path: Path) -> None:
     filled(observations()[:1], tmp_path / 'state').close()
-    prior = setup().prior
+    prior = bag_setup().prior
     wider = dataclasses.replace(prior, camera=dataclasses.replace(prior.camera, width=1280))
-    other = dataclasses.replace(setup(), prior=wider)
+    other = dataclasses.replace(bag_setup(), prior=wider)
     with pytest.raises(OptionError, match=f'state_dir: {tmp_path / "state"} is of a camera of'):
         started(tmp_path / 'state', other)
     started(tmp_path / 'state').close()  # it was let go of

@@ -105,7 +105,7 @@ def test_the_estimate_of_a_calibration_from_python_is_on_one_thread() -> None:
                 if room.endswith(('estimation', 'assessment'))
             )
 
-    records, prior = attacks.observations(), attacks.setup().prior
+    records, prior = attacks.observations(), attacks.bag_setup().prior
     sys.setprofile(look)
     try:
         calibration = starcal_ground.calibrate(records, prior)

@@ -9,7 +9,7 @@ import json
 import os
 from pathlib import Path
 
-from attacks import BAG, calibration, drawn, setup, spoilt_text  # type: ignore[import-not-found]
+from attacks import BAG, bag_setup, calibration, drawn, spoilt_text  # type: ignore[import-not-found]
 from hypothesis import given
 import numpy as np
 import pytest
@@ -62,11 +62,11 @@ def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60)
 
 
 def test_parameter_files(tmp_path: Path) -> None:
-    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup().options().items()}
+    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in bag_setup().options().items()}
     lines = [f'    {name}: {json.dumps(value)}' for name, value in flow.items()]
 
     def read(path: Path) -> None:
-        load_setup(read_parameter_file(path, NODES), setup().prior)
+        load_setup(read_parameter_file(path, NODES), bag_setup().prior)
 
     text = '\n'.join(['/**:', '  ros__parameters:', *lines])
     spoils(text, tmp_path / 'params.yaml', read)

@@ -35,38 +35,39 @@ KB97 = Path(__file__).parents[4] / 'shared/realsky/lco_kb97_observations'
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('source', ['noise', 'kb97'])
-def test_a_lens_that_cannot_be_estimated_loses_without_a_traceback(source: str) -> None:
-    """The trial ended at fx, fy below zero, where there is no camera."""
-    if source == 'kb97':
-        if not KB97.is_dir():
-            pytest.skip('lco_kb97_observations is not on this machine')
-        values = read_parameter_file(KB97 / 'params.yaml', NODES)
-        values |= {name: str(KB97 / str(values[name])) for name in ('camera_info_url', 'catalog')}
-        setup = load_setup(values)
-        ensemble = Ensemble()
-        for record in read_observations([KB97 / 'observations.mcap'], '/observations'):
-            ensemble = ensemble.add(record)
-        found, _ = estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)
-        camera = found.geometry.camera
-        assert camera.intrinsics[0] == pytest.approx(180540.9, rel=0.01)
-        # In half a degree the stars show no other coefficients: k4 was -7e14 in an equidistant.
-        assert camera.model == setup.prior.camera.model
-        return
+def test_a_lens_that_the_stars_do_not_show_loses_without_a_traceback() -> None:
+    if not KB97.is_dir():
+        pytest.skip('lco_kb97_observations is not on this machine')
+    values = read_parameter_file(KB97 / 'params.yaml', NODES)
+    values |= {name: str(KB97 / str(values[name])) for name in ('camera_info_url', 'catalog')}
+    setup = load_setup(values)
+    ensemble = Ensemble()
+    for record in read_observations([KB97 / 'observations.mcap'], '/observations'):
+        ensemble = ensemble.add(record)
+    found, _ = estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)
+    camera = found.geometry.camera
+    assert camera.intrinsics[0] == pytest.approx(180540.9, rel=0.01)
+    # In half a degree the stars show no other coefficients: k4 was -7e14 in an equidistant.
+    assert camera.model == setup.prior.camera.model
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_no_camera_fits_mirrored_noise(seed: int) -> None:
+    """The fit ends at fx or fy below zero, where there is no camera."""
     given = of_random_pointings(1, images=12)
-    ensemble, rng, middle = true_observations(given), np.random.default_rng(1), (648.0, 512.0)
+    rng, middle = np.random.default_rng(seed), (648.0, 512.0)
     images = []
-    for image in ensemble.images:
+    for image in true_observations(given).images:
         few = image.select(np.isin(np.arange(len(image)), rng.permutation(len(image))[:6]))
         noise = rng.normal(size=few.measured_px.shape) * 30.0
-        px = middle + (few.measured_px - middle) * 0.005 + noise
+        px = middle + (few.measured_px - middle) * (-0.02, 0.02) + noise
         images.append(dataclasses.replace(few, measured_px=px))
     options = CalibrationOptions(
         star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec,
         velocity_sigma_m_s=10.0,
         method='per_image',
     )
-    with pytest.raises(TooFewObservations, match='plumb_bob fit ends at fx, fy: -'):
+    with pytest.raises(TooFewObservations, match='fx'):
         estimate_calibration(Ensemble(tuple(images)), given.prior, options)
 
 
