@@ -25,7 +25,7 @@ from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.amplitudes import STARTS_PX, UNSTATED
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, STEP_SIGMA
+from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
@@ -33,7 +33,13 @@ from starcal_ros.estimation.options import (
     check_options,
 )
 from starcal_ros.estimation.outliers import dropped_stars
-from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
+from starcal_ros.estimation.posterior import (
+    is_settled,
+    Posterior,
+    posterior,
+    Weights,
+    with_shared_errors,
+)
 from starcal_ros.estimation.problem import (
     canonical_xyzw,
     image_parameters,
@@ -72,7 +78,6 @@ from starcal_ros.estimation.weights import (
     CentroidVariance,
     Data,
     degrees_of_freedom,
-    has_converged,
     judge,
     sky_rotations,
     tracker_attitudes,
@@ -248,21 +253,20 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     before_sigma: Floats = np.empty(0)
     for k in range(MOST_ROUNDS):
         last = _round(data, problem, state, judged, residual_px, shape_px, before, share)
+        iterations += 1
+        if before and is_settled(last.posterior, before.posterior):
+            termination = 'converged'
+            break
         after = judge(
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
         residual_px, before = last.residual_px, last
         shape_px = np.maximum(last.posterior.shapes.sigma_px, STARTS_PX[0])
-        iterations += 1
-        step_sigma = _step_sigma(last.posterior)
-        is_settled = np.abs(step_sigma).max(initial=0.0) < STEP_SIGMA
-        if is_settled and has_converged(judged, after, table):
-            termination = 'converged'
-            break
         if k < MOST_ROUNDS - 1:
             state, judged = last.after, after
         # Steps of unknowns that stars hardly show oscillate: the ratio of successive steps damps
         # them.
+        step_sigma = last.posterior.step_sigma
         if k:
             of_before = max(float(before_sigma @ before_sigma), 1e-300)
             rest = float(step_sigma @ before_sigma) / of_before
@@ -363,14 +367,6 @@ def _colours(table: StarTable, colours_of: Callable[[Indices], Floats] | None) -
     weight = known / (table.covariance_px2[:, 0] + table.covariance_px2[:, 2])
     colour = np.where(known, colour, 0.0)
     return known * (colour - np.average(colour, weights=weight)) if known.any() else None
-
-
-def _step_sigma(found: Posterior) -> Floats:
-    """Return the steps of the shared unknowns of the state, in their sigmas."""
-    in_state = found.layout.in_state
-    sigma = np.sqrt(np.diag(found.covariance)[in_state])
-    steps = np.divide(found.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
-    return np.asarray(steps)
 
 
 def _check_not_mirrored(state: State) -> None:

@@ -44,7 +44,7 @@ from starcal_ros.estimation.equations import (
     weighted_rows_by,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE
+from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE, STEP_SIGMA
 from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
 from starcal_ros.estimation.tracker_errors import TrackerErrors
@@ -113,6 +113,14 @@ class Posterior:
     log_evidence: float
     layout: Layout
     errors: ErrorParts | None = None
+
+    @property
+    def step_sigma(self) -> Floats:
+        """Steps of the shared unknowns of the state, in their sigmas; zero if they are held."""
+        in_state = self.layout.in_state
+        sigma = np.sqrt(np.diag(self.covariance)[in_state])
+        steps = np.divide(self.mean[in_state], sigma, out=np.zeros_like(sigma), where=sigma > 0)
+        return np.asarray(steps)
 
     @functools.cached_property
     def covariance(self) -> Floats:
@@ -375,6 +383,23 @@ class Weights:
     from_sky: Floats
     errors: tuple[SharedError, ...]
     trackers: tuple[TrackerErrors, ...]
+
+
+def is_settled(found: Posterior, before: Posterior) -> bool:
+    """
+    Return True if new weights moved neither the unknowns nor their covariance.
+
+    The weights themselves need not settle: a star at the limit of outliers may come and go for
+    ever, and the variance of what no star shows may creep to zero.
+    """
+    if np.abs(found.step_sigma).max(initial=0.0) >= STEP_SIGMA:
+        return False
+    now, then = (
+        np.append(np.diag(C)[one.layout.in_state], np.trace(C[np.ix_(field, field)]))
+        for one in (found, before)
+        for C, field in [(one.covariance, one.layout.field_at)]
+    )
+    return bool(np.allclose(now, then, rtol=NEGLIGIBLE, atol=0.0))
 
 
 def with_shared_errors(

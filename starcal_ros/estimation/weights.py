@@ -44,7 +44,6 @@ from starcal_ros.estimation.problem import (
 )
 from starcal_ros.estimation.shared_errors import (
     Groups,
-    pixel_variance_px2,
     shared_errors,
     SharedError,
     star_shares_px2,
@@ -462,33 +461,3 @@ def judge(
             residual_px, own_px2, kept, data.groups, from_sky, found.last_octave
         )
     return Weighting(variance, errors, kept, attitudes)
-
-
-def has_converged(one: Weighting, other: Weighting, table: StarTable) -> bool:
-    """Return True if both lead to the same estimate."""
-    if one.attitudes is None or other.attitudes is None:
-        return False
-    return (
-        np.array_equal(one.kept, other.kept)
-        and np.array_equal(one.attitudes.misfit, other.attitudes.misfit)
-        # A change of 2 % in the variances moves no estimate.  RMS, not maximum: near a zero floor
-        # the variance of one bright star keeps drifting without effect, as that of places does
-        # where hardly a star is seen twice.
-        and _change(one.working_px2(table), other.working_px2(table)) < 0.02
-        and math.isclose(
-            pixel_variance_px2(one.errors),
-            pixel_variance_px2(other.errors),
-            rel_tol=0.1,
-            abs_tol=1e-7,
-        )
-        and len(one.attitudes.trackers) == len(other.attitudes.trackers)
-        and all(
-            math.isclose(a.working, b.working, rel_tol=0.05)
-            for a, b in zip(one.attitudes.trackers, other.attitudes.trackers, strict=True)
-        )
-    )
-
-
-def _change(before: Floats, after: Floats) -> float:
-    """Return the RMS of the relative change of variances uu, vv of covariances (n, 3)."""
-    return float(np.sqrt(np.mean((after[:, ::2] / before[:, ::2] - 1.0) ** 2)))

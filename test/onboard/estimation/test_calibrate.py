@@ -21,17 +21,14 @@ from starcal_ground.simulation.centroids import (
     true_observations,
 )
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation import calibrate, weights
+from starcal_ros.estimation import calibrate
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
+from starcal_ros.estimation.posterior import is_settled
 from starcal_ros.estimation.problem import METHODS
-from starcal_ros.estimation.shared_errors import SharedError
-from starcal_ros.estimation.star_equations import star_table
-from starcal_ros.estimation.tracker_errors import Attitudes
-from starcal_ros.estimation.weights import CentroidVariance
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from studies import worlds
 
@@ -346,23 +343,13 @@ def test_stars_in_one_spot_leave_an_honest_uncertainty(method: str) -> None:
     assert np.abs(errors_of(found, TRUTH)[FREE] / sigma[FREE]).max() < 5
 
 
-def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
-    """Places of stars that are seen once: their variance creeps to zero for twenty rounds."""
-    table = star_table(clean().images)
-    kept = np.ones(len(table), bool)
-    seen: Mask = np.ones(table.image_count, bool)
-    none = np.zeros((table.image_count, 3))
-    attitudes = Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, ())
-
-    def judged(variance_px2: float, stars: Indices) -> weights.Weighting:
-        share_px2 = np.full(len(stars), variance_px2)
-        error = SharedError('star places', stars, share_px2, 0.0, True, 1.0)
-        return weights.Weighting(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
-
-    once = dataclasses.replace(table, star=np.arange(len(table)))
-    assert weights.has_converged(judged(4e-6, once.star), judged(2e-6, once.star), once)
-    often = dataclasses.replace(table, star=np.zeros(len(table), np.int64))
-    assert not weights.has_converged(judged(4e-6, often.star), judged(2e-6, often.star), often)
+def test_an_estimate_is_settled_where_neither_unknowns_nor_sigmas_move() -> None:
+    found = estimate_calibration(with_noise(clean(), 1, TRACKER_ARCSEC), PRIOR, EIGHT).posterior
+    sigma = np.sqrt(np.diag(found.covariance))
+    still = dataclasses.replace(found, mean=0.01 * sigma)
+    assert is_settled(still, found)
+    assert not is_settled(dataclasses.replace(found, mean=0.1 * sigma), found)
+    assert not is_settled(dataclasses.replace(still, working=1.1 * found.working), found)
 
 
 class EnoughRounds(Exception):
