@@ -63,80 +63,6 @@ def test_a_command_line_imports_its_command_alone() -> None:
     assert 'numpy' not in done.stdout.split()
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (['fly'], ["'fly'"]),
-        (['calibrat'], ["'calibrat'", 'calibrate']),
-        (['diagnose', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'diagnose --help']),
-        (['diagnose', 'none.mcap'], ['none.mcap', 'no such file or folder']),
-        (['diagnose', ''], ['empty path']),
-        (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
-        (
-            ['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'],
-            ['larger than'],
-        ),
-        (
-            ['calibrate', str(TINY.parent), '--params', str(TINY / 'params.yaml'), '-o', 'x'],
-            ['did you mean', str(TINY)],
-        ),
-        (['compare', 'none'], ['B']),
-        (['compare', 'none', 'none'], ['none', 'No such file']),
-        (['compare', str(TINY), str(TINY)], [str(TINY), 'no calibration.json']),
-        (['compare', *2 * [str(TINY / 'truth.json')]], ['truth.json', 'not a calibration']),
-        (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
-        (['import', '--channel', 'grene'], ["'grene'", 'green']),
-        (['calibrate'], ['BAG']),
-        (['simulate', '-o', 'x'], ['--scenario']),
-        (['simulate', '-o', 'x', '--scenario', 'huge'], ["'huge'", 'tiny', 'small', 'paper']),
-        (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', '-1'], ['--seed', '-1']),
-        (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', 'one'], ['--seed', 'one']),
-        (
-            ['simulate', '-o', 'x', '--scenario', 'tiny', '--clock-error', '-0.5'],
-            ['--clock-error: -0.5 s changes no result'],
-        ),
-        (['play'], ['BAG']),
-        (['play', 'none.mcap'], ['none.mcap', 'no such file or folder']),
-        (['play', 'a.mcap', '--observer=ground'], ['--observer=ground (see starcal play --help)']),
-        (['play', str(TINY), '--rate', 'fast'], ['--rate', 'fast']),
-        (['calibrate', 'a', '-o', 'x', '--from', 'noon'], ['--from', 'is not a time: give 2026']),
-        (['play', str(TINY), '--rate', '-1'], ['--rate', '-1']),
-        (['play', str(TINY), '--rate', 'nan'], ['--rate', 'nan']),
-        (['play', str(TINY), '--remap', 'image'], ['--remap', "'image'"]),
-        (['monitor'], ['--once', 'not a terminal']),
-        (['monitor', '--once', 'nan'], ['--once', 'nan']),
-    ],
-)
-def test_bad_arguments(
-    starcal: Starcal,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    words: list[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert_refused(starcal(*arguments), *words)
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ('text', 'words'),
-    [
-        ('camera_info_url: a.yaml\n', ['write /**: and ros__parameters: above']),
-        ('ros__parameters: {camera_info_url: a.yaml}\n', ['write /**: above']),
-        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
-        ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
-        ('/**:\n  ros__parameters: {min_images: few}\n', ['min_images', 'bad.yaml']),
-    ],
-)
-def test_bad_parameter_files(
-    starcal: Starcal, tmp_path: Path, text: str, words: list[str]
-) -> None:
-    file = tmp_path / 'bad.yaml'
-    file.write_text(text)
-    assert_refused(starcal('calibrate', TINY, '--params', file, '-o', tmp_path / 'out'), *words)
-
-
 @pytest.fixture(scope='module')
 def lookup_columns() -> list[str]:
     """Columns of a table of lines of sight, as the interface document has them."""
@@ -167,38 +93,6 @@ def test_lookup_writes_the_columns_of_the_interface_document(
         assert list(archive.files) == lookup_columns
         assert sorted(set(archive['u_px'])) == [0, 319.5, 639]
         assert sorted(set(archive['v_px'])) == [0, 255.5, 511]
-
-
-@pytest.mark.parametrize(
-    ('file', 'options', 'words'),
-    [
-        ('a.csv', ('--points', '1'), ['--points', '1 is not within 2 to 2000']),
-        ('a', (), ['.csv', '.npz']),
-        ('none/a.csv', (), ['none', 'cannot be written']),
-    ],
-)
-def test_bad_lookups(
-    starcal: Starcal,
-    tmp_path: Path,
-    tiny_products: Path,
-    file: str,
-    options: tuple[str, ...],
-    words: list[str],
-) -> None:
-    assert_refused(starcal('lookup', tiny_products, '-o', tmp_path / file, *options), *words)
-    assert not (tmp_path / file).exists()
-    assert_refused(starcal('lookup', tmp_path, '-o', tmp_path / 'a.csv'), 'no calibration.json')
-
-
-def test_outputs_that_cannot_be_written(starcal: Starcal, tmp_path: Path) -> None:
-    file = tmp_path / 'file'
-    file.write_text('in the way')
-    assert_refused(
-        starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', file), str(file)
-    )
-    result = starcal('simulate', '--scenario', 'tiny', '-o', file / 'bag')
-    assert_refused(result, str(file))
-    assert file.read_text() == 'in the way'
 
 
 BLANK = np.full((512, 640), 33, np.uint16)

@@ -6,20 +6,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import re
-import shutil
 
-from mission_files import attitudes, frames_of, images, TINY, write_encoded, write_pngs, write_tiny  # type: ignore[import-not-found]
+from mission_files import attitudes, frames_of, images, TINY, write_pngs, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
-from starcal_ground.bag_writer import BagWriter
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 
 TRUTH = json.loads((TINY / 'truth.json').read_text())
-IMAGES = '/opnav/image_raw'
 ATTITUDES = '/star_tracker/attitude'
 ALIGNMENT_DEG = 0.1  # noise of the star tracker in the bag: 0.011; a prior must be within 1.5
 COLUMNS = 80
@@ -161,79 +158,3 @@ def test_a_requirement_is_answered_for_people_and_programs(
     assert re.match(words, check['note']) and check['found'] < 0.07
     (reason,) = answer['reasons']
     assert reason.endswith(f'over the limit of 0.055 px (requirements); {check["note"]}')
-
-
-STATED = f'--params {TINY}/params.yaml -o out'
-WRONG = [
-    ('calibrate {bag}', ['-o/--output DIR: not given', 'e.g. -o out']),
-    ('calibrate {bag} --params camera.yaml -o out',
-     ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
-    ('calibrate {bag} -o out --set camera_info_url=none.yaml',
-     ['--set camera_info_url: none.yaml: no such file']),
-    ('calibrate {bag} -o out --set observer=grond', ['--set observer', 'did you mean ground?']),
-    ('calibrate {bag} -o out --set obsrver=ground', ['--set obsrver', 'did you mean observer?']),
-    ('calibrate {bag} -o out --set observer', ['--set', 'not of the form NAME=VALUE']),
-    ('calibrate {bag} -o out --require line=5arcsec', ['requirements: line is not']),
-    ('calibrate {bag} -o out --require map=5', ['unit', 'write map=5arcsec or map=5px']),
-    ('calibrate {bag} -o out --require map=5px@150%', ['the share at most 100 %']),
-    ('calibrate {bag} -o out --observer ground',
-     ['did you mean --set observer=VALUE?', 'starcal calibrate --help']),
-    ('calibrate {bag} -o out --set camera_info_url=params.yaml',
-     ['params.yaml: a parameter file, not a camera file: give it as --params']),
-    ('calibrate night {bag} -o out', [': a bag, and the other paths hold images']),
-    ('calibrate nothing -o out', ['nothing: no .mcap files in the folder, nor images']),
-    ('calibrate nothing/notes.txt -o out', ['notes.txt: not an MCAP bag, nor images']),
-    ('plan nothing', ['nothing: no .mcap files in the folder, nor images']),
-    ('plan night --set star_tracker_slow_arcsec=5', ['--camera-alone']),
-    ('calibrate {bag} -o out --focal-length-mm 50', ['--pixel-size-um: bags need both']),
-    ('calibrate {bag} {stated} --focal-length-mm 50', ['a camera_info_url has them already']),
-    ('calibrate {bag} -o out --json --quiet', ['--quiet: not allowed with argument --json']),
-    ('calibrate night -o out --set star_tracker_slow_arcsec=5',
-     ['star_tracker_slow_arcsec: stated, but image files have no attitudes', '--camera-alone']),
-    ('diagnose night --set star_tracker_slow_arcsec=5', ['--camera-alone']),
-    ('calibrate night.mcap -o out --set star_tracker_slow_arcsec=5', ['--camera-alone']),
-    ('calibrate observations.mcap -o out', ['shows no camera: give the parameter file']),
-    ('calibrate colour.mcap -o out', ['set image_channel, e.g. to green']),
-    ('calibrate colour.mcap {stated}', ['set image_channel, e.g. to green']),
-    ('calibrate {bag} -o out --jsn', ['unrecognized arguments: --jsn', 'calibrate --help']),
-    ('import --images night/0.png --attitude none.csv -o bag --camera none.yaml', ['none.yaml']),
-]  # fmt: skip
-
-
-@pytest.fixture(scope='module')
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the inputs of the table."""
-    folder = tmp_path_factory.mktemp('inputs')
-    for name in ('params.yaml', 'camera.yaml'):
-        shutil.copy(TINY / name, folder)
-    write_pngs(folder / 'night', frames_of(3))
-    (folder / 'nothing').mkdir()
-    (folder / 'nothing' / 'notes.txt').write_text('notes')
-    with BagWriter(folder / 'night.mcap') as writer:
-        for image in images()[:3]:
-            writer.write_image(IMAGES, image, 'camera')
-    with BagWriter(folder / 'colour.mcap') as writer:
-        for image in images()[:3]:
-            colour = np.repeat((image.pixels >> 4).astype(np.uint8).reshape(-1), 3)
-            write_encoded(writer, IMAGES, image, 'rgb8', colour)
-            writer.write_attitude(ATTITUDES, image.time_ns, np.array([0, 0, 0, 1.0]), 'icrf')
-    with BagWriter(folder / 'observations.mcap') as writer:
-        from starcal_ros.records import refused_image
-
-        writer.write_observations('/observations', refused_image(1, 8, 8, 'blank', ''), 'camera')
-    return folder
-
-
-@pytest.mark.parametrize(('line', 'words'), WRONG, ids=[line for line, _ in WRONG])
-def test_a_wrong_input_ends_in_one_line(
-    line: str,
-    words: list[str],
-    inputs: Path,
-    starcal: Starcal,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(inputs)
-    answer = starcal(*line.format(bag=TINY, stated=STATED).split())
-    assert_refused(answer, *words)
-    assert not answer.out
-    assert answer.err.lower().count('one channel') == 0  # no second remedy for colour

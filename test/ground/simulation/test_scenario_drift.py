@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from datetime import datetime, timezone
 import json
 from pathlib import Path
@@ -66,20 +65,3 @@ def test_a_trend_finds_the_drift_of_simulated_bags(
     ):
         off = (abs(found[name].size) - per_year) / found[name].sigma
         assert abs(off) < 4.0  # one in 16,000 good ones is beyond
-
-
-@pytest.mark.parametrize(
-    ('given', 'words'),
-    [
-        (['--focal-drift', '100'], '--focal-drift, --alignment-drift: need --date'),
-        (['--date', '1905-05-15'], '--date: not within 1990 to 2037'),
-        (['--date', 'soon'], "'soon' is not a time"),
-    ],
-)
-def test_a_date_without_meaning_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: list[str], words: str
-) -> None:
-    command = ['simulate', '-o', str(tmp_path / 'bag'), '--scenario', 'tiny']
-    with contextlib.suppress(SystemExit):  # of argparse
-        assert main([*command, *given]) == 2
-    assert words in capsys.readouterr().err

@@ -167,24 +167,3 @@ def test_the_remedy_is_named_without_parameters(tmp_path: Path, starcal: Starcal
     status, out, _ = starcal('diagnose', path)
     assert status == 3
     assert 'is not a PNG or JPEG' in out.partition('Cannot be calibrated')[2]
-
-
-@pytest.mark.parametrize('start', ['2030-01-01T00:00:00', '+5000'])
-def test_no_image_is_chosen(start: str, tmp_path: Path, starcal: Starcal) -> None:
-    command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '--from', start]
-    span = '2026-05-15 07:20:00.000 UTC to 2026-05-15 07:20:36.000 UTC, +0 to +36 s'
-    assert_refused(starcal(*command, '-o', tmp_path / 'out'), span)
-
-
-def test_a_folder_of_image_files_is_imported(tmp_path: Path, starcal: Starcal) -> None:
-    night = tmp_path / 'night'
-    night.mkdir()
-    (night / '001.fits').write_bytes(b'SIMPLE  =                    T')
-    for command in (['calibrate', '-o', tmp_path / 'out'], ['diagnose']):
-        for path in (night, night / '001.fits'):
-            # What is stated of a star tracker has to be there.
-            stated = starcal(*command, path, '--params', TINY / 'params.yaml')
-            assert_refused(stated, 'a bag that has them (starcal import)')
-            # By the stars alone: a file that is none is named.
-            alone = starcal(*command, path)
-            assert_refused(alone, 'no image can be read; left out: 1 file (001.fits): not')

@@ -157,29 +157,6 @@ def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, run: 
     )
 
 
-@pytest.mark.parametrize(
-    ('line', 'found'),
-    [
-        ('{night}/*.nothing', 'no file matches'),
-        ('{night}/0.fits --attitude {night}/none.aem', 'cannot be read'),
-        ('{night}/0.fits --attitude {aem} {night}/0.fits', 'one file, unless all are SPICE'),
-        ('{night}/0.fits --camera {aem}', 'a.aem'),
-        ('{night}/0.fits --star-tracker ST7', 'choose one with'),
-        ('{night}/0.fits --value-range 5 1', 'is empty'),
-        (
-            '{night}/0.fits --camera {camera} --more-star-trackers ST-2',
-            '--alignment: 0 numbers, 8 are needed: x y z w for each star tracker; only that of a ',
-        ),
-    ],
-)
-def test_bad_input_is_one_line(
-    night: Path, tmp_path: Path, run: Starcal, line: str, found: str
-) -> None:
-    aem = write_aem(tmp_path / 'a.aem')
-    given = line.format(night=night, aem=aem, camera=TINY / 'camera.yaml').split()
-    assert_refused(run(aem, Path(given[0]), more=given[1:]), found)
-
-
 def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
     night: Path, tmp_path: Path, run: Starcal
 ) -> None:

@@ -155,18 +155,6 @@ def test_a_number_that_no_page_can_show_is_left_out(mission: Path, trend: Trend)
     assert '<b>fx</b>Not tested' not in (mission.parent / 'out/trend.html').read_text()
 
 
-@pytest.mark.parametrize(
-    ('line', 'words'),
-    [
-        ('trend {t}/none -o {t}/out', 'no such folder'),
-        ('trend {t} -o {t}/out', 'no calibration.json below it'),
-        ('trend nowhere://fleet -o {t}', 'nowhere'),
-    ],
-)
-def test_bad_input_is_one_line(tmp_path, starcal: Starcal, line: str, words: str) -> None:
-    assert_refused(starcal(*line.format(t=tmp_path).split()), words)
-
-
 @pytest.mark.slow
 def test_a_bag_that_kills_its_worker_costs_itself(mission: Path, monkeypatch) -> None:
     poison = [Task(f'poison {k}', f'poison {k}') for k in range(2)]
