@@ -123,7 +123,8 @@ def test_recorded_observations_give_the_same_calibration(
 
 
 def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
-    params = params_with(tmp_path, max_change_px=1e-6)
+    of_nodes = {'autostart': True, 'attitude_timeout_s': 2.0, 'use_sim_time': True}
+    params = params_with(tmp_path, max_change_px=1e-6, **of_nodes)
     done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
     assert done.returncode == 3
     assert done.stderr == ''

@@ -42,27 +42,6 @@ def test_version(starcal: Starcal) -> None:
     assert starcal('--version') == (0, f'starcal {software_version()}\n', '')
 
 
-def test_help_is_there_at_once() -> None:
-    done = subprocess.run(
-        [sys.executable, '-X', 'importtime', '-m', 'starcal_ground.cli.main', '--help'],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    for command in ('demo', 'diagnose', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
-        assert command in done.stdout
-    # Half a second of imports would be felt at each press of the tab key.
-    numbers = ('numpy', 'scipy', 'cv2', 'mcap', 'rosbags')
-    for heavy in (*numbers, 'rclpy', 'rich', 'argcomplete'):
-        assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
-
-
-def test_a_command_line_imports_its_command_alone() -> None:
-    show = 'import sys; from starcal_ground.cli.main import parser; parser(["lookup", "plan"])'
-    show += '; print(*sys.modules)'
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
-    assert re.findall(r'starcal_ground\.cli\.commands\.(\w+)', done.stdout) == ['lookup']
-    assert 'numpy' not in done.stdout.split()
-
-
 @pytest.fixture(scope='module')
 def lookup_columns() -> list[str]:
     """Columns of a table of lines of sight, as the interface document has them."""
@@ -253,15 +232,6 @@ def test_no_report_is_written_where_none_is_wanted(
     assert status == 0 and f'\nproducts written to {tmp_path}\n' in out
     assert (tmp_path / 'calibration.json').is_file()
     assert not (tmp_path / 'report.html').exists()
-
-
-@pytest.mark.slow
-def test_parameters_of_the_nodes_are_known_to_the_tool(starcal: Starcal, tmp_path: Path) -> None:
-    shared = params_with(
-        tmp_path, autostart=True, attitude_timeout_s=2.0, use_sim_time=True, max_change_px=1e-6
-    )
-    status, _, err = starcal('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
-    assert (status, err) == (3, '')
 
 
 def test_demo_takes_the_bag_of_the_repository(tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ from pathlib import Path
 import resource
 import shutil
 
-from attacks import BAG, write_product_folder  # type: ignore[import-not-found]
-from mission_files import write_frames, write_lsk, write_sclk  # type: ignore[import-not-found]
 import pytest
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
@@ -81,18 +79,6 @@ PLACES = {
 }
 """Where the file is, if the command does not name it; in `MAY_LACK` it may be missing."""
 MAY_LACK = ('file of a bag', 'residuals.npz', 'observations.mcap', '--params of trend')
-
-
-@pytest.fixture(scope='module')
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag, a product folder, a frame to import, and kernels."""
-    folder = tmp_path_factory.mktemp('campaign')
-    shutil.copytree(BAG, folder / 'bag')
-    write_product_folder(folder / 'out')
-    write_frames(folder / 'frames')
-    write_lsk(folder / 'naif.tls')
-    write_sclk(folder / 'clock.tsc')
-    return folder
 
 
 @pytest.mark.parametrize('kind', KINDS)

@@ -142,15 +142,3 @@ def test_the_summary_is_a_line() -> None:
     assert verdict.thermal_summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'
     both = TemperatureTerms(20.0, (4e-5, 2e-6), (1e-6, 1e-7))
     assert '; a2 +0.00000200 (0.0000001) /degC^2;' in verdict.thermal_summary(both)
-
-
-def test_only_parts_that_matter_are_printed() -> None:
-    budget_of = [
-        SigmaPart('total', 1.0, 10.0, ''),
-        SigmaPart('stars', 0.2, 0.1, 'a'),
-        SigmaPart('velocity', 0.6, 0.1, 'b'),
-        SigmaPart('star tracker noise', 0.0, 9.9, 'c'),
-    ]
-    found = [part.cause for part in verdict.parts_that_matter(budget_of)]
-    assert found == ['total', 'star tracker noise', 'velocity']
-    assert verdict.parts_that_matter([]) == []

@@ -84,10 +84,8 @@ def broken(*_: object) -> None:
 @pytest.mark.parametrize(
     ('place', 'missing'),
     [
-        ('starcal_ground.report.page._context', 'report'),
         ('starcal_ground.report.page.page_template', 'report'),
         ('starcal_ground.report.thumbnails.annotate_reduced', 'pictures of images'),
-        ('starcal_ground.report.thumbnails._reduced', 'pictures of images'),
     ],
 )
 def test_a_drawing_that_fails_costs_the_drawing_only(
@@ -166,7 +164,7 @@ def test_a_part_of_a_bag(tmp_path: Path, starcal: Starcal) -> None:
 def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[str]) -> None:
     budget = (
         *calibration().sigma_budget,
-        SigmaPart('stamps', 0.01, 0.02, '5 ms assumed'),
+        SigmaPart('stamps', 0.14, 0.02, '5 ms assumed'),  # a fifth of all
         SigmaPart('star tracker noise', 0.0, 12.0, 'estimated: 20, 20, 20″ about x, y, z'),
     )
     record = dataclasses.replace(calibration(), sigma_budget=budget)
@@ -178,13 +176,7 @@ def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[
     ]  # fmt: skip
     assert lines[first + 3].split() == ['velocity', '0.6″', '0.75″']
     assert 'stamps' not in '\n'.join(lines) and max(map(len, lines)) <= 80
-
-
-def test_a_calibration_without_a_budget_has_no_table_of_it(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    record = dataclasses.replace(calibration(), sigma_budget=())
-    print_calibration(record, record.geometry)
+    print_calibration(dataclasses.replace(record, sigma_budget=()), record.geometry)
     assert '1-sigma of lines' not in capsys.readouterr().out
 
 

@@ -42,16 +42,8 @@ SAME_DIRECTION = 1e-12
 # A direction to 1e-12 is 4e-9 px at a focal length of 3600 px; Newton and field end below it.
 SAME_PX = 1e-8
 REFERENCE_DEGC = 20.0  # of `calibration(temperature=True)`
-OUTSIDE, BAD_ARGUMENT, NO_IMAGE, NOT_A_TABLE, OTHER_VERSION, TRUNCATED, DAMAGED, TOO_LARGE = (
-    1,
-    2,
-    3,
-    5,
-    6,
-    7,
-    8,
-    9,
-)
+OUTSIDE, BAD_ARGUMENT, NO_IMAGE = range(1, 4)
+NOT_A_TABLE, OTHER_VERSION, TRUNCATED, DAMAGED, TOO_LARGE = range(5, 10)
 
 COMPILERS = [
     (name, standard)
