@@ -116,10 +116,7 @@ def numbers_of(calibration: Calibration) -> Mapping[str, Any]:
 
 @pytest.mark.parametrize('entrance', [by_python, by_trend, by_plan])
 def test_all_entrances_give_one_calibration(
-    bag: Path,
-    expected: Calibration,
-    entrance: Callable[..., Mapping[str, Any]],
-    starcal: Starcal,
+    bag: Path, expected: Calibration, entrance: Callable[..., Mapping[str, Any]], starcal: Starcal
 ) -> None:
     given = (bag, starcal) if entrance is by_plan else (bag,)
     for name, number in entrance(*given).items():

@@ -45,13 +45,8 @@ def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str
     [
         ['--version'],
         # The lens is stated, so that the search for the camera, whose modules count too, is short.
-        [
-            *('diagnose', 'BAG'),
-            *('--focal-length-mm', '18', '--pixel-size-um', '10'),
-        ],
-        [
-            *('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml'),
-        ],
+        [*('diagnose', 'BAG'), *('--focal-length-mm', '18', '--pixel-size-um', '10')],
+        [*('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml')],
     ],
     ids=['version', 'diagnose', 'trend'],
 )

@@ -105,8 +105,4 @@ def test_a_match_that_is_right_in_a_part_of_the_image_is_refused() -> None:
     off_deg = np.degrees((right.inv() * Rotation.from_quat(attitudes)).magnitude())
     shot = Exposure(image, attitudes[int(np.abs(off_deg - 2.13).argmin())], 0.0)
     with pytest.raises(ImageRefused, match='part of the image'):
-        observe_stars(
-            shot,
-            scenario.prior,
-            StarSearch(load_catalog(None, 9.0)),
-        )
+        observe_stars(shot, scenario.prior, StarSearch(load_catalog(None, 9.0)))

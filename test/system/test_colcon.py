@@ -32,10 +32,7 @@ TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README
 INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_STOPS_WITHIN_S = 240.0
 
-pytestmark = [
-    pytest.mark.packaging,
-    pytest.mark.slow,
-]
+pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
 # The messages in use, not only the Python files that wrap them, must be those of the workspace.
 ORIGINS = """

@@ -29,11 +29,7 @@ from geometry_msgs.msg import PointStamped, Vector3Stamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-pytestmark = [
-    pytest.mark.nodes,
-    pytest.mark.packaging,
-    pytest.mark.slow,
-]
+pytestmark = [pytest.mark.nodes, pytest.mark.packaging, pytest.mark.slow]
 EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'pointing_node'
 # A unit vector in double precision; the table is that of the Python package.
 SAME_DIRECTION = 1e-12

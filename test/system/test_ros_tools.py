@@ -218,8 +218,7 @@ def test_two_cameras_with_one_frame_are_named(
 def test_lifecycle_and_parameters(ros2: RosTools, tiny_bag: Path, tmp_path: Path) -> None:
     """Each transition by its name; services answer while inactive; a dump can be read again."""
     node = ros2.start_node(
-        *('calibrator', '--params-file', tiny_bag / 'params.yaml'),
-        *('-p', 'autostart:=false'),
+        *('calibrator', '--params-file', tiny_bag / 'params.yaml'), *('-p', 'autostart:=false')
     )
     ros2.until('unconfigured', 'lifecycle', 'get', '/calibrator')
     for transition, state in (

@@ -227,10 +227,7 @@ def params(folder: Path, **options: object) -> Path:
     return path
 
 
-STATED = {
-    'prior_alignment': [0.0, 0.0, 0.0, 1.0],
-    'star_tracker_sigma_arcsec': [10.0, 10.0, 20.0],
-}
+STATED = {'prior_alignment': [0.0, 0.0, 0.0, 1.0], 'star_tracker_sigma_arcsec': [10.0, 10.0, 20.0]}
 
 
 @pytest.mark.parametrize('stated', STATED)
@@ -256,12 +253,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
 
 @pytest.mark.parametrize(
     ('kind', 'options'),
-    [
-        ('', []),
-        (ODOMETRY, []),
-        ('', ['PARAMS']),
-        (TF, ['PARAMS', '--camera-alone']),
-    ],
+    [('', []), (ODOMETRY, []), ('', ['PARAMS']), (TF, ['PARAMS', '--camera-alone'])],
 )
 @pytest.mark.slow
 def test_diagnose_takes_images_without_attitudes_where_calibrate_does(

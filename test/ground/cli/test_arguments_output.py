@@ -173,9 +173,7 @@ WRITING: dict[str, str] = {
     f'export HERE/out --to ck --spacecraft-id -999 -o HERE/o {_CK}': 'camera.bc',
 }
 """Commands that write, and the files that they write in ``o/``."""
-WITH_NODES = {
-    'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json',
-}
+WITH_NODES = {'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json'}
 
 
 def _foreign(path: Path) -> None:

@@ -86,11 +86,7 @@ def slewing_night() -> Night:
     stamps_ns = START_NS + np.rint(reported_s * 1e9).astype(np.int64)
     sent = (path(reported_s) * camera_from_tracker).as_quat()
     prior = scenario.prior
-    return Night(
-        tuple(rendering.images(scenario)),
-        WireAttitudes(stamps_ns, sent),
-        set_up(prior),
-    )
+    return Night(tuple(rendering.images(scenario)), WireAttitudes(stamps_ns, sent), set_up(prior))
 
 
 @functools.cache
@@ -477,11 +473,7 @@ def at_rest(count: int) -> Night:
     stamps_ns = np.array([sample.time_ns for sample in samples])
     sent = np.array([sample.icrf_from_star_tracker_xyzw for sample in samples])
     prior = scenario.prior
-    return Night(
-        tuple(rendering.images(scenario)),
-        WireAttitudes(stamps_ns, sent),
-        set_up(prior),
-    )
+    return Night(tuple(rendering.images(scenario)), WireAttitudes(stamps_ns, sent), set_up(prior))
 
 
 @pytest.mark.parametrize('count', [1, 4])
@@ -558,17 +550,9 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
             ['principal_point'],
             'a camera matrix of the whole detector with the size of a region looks so',
         ),
-        (
-            [region(0.25, 0.95, 0.1, 0.8)],
-            ['wrong_size'],
-            'a region of the detector (roi of',
-        ),
+        ([region(0.25, 0.95, 0.1, 0.8)], ['wrong_size'], 'a region of the detector (roi of'),
         # Half as wide and high, but no bins: the stars tell.
-        (
-            [region(0.4, 0.9, 0.1, 0.6)],
-            ['wrong_size'],
-            'a region of the detector (roi of',
-        ),
+        ([region(0.4, 0.9, 0.1, 0.6)], ['wrong_size'], 'a region of the detector (roi of'),
         ([binned], ['wrong_size'], 'binned 2 x 2 (binning_x, binning_y of CameraInfo)'),
         ([binned, with_size], ['focal_length'], 'is of pixels before 2 x 2 binning'),
         ([binned, off(40)], ['wrong_size', 'prior_alignment'], 'prior_alignment points'),

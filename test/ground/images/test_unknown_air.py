@@ -290,10 +290,7 @@ def test_derivatives_of_refraction_are_those_of_differences() -> None:
     e /= np.linalg.norm(e, axis=1, keepdims=True)
     image, axes = np.ones(50, np.int64), np.tile(np.eye(3), (2, 1, 1))
     turns = air.by_site(axes, np.empty((2, 50)), e.T, image)
-    for row, other in (
-        (0, zenith_of(0.7 + 1e-3, times)),
-        (2, zenith_of(0.7, times + 1e-3)),
-    ):
+    for row, other in ((0, zenith_of(0.7 + 1e-3, times)), (2, zenith_of(0.7, times + 1e-3))):
         before = refracted(e, zenith[1], 54.0)
         moved = (refracted(e, other[1], 54.0) - before) / 1e-3
         by_turn = -np.cross(turns[:, row].T, e)

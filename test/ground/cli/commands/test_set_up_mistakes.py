@@ -110,11 +110,7 @@ def said(
     ],
 )  # fmt: skip
 def test_a_mistake_of_the_bag(
-    write: Write,
-    shift_s: float | None,
-    words: list[str],
-    tmp_path: Path,
-    starcal: Starcal,
+    write: Write, shift_s: float | None, words: list[str], tmp_path: Path, starcal: Starcal
 ) -> None:
     path = bag(tmp_path / 'bag.mcap', write, shift_s)
     for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():

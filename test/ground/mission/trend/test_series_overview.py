@@ -66,9 +66,7 @@ def found_in(page: str) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_300_cameras_take_5_kilobytes_each_the_largest_change_first(
-    tmp_path: Path,
-) -> None:
+def test_300_cameras_take_5_kilobytes_each_the_largest_change_first(tmp_path: Path) -> None:
     rng = np.random.default_rng(31)
     truths = {f'sat{k:04d}': simulated_truth(rng) for k in range(300)}
     fleet = (simulated_rows(name, months(truth), rng) for name, truth in truths.items())
