@@ -158,15 +158,6 @@ def test_metadata_for_rosbag2(folder: Path) -> None:
     assert information['relative_file_paths'] == ['six_0.mcap']
 
 
-def test_several_topics_of_a_type(tmp_path: Path) -> None:
-    """Two topics of a type need an explicit choice."""
-    with BagWriter(tmp_path / 'two') as writer:
-        for topic in ('/b', '/a'):
-            writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
-    with pytest.raises(BagError, match='several topics of type .*: /a, /b'):
-        bag_reader.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
-
-
 @pytest.mark.parametrize(('content', 'kind'), [(b'', 'truncated'), (bytes(4096), 'damaged')])
 def test_split_bag_is_read_in_order(tmp_path: Path, content: bytes, kind: str) -> None:
     """Files of a split bag are read in recording order: 10 after 9; a crash lost the last."""

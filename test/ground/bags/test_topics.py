@@ -164,13 +164,6 @@ def test_images_in_another_order_are_all_used(tmp_path: Path) -> None:
     assert [(record.time_ns, record.refusal) for record in records] == [(t, '') for t in expected]
 
 
-def test_without_a_channel_the_refusal_names_the_option(bag: Path) -> None:
-    setup = setup_with()
-    records = list(topics.read([bag], topics.choose_topics([bag], Topics(), setup), setup))
-    assert {record.refusal for record in records} == {'bad_encoding'}
-    assert 'image_channel' in records[0].detail
-
-
 def test_images_that_cannot_be_decoded_are_chosen_by_their_stamps_too(bag: Path) -> None:
     setup, wanted = setup_with(), images()[1].time_ns
     chosen = topics.choose_topics([bag], Topics(), setup)

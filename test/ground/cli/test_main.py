@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 import importlib.util
-import json
 import os
 from pathlib import Path
 import re
@@ -92,22 +91,6 @@ def test_a_temperature_topic_must_be_there(starcal: Starcal, tmp_path: Path) -> 
     asks = params_with(tmp_path, focal_temperature_order=1)
     result = starcal('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
     assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
-
-
-@pytest.mark.slow
-def test_simulate_writes_bag_truth_and_parameters(starcal: Starcal, tmp_path: Path) -> None:
-    made = ('--scenario', 'tiny', '--seed', '5', '--images', '4')
-    status, out, err = starcal('simulate', '-o', tmp_path / 'bag', *made)
-    assert (status, err) == (0, '')
-    truth = json.loads((tmp_path / 'bag' / 'truth.json').read_text())
-    assert (truth['seed'], truth['images'], truth['scenario']) == (5, 4, 'tiny')
-    assert (tmp_path / 'bag' / truth['bag']).is_file()
-    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
-    assert 'truth.json' in out and 'params.yaml' in out
-    assert starcal('simulate', '-o', tmp_path / 'b.mcap', *made)[0] == 0
-    same = (tmp_path / 'bag' / truth['bag']).read_bytes()
-    assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
-    assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}
 
 
 def examples() -> list[tuple[str, list[str]]]:

@@ -203,12 +203,6 @@ def test_on_a_stated_ground_the_likeliest_zenith_is_taken_with_an_honest_sigma()
     assert np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
-def test_a_ground_that_the_stars_contradict_is_doubted() -> None:
-    images, text = with_air(seen_from(SiteOptions(), 2), CAMERA, is_ground=True)
-    assert text.startswith('observer: ground: the stars do not show its air')
-    assert honesty(GIVEN, estimate(images), unmoved)[0] < 2.0
-
-
 def test_air_that_is_recorded_is_not_applied_again() -> None:
     once, _ = with_air(seen_from(SITE, 3), CAMERA)
     assert with_air(once, CAMERA, is_ground=True) == (once, '')

@@ -12,20 +12,6 @@ import pytest
 from starcal_tool import Starcal  # type: ignore[import-not-found]
 import yaml
 
-
-def test_the_cause_and_its_remedy(tmp_path: Path, starcal: Starcal) -> None:
-    wrong_params = params_with(tmp_path, attitude_direction='inertial_to_st')
-    status, out, _ = starcal('diagnose', TINY, '--params', wrong_params)
-    lines = out.splitlines()
-    assert status == 3
-    contents, diagnosis = lines[: lines.index('')], lines[lines.index('') + 1 :]
-    assert any('10 refused as no_match' in line for line in contents)
-    assert diagnosis[0] == (
-        'The attitude quaternions are st_to_inertial (x, y, z, w), not inertial_to_st.'
-    )
-    assert lines[-1].strip() == 'attitude_direction: st_to_inertial'
-
-
 REAL_SKY = Path(__file__).parents[5] / 'shared' / 'realsky'
 
 
