@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image, TiffImagePlugin
 import pytest
 
-from starcal_ground.images.image_series import FileFacts
+from starcal_ground.images.image_series import (
+    common_scale,
+    FileFacts,
+    ImageOptions,
+    look,
+    pixels_of,
+)
 from starcal_ground.images.photographs import (
     by_camera,
     image_paths,
@@ -222,6 +228,12 @@ def read(path: Path) -> Photograph:
     return photograph
 
 
+def imported(path: Path) -> None:
+    """Read the facts and the pixels of a file as an import does."""
+    options = ImageOptions({path.name: 1})
+    pixels_of(path, options, common_scale([look(path, options)], options))
+
+
 def sparse(path: Path, start: bytes, size: int) -> None:
     with path.open('wb') as file:
         file.write(start)
@@ -230,6 +242,16 @@ def sparse(path: Path, start: bytes, size: int) -> None:
 
 def content(data: bytes) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(data)
+
+
+def encoded_fits() -> bytes:
+    stream = io.BytesIO()
+    fits.PrimaryHDU(PIXELS[:, :, 0]).writeto(stream)
+    return stream.getvalue()
+
+
+def write_table(path: Path) -> None:
+    fits.BinTableHDU.from_columns([fits.Column('x', 'D', array=[1.0])]).writeto(path)
 
 
 HUGE = encoded('.png')[:16] + struct.pack('>II', 60000, 60000) + encoded('.png')[24:]
@@ -257,6 +279,8 @@ BAD: Mapping[str, tuple[Callable[[Path], object], str]] = {
     'renamed.jpg': (content(HEIC), 'no image that is read'),
     'cube.fits': (lambda path: fits.PrimaryHDU(np.zeros((8, 9, 10))).writeto(path), 'each image'),
     'pages.tif': (lambda path: cv2.imwritemulti(str(path), [PIXELS, PIXELS]), 'each image'),
+    'cut.fits': (content(encoded_fits()[:4000]), 'not readable as FITS|damaged'),
+    'table.fits': (write_table, 'no image'),
     'bag.mcap': (content(b'\x89MCAP0\r\n' + bytes(40)), 'an MCAP bag: calibrate it by itself'),
 }
 
@@ -273,6 +297,9 @@ def test_a_file_that_is_no_sound_photograph_is_refused_with_its_reason(
     assert str(error.value).startswith(f'{path}: ') and '\n' not in str(error.value)
     # Nor do the libraries print a line for each file.
     assert ''.join(capfd.readouterr()) == ''
+    with pytest.raises(IngestError) as error:
+        imported(path)
+    assert str(error.value).startswith(f'{path}: ') and '\n' not in str(error.value)
 
 
 def test_files_left_out_are_counted_by_reason_with_a_few_names() -> None:
@@ -304,10 +331,8 @@ def test_a_folder_is_read_by_content_and_nothing_in_it_is_skipped(tmp_path: Path
 def test_fits_is_read_compressed_and_by_any_name(
     tmp_path: Path, name: str, pack: Callable[[bytes], bytes]
 ) -> None:
-    stream = io.BytesIO()
-    fits.PrimaryHDU(PIXELS[:, :, 0]).writeto(stream)
     for path in (tmp_path / name, tmp_path / 'renamed'):
-        path.write_bytes(pack(stream.getvalue()))
+        path.write_bytes(pack(encoded_fits()))
         assert (pixels_of_photograph(path) == PIXELS[:, :, 0]).all()
 
 
