@@ -19,7 +19,6 @@ import yaml
 
 import starcal_ground
 from starcal_ground import campaign
-from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.reader import read_observations, Topics
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
@@ -208,10 +207,7 @@ def test_a_calibration_refused_for_want_of_stars_finds_those_of_a_right_prior(
 
 
 def test_a_bag_without_attitudes_gives_one_camera(tmp_path: Path) -> None:
-    bag, params = tmp_path / 'images.mcap', tmp_path / 'params.yaml'
-    with BagWriter(bag) as writer:
-        for image in images()[:5]:
-            writer.write_image('/camera/image_raw', image, 'camera')
+    bag, params = write_tiny(tmp_path / 'a.mcap', images()[:5], ()), tmp_path / 'params.yaml'
     params.write_text('/**:\n  ros__parameters:\n    observer: space\n')
     by_tool = ['calibrate', str(bag), '--params', str(params), '-o', str(tmp_path / 'out')]
     assert main([*by_tool, '--no-report']) in (0, 3)

@@ -7,7 +7,16 @@ from pathlib import Path
 import shlex
 import shutil
 
-from mission_files import frames_of, images, TINY, write_aem, write_encoded, write_fits, write_pngs  # type: ignore[import-not-found]
+from mission_files import (  # type: ignore[import-not-found]
+    frames_of,
+    images,
+    TINY,
+    write_aem,
+    write_encoded,
+    write_fits,
+    write_pngs,
+    write_tiny,
+)
 import numpy as np
 import pytest
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
@@ -170,14 +179,11 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, tiny_products: Path) -> Pat
     write_pngs(folder / 'night', frames_of(3))
     write_fits(folder / '0.fits', images()[0])
     write_aem(folder / 'a.aem')
-    topic = '/opnav/image_raw'
-    with BagWriter(folder / 'night.mcap') as writer:
-        for image in images()[:3]:
-            writer.write_image(topic, image, 'camera')
+    write_tiny(folder / 'night.mcap', images()[:3], ())
     with BagWriter(folder / 'colour.mcap') as writer:
         for image in images()[:3]:
             colour = np.repeat((image.pixels >> 4).astype(np.uint8).reshape(-1), 3)
-            write_encoded(writer, topic, image, 'rgb8', colour)
+            write_encoded(writer, '/opnav/image_raw', image, 'rgb8', colour)
             attitude = np.array([0, 0, 0, 1.0])
             writer.write_attitude('/star_tracker/attitude', image.time_ns, attitude, 'icrf')
     with BagWriter(folder / 'observations.mcap') as writer:

@@ -131,7 +131,7 @@ def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air
         status, _, notes = starcal(*command, *given)
         assert status == 0 and 'observer: ground: the stars do not show its air' in notes
     calibration = read_calibration(tmp_path / 'calibration.json')
-    truth = json.loads((TINY / 'truth.json').read_text())['k_true'][0]
+    truth = TRUTH['k_true'][0]
     focal_px, sigma_px = calibration.geometry.camera.parameters[0], calibration.sigma[0]
     # Half of 52 arcsec is 1.3e-4 of the focal length; one draw, as above.
     assert abs(focal_px - truth) < 4 * sigma_px < 4 * 1.5e-4 * focal_px

@@ -12,15 +12,15 @@ from pathlib import Path
 
 from astropy.io import fits
 import cv2
-from mission_files import date, frames_of, TINY, write_fits, write_pngs  # type: ignore[import-not-found]
+from mission_files import date, frames_of, TINY, write_fits, write_pngs, write_tiny  # type: ignore[import-not-found]
 from mission_files import images as tiny_images
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.api import calibrate_images
-from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.topics import Topics
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.blind.search import SkyMatch
@@ -51,15 +51,14 @@ from starcal_ros.records import Image, PIXELS_OF, refused_image
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog
 
-TOPIC = '/camera/image_raw'
+TRUTH = json.loads((TINY / 'truth.json').read_text())
 LENS = ('--focal-length-mm', '18', '--pixel-size-um', '10')  # of the small bag, within 1 %
 
 
 def difference_and_sigma_arcsec(calibration: starcal_ros.Calibration) -> tuple[float, float]:
     """RMS difference of lines of sight from the truth, common rotation removed, and 1-sigma."""
-    truth = json.loads((TINY / 'truth.json').read_text())
     camera = calibration.geometry.camera
-    parameters = np.array([*truth['k_true'], *truth['d_true']])
+    parameters = np.array([*TRUTH['k_true'], *TRUTH['d_true']])
     true = CameraModel(camera.width, camera.height, parameters)
     pixels = pixel_grid(camera, 15, 15)
     a, b = line_of_sight(camera, pixels), line_of_sight(true, pixels)
@@ -72,34 +71,30 @@ def difference_and_sigma_arcsec(calibration: starcal_ros.Calibration) -> tuple[f
 
 @pytest.mark.slow
 def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignment(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
-    bag = tmp_path / 'bag.mcap'
-    with BagWriter(bag) as writer:
-        for image in tiny_images()[:5]:
-            writer.write_image(TOPIC, image, 'camera')
-    assert main(['calibrate', str(bag), *LENS, '-o', str(tmp_path / 'out')]) in (0, 3)
+    bag = write_tiny(tmp_path / 'bag.mcap', tiny_images()[:5], ())
+    status, said, _ = starcal('calibrate', bag, *LENS, '-o', tmp_path / 'out')
+    assert status in (0, 3)
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     difference, sigma = difference_and_sigma_arcsec(calibration)
     assert difference < 2 * sigma
     assert not calibration.has_alignment
-    said = capsys.readouterr().out
     assert 'none: attitudes from the stars' in said
     # No star tracker is a cause of its sigma, no column is of an alignment or of a first solution.
     assert 'star tracker' not in said and 'with alignment' not in said and 'prior' not in said
     page = (tmp_path / 'out' / 'report.html').read_text()
     assert 'No alignment' in page and '<title>Star calibration of a camera from its stars' in page
+    for words in ('slow', 'frame', 'reported'):
+        assert f'star tracker {words}' not in page
     for words in (
-        'star tracker slow',
-        'star tracker frame',
-        'star tracker reported',
         'predicted by the star tracker',
         'id="figure-change"',
         'camera_optical_frame on',
     ):
         assert words not in page
     table = tmp_path / 'table.csv'
-    assert main(['lookup', str(tmp_path / 'out'), '-o', str(table)]) == 0
+    assert starcal('lookup', tmp_path / 'out', '-o', table).status == 0
     assert table.read_text().splitlines()[0] == 'u_px,v_px,x,y,z,shape_sigma_arcsec'
 
 
@@ -117,35 +112,30 @@ def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_cl
 
 @pytest.mark.slow
 def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, starcal: Starcal
 ) -> None:
     folder, table, out = tmp_path / 'night', tmp_path / 'times.csv', tmp_path / 'out'
     shown = tiny_images()[:6]
     files = sorted(write_pngs(folder, [one.pixels[::-1] for one in shown]).iterdir())
     rows = (f'{path.name},{one.time_ns}' for path, one in zip(files, shown, strict=True))
     table.write_text('\n'.join(['file,time_ns', *rows]))
-    stated = ['calibrate', str(folder), *LENS, '-o', str(out), '--times', str(table), '--flip']
-    assert main([*stated, 'top-bottom']) in (0, 3)
+    stated = ['calibrate', folder, *LENS, '-o', out, '--times', table, '--flip']
+    assert starcal(*stated, 'top-bottom').status in (0, 3)
     calibration = read_calibration(out / 'calibration.json')
     assert TIMES not in calibration.provenance
-    assert (calibration.first_image_ns, calibration.time_ns) == (
-        shown[0].time_ns,
-        shown[-1].time_ns,
-    )
+    span_ns = (calibration.first_image_ns, calibration.time_ns)
+    assert span_ns == (shown[0].time_ns, shown[-1].time_ns)
     assert calibration.provenance[PIXELS_OF] == 'mirrored top to bottom (--flip)'
-    truth = json.loads((TINY / 'truth.json').read_text())
-    off = calibration.geometry.camera.parameters[3:5] - truth['k_true'][3:5]
+    off = calibration.geometry.camera.parameters[3:5] - TRUTH['k_true'][3:5]
     assert np.abs(off / calibration.sigma[3:5]).max() < 4.0  # one in 8,000 good ones is beyond
     # A side that the stars contradict is refused.
     for path, one in zip(files, shown, strict=True):
         cv2.imwrite(str(path), one.pixels)
-    capsys.readouterr()
-    assert main([*stated, 'left-right']) == 2
-    said = capsys.readouterr().err
-    assert '--flip left-right: the stars show a mirror image with it: leave it out' in said
+    words = '--flip left-right: the stars show a mirror image with it: leave it out'
+    assert_refused(starcal(*stated, 'left-right'), words)
     # A bag has the times and the pixels that it was made with.
-    assert main(['calibrate', str(TINY), '-o', str(out), '--flip', 'top-bottom']) == 2
-    assert 'starcal: --times, --flip: only of image files' in capsys.readouterr().err
+    of_bag = starcal('calibrate', TINY, '-o', out, '--flip', 'top-bottom')
+    assert_refused(of_bag, '--times, --flip: only of image files')
 
 
 @pytest.mark.slow
@@ -158,7 +148,7 @@ def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(
     ],
 )
 def test_the_axis_of_a_mirror_image_is_that_of_the_file_and_is_in_the_products(
-    tmp_path: Path, kind: str, words: str
+    tmp_path: Path, kind: str, words: str, starcal: Starcal
 ) -> None:
     """The principal point, 60 and 50 px off the middle, is that of the pixels named."""
     folder, out = tmp_path / 'night', tmp_path / 'out'
@@ -172,9 +162,9 @@ def test_the_axis_of_a_mirror_image_is_that_of_the_file_and_is_in_the_products(
             upside_down = Image(image.time_ns, pixels[::-1].copy())
             path = folder / f'{image.time_ns}.fits'
             write_fits(path, upside_down, **{'DATE-AVG': date(image.time_ns), **header})
-    main(['calibrate', str(folder), *LENS, '-o', str(out), '--quiet'])
+    starcal('calibrate', folder, *LENS, '-o', out, '--quiet')
     calibration = read_calibration(out / 'calibration.json')
-    truth = np.array(json.loads((TINY / 'truth.json').read_text())['k_true'])[3:5] - [60.0, 0.0]
+    truth = np.array(TRUTH['k_true'])[3:5] - [60.0, 0.0]
     off = (calibration.geometry.camera.parameters[3:5] - truth) / calibration.sigma[3:5]
     assert np.abs(off).max() < 4.0  # one in 8,000 good ones is beyond
     assert calibration.provenance[PIXELS_OF].startswith(words)
