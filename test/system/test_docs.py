@@ -91,19 +91,8 @@ MAKE_TARGETS = sorted(
 )
 # What the documents call besides, on the reader's machine: nothing of ours to hold it against.
 OTHERS = {
-    'git',
-    'cd',
-    'rosdep',
-    'colcon',
-    '.',
-    'eval',
-    'apt',
-    'sudo',
-    'xdg-open',
-    'export',
-    'kill',
-    'sqlite3',
-    'chromium',
+    *('git', 'cd', 'rosdep', 'colcon', '.', 'eval', 'apt', 'sudo', 'xdg-open', 'export'),
+    *('kill', 'sqlite3', 'chromium'),
 }
 
 

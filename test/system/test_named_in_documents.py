@@ -42,14 +42,9 @@ OF_PACKAGES = [
 ]  # fmt: skip
 # Composed by the code, of other packages of ROS, or of the tools whose users read coming_from.md.
 ELSEWHERE = {
-    *(
-        'malloc_trim',
-        'refused_overrun',
-        'star_tracker_2_x',
-        'camera_calibration',
-        'foxglove_bridge',
-    ),
-    *('Calibration.id_stars', 'estimate_geometric_calibration', 'estimate_attitude'),
+    *('malloc_trim', 'refused_overrun', 'star_tracker_2_x', 'camera_calibration'),
+    *('foxglove_bridge', 'Calibration.id_stars', 'estimate_geometric_calibration'),
+    'estimate_attitude',
     *('estimate_static_alignment', 'estimate_temperature_dependent_alignment'),
     *('kalibr_calibrate_imu_camera', 'camchain.yaml', 'timeshift_cam_imu', 'target.yaml'),
     *('report.pdf', 'ros_base', '--velocity-topic T'),

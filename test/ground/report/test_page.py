@@ -41,21 +41,8 @@ from starcal_ros.ros.archive import Archive
 from starcal_ros.text import significant
 
 FIGURES = (
-    'cells',
-    'vectors',
-    'change',
-    'sky',
-    'before',
-    'images',
-    'histogram',
-    'lens_field',
-    'field',
-    'magnitude',
-    'colour',
-    'phase',
-    'budget',
-    'line_of_sight',
-    'shape',
+    *('cells', 'vectors', 'change', 'sky', 'before', 'images', 'histogram', 'lens_field'),
+    *('field', 'magnitude', 'colour', 'phase', 'budget', 'line_of_sight', 'shape'),
     'alignment',
 )
 
