@@ -115,6 +115,18 @@ def test_a_colour_of_an_image_is_chosen(tmp_path: Path) -> None:
         look(cube, PLAIN)
 
 
+@pytest.mark.parametrize(
+    ('bayer', 'channel', 'first'), [('rggb', 'green', 1), ('grbg', 'blue', 10)]
+)
+def test_a_colour_of_a_mosaic_has_half_the_size(
+    tmp_path: Path, bayer: str, channel: str, first: int
+) -> None:
+    path = tmp_path / 'a.png'
+    cv2.imwrite(str(path), np.arange(80, dtype=np.uint16).reshape(8, 10))
+    pixels = read(path, ImageOptions({'a.png': 1}, channel=channel, bayer=bayer))
+    assert pixels.shape == (4, 5) and pixels[0, 0] == first and pixels[1, 1] == first + 22
+
+
 MIDDLE = '2026-05-15T07:20:00.5'
 
 

@@ -154,9 +154,9 @@ def test_a_trend_finds_the_drift_of_simulated_bags(
         drifts = ['--focal-drift', str(FOCAL_PPM), '--alignment-drift', str(TURN_ARCSEC)]
         date = ['--date', f'{2026 + k}-05-15T07:20:00']
         assert main(['simulate', '-o', str(bag), *camera, *drifts, *date]) == 0
-        start = datetime.fromtimestamp(
-            json.loads((bag / 'truth.json').read_text())['t0'], timezone.utc
-        )
+        truth = json.loads((bag / 'truth.json').read_text())
+        assert (truth['seed'], truth['images']) == (k, 4)
+        start = datetime.fromtimestamp(truth['t0'], timezone.utc)
         assert f'{start:%Y-%m-%dT%H:%M}' == f'{2026 + k}-05-15T07:20'
         params = ['--params', str(bag / 'params.yaml'), '--no-report', '--quiet']
         assert main(['calibrate', str(bag), '-o', str(out), *params]) in (0, 3)
