@@ -13,7 +13,6 @@ from mission_files import attitudes, params_with, TINY, write_compressed, write_
 from mission_files import images as tiny_images
 import numpy as np
 import pytest
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import topics
@@ -46,7 +45,7 @@ def setup() -> Setup:
         (30.0, '; RA 180.00, Dec +1.00; RA 210.00, Dec +1.00, and 2 more'),
     ],
 )
-def test_the_sky_that_a_catalog_lacks_is_named(step_deg: float, words: str) -> None:
+def test_the_sky_that_a_catalog_lacks_is_named(step_deg, words) -> None:
     details = [
         f'0.1 stars; needed: RA {step_deg * k:.2f}, Dec +1.00, radius 0.30 deg' for k in range(10)
     ]
@@ -91,7 +90,7 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
 
 
 @pytest.mark.slow
-def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> None:
+def test_verdicts_are_those_of_the_calibration(tmp_path, setup) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
     quick = contents_of(path)
@@ -120,7 +119,7 @@ def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> 
     assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
 
 
-def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path: Path, starcal: Starcal) -> None:
+def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path, starcal) -> None:
     """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
     alone = [(0, np.array([0.0, 0.0, 0.0, 1.0]))]
     path = write_tiny(tmp_path / 'images.mcap', tiny_images()[:1], alone)
@@ -132,7 +131,7 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path: Path, starcal: St
     assert status == EXIT_REFUSED and 'longest attitude gap' not in out
 
 
-def test_the_topics_are_told(tmp_path: Path) -> None:
+def test_the_topics_are_told(tmp_path) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
     attitude, image = sorted(contents_of(path).topics, key=lambda t: -t.bad)
@@ -145,7 +144,7 @@ def test_the_topics_are_told(tmp_path: Path) -> None:
     assert image.last_ns == tiny_images()[-1].time_ns + 10**10
 
 
-def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path: Path) -> None:
+def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path) -> None:
     path = tmp_path / 'more.mcap'
     with BagWriter(path) as writer:
         for k in (0, 2, 1):
@@ -162,7 +161,7 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
     assert 'starcal import' in sentence and '/lens' in sentence
 
 
-def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
+def test_compressed_images_are_told_apart(tmp_path) -> None:
     path = tmp_path / 'png.mcap'
     with BagWriter(path) as writer:
         for image, ending in zip(tiny_images(), ('png', 'jpg', 'bmp'), strict=False):
@@ -177,7 +176,7 @@ def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 
-def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path) -> None:
     cut = tmp_path / 'cut.mcap'
     write_spoilt(cut, tiny_images())
     cut.write_bytes(cut.read_bytes()[:-10_000])  # in the second chunk
@@ -188,7 +187,7 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     assert 0 < images < 10 and found.images == images
 
 
-def test_recorded_observations_need_no_parameters(tiny_products: Path, starcal: Starcal) -> None:
+def test_recorded_observations_need_no_parameters(tiny_products, starcal) -> None:
     path = tiny_products / 'observations.mcap'
     found = contents_of(path)
     assert found.stars_per_image and found.images == 10 and not found.refused
@@ -198,7 +197,7 @@ def test_recorded_observations_need_no_parameters(tiny_products: Path, starcal: 
 
 
 @pytest.mark.slow
-def test_the_tool_says_it_to_people_and_programs(tmp_path: Path, starcal: Starcal) -> None:
+def test_the_tool_says_it_to_people_and_programs(tmp_path, starcal) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images())
     status, out, _ = starcal('diagnose', path)
@@ -210,7 +209,7 @@ def test_the_tool_says_it_to_people_and_programs(tmp_path: Path, starcal: Starca
     assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
 
 
-def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path: Path, starcal: Starcal) -> None:
+def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path, starcal) -> None:
     alone = [(5, np.array([0.0, 0.0, 0.0, 1.0]))]
     path = write_tiny(tmp_path / 'two.mcap', tiny_images()[:2], alone)
     status, out, _ = starcal('diagnose', path)
@@ -232,7 +231,7 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path: Path, starcal: St
     ],
 )
 def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
-    direction: str, cause: str, words: str, tmp_path: Path, starcal: Starcal
+    direction, cause, words, tmp_path, starcal
 ) -> None:
     last = tiny_images()[-1]
     later = (Image(last.time_ns + k * 10**11, last.pixels) for k in (1, 2))

@@ -68,7 +68,7 @@ def test_a_vehicle_gets_every_package() -> None:
 @pytest.mark.parametrize(
     'path', sorted((CONFIG / 'examples').glob('*.yaml')), ids=lambda path: path.stem
 )
-def test_examples_load(path: Path) -> None:
+def test_examples_load(path) -> None:
     if path.stem.endswith('_camera'):
         assert read_camera_info(str(path)).width > 0
         return
@@ -77,7 +77,7 @@ def test_examples_load(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path: Path) -> None:
+def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path) -> None:
     """Copied beside the prior camera, as its first line instructs: parameters are all basic."""
     text = (CONFIG / 'minimal.yaml').read_text()
     assert len(text.splitlines()) == 10
@@ -115,7 +115,7 @@ def test_every_pin_has_its_digests() -> None:
         assert re.fullmatch('sha256:[0-9a-f]{64}', digest), file
 
 
-def test_pip_is_given_the_digests(tmp_path: Path) -> None:
+def test_pip_is_given_the_digests(tmp_path) -> None:
     make_venv, path = tool('make_venv'), tmp_path / 'some.txt'
     path.write_text('# why\nempy==3.3.4 ; python_version > "3.9"  # old\n')
     (line,) = make_venv.hashed_lines(path)

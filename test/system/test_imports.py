@@ -94,9 +94,7 @@ COMMANDS = 'starcal_ground.cli.commands'
     ],
     ids=['on board', 'ground', 'help', 'a command', 'a calibration', 'all without ROS'],
 )
-def test_a_start_does_not_wait_for_what_it_seldom_needs(
-    start: str, needs: str, does_not_wait_for: str
-) -> None:
+def test_a_start_does_not_wait_for_what_it_seldom_needs(start, needs, does_not_wait_for) -> None:
     show = f'{start}\nimport sys; print(*sys.modules, file=sys.stderr)'
     done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
     loaded = set(done.stderr.split())

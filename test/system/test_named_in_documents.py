@@ -143,7 +143,7 @@ def test_each_symbol_of_the_algorithm_has_a_name_in_the_code() -> None:
 
 
 @pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_what_a_document_names_exists(document: Path) -> None:
+def test_what_a_document_names_exists(document) -> None:
     assert [span for span in spans(document) if not exists(span)] == []
 
 
@@ -234,7 +234,7 @@ def identifiers() -> frozenset[str]:
         ),
     ],
 )
-def test_a_name_that_does_not_exist_is_found(span: str) -> None:
+def test_a_name_that_does_not_exist_is_found(span) -> None:
     """The test above could fail."""
     assert not exists(span)
 

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import functools
 from pathlib import Path
 import re
 import shutil
 import sys
-from types import ModuleType
 
 import cv2
 from mission_files import frames_of, write_pngs  # type: ignore[import-not-found]
@@ -83,13 +81,7 @@ def small_trend(patch: pytest.MonkeyPatch, folder: Path) -> None:
         (make_trend, '{folder}', small_trend),
     ],
 )
-def test_a_command_draws_its_pictures(
-    command: ModuleType,
-    line: str,
-    in_small: Callable[[pytest.MonkeyPatch, Path], None] | None,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
+def test_a_command_draws_its_pictures(command, line, in_small, monkeypatch, tmp_path) -> None:
     if in_small is not None:
         in_small(monkeypatch, tmp_path)
     name = command.__name__.rpartition('.')[2]

@@ -63,7 +63,7 @@ def started(node: Path, client: Client) -> Iterator[None]:
 
 
 def test_it_answers_with_the_lines_of_sight_of_the_python_package(
-    client: Client, started: None, tmp_path: Path
+    client, started, tmp_path
 ) -> None:
     answers = client.collect(Vector3Stamped, 'line_of_sight')
     client.until(lambda: client.node.count_publishers('line_of_sight'))
@@ -99,7 +99,7 @@ def test_it_answers_with_the_lines_of_sight_of_the_python_package(
     assert np.abs(sights() - expected(UPLINKED, asked)).max() < SAME_DIRECTION
 
 
-def test_a_bad_table_at_the_start_costs_one_line(node: Path, tmp_path: Path) -> None:
+def test_a_bad_table_at_the_start_costs_one_line(node, tmp_path) -> None:
     command: list[str | Path] = [node, '--ros-args', '-p', f'table:={tmp_path / "none"}']
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -122,9 +122,7 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize('name', PLACES)
-def test_an_output_that_names_an_input_is_refused(
-    name: str, campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_that_names_an_input_is_refused(name, campaign, tmp_path, capsys) -> None:
     """-o names an input, its folder, or a file of another origin: nothing is changed."""
     prepare, command = PLACES[name]
     here = tmp_path / 'campaign'
@@ -212,9 +210,7 @@ def test_each_command_that_writes_is_in_the_table() -> None:
 
 
 @pytest.mark.parametrize('command', [*WRITING, *WITH_NODES])
-def test_what_starcal_did_not_write_is_not_replaced(
-    command: str, campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_starcal_did_not_write_is_not_replaced(command, campaign, tmp_path, capsys) -> None:
     """A file of others, or its own that was changed: nothing is written. Its own is replaced."""
     if command.startswith('demo'):
         pytest.importorskip('rclpy')
@@ -248,7 +244,7 @@ def test_what_starcal_did_not_write_is_not_replaced(
     'ends', ['>&-', '2>&-', '>&- 2>&-', '<&- >&- 2>&-', '>/dev/full', '| true', '2>&1 | true']
 )
 @pytest.mark.parametrize('bag', [BAG, '/none'])
-def test_standard_streams_that_are_closed_full_or_abandoned(bag: object, ends: str) -> None:
+def test_standard_streams_that_are_closed_full_or_abandoned(bag, ends) -> None:
     line = f'diagnose {bag} --params {BAG}/params.yaml'  # without, it is a search for the camera
     command = f'{sys.executable} -m starcal_ground.cli.main {line} {ends}'
     done = subprocess.run(['bash', '-c', command], capture_output=True, text=True)

@@ -144,7 +144,7 @@ def _cut_in_run(
 
 
 @pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.name)
-def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder: Path) -> None:
+def test_outputs_are_old_or_whole_before_each_operation(command, folder) -> None:
     old, expected, operations = _whole_run(command, folder)
     assert operations > 1
     assert not _cut_in_run(command, folder, old, expected)
@@ -154,7 +154,7 @@ def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder
 
 @pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.name)
 def test_an_interrupt_is_one_line_and_leaves_inputs_and_outputs_sound(
-    command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+    command, folder, capsys
 ) -> None:
     """Runs that replace the products of an earlier one."""
     old, expected, operations = _whole_run(command, folder)

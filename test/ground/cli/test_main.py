@@ -18,7 +18,7 @@ import sys
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.child_process import module_command
@@ -31,13 +31,13 @@ from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import Image
 
 
-def test_no_command_prints_the_help(starcal: Starcal) -> None:
+def test_no_command_prints_the_help(starcal) -> None:
     status, out, err = starcal()
     assert (status, err) == (0, '')
     assert out == parser().format_help()
 
 
-def test_version(starcal: Starcal) -> None:
+def test_version(starcal) -> None:
     assert starcal('--version') == (0, f'starcal {software_version()}\n', '')
 
 
@@ -50,7 +50,7 @@ def lookup_columns() -> list[str]:
 
 
 def test_lookup_writes_the_columns_of_the_interface_document(
-    starcal: Starcal, tmp_path: Path, tiny_products: Path, lookup_columns: list[str]
+    starcal, tmp_path, tiny_products, lookup_columns
 ) -> None:
     file = tmp_path / 'table.csv'
     status, out, err = starcal('lookup', tiny_products, '-o', file)
@@ -76,7 +76,7 @@ def test_lookup_writes_the_columns_of_the_interface_document(
 BLANK = np.full((512, 640), 33, np.uint16)
 
 
-def test_a_temperature_topic_must_be_there(starcal: Starcal, tmp_path: Path) -> None:
+def test_a_temperature_topic_must_be_there(starcal, tmp_path) -> None:
     files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     result = starcal('calibrate', TINY, *files, '--temperature-topic', '/box')
     assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
@@ -121,9 +121,7 @@ def test_each_command_has_examples_that_it_takes() -> None:
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_the_first_steps_run_in_an_empty_folder(
-    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_steps_run_in_an_empty_folder(starcal, tmp_path, monkeypatch) -> None:
     """As after `pip install`, where there is neither ROS nor the bag of the repository."""
     monkeypatch.chdir(tmp_path)
     *steps, demo_step = [words[1:] for name, words in examples() if not name]
@@ -137,9 +135,7 @@ def test_the_first_steps_run_in_an_empty_folder(
     'line', ['demo -o {t}/out', 'play {b}', 'monitor --once 1'], ids=lambda line: line.split()[0]
 )
 @pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
-def test_what_needs_ros_names_it(
-    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
-) -> None:
+def test_what_needs_ros_names_it(starcal, tmp_path, monkeypatch, line, missing) -> None:
     for name in [name for name in sys.modules if name.partition('.')[0] == missing]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)  # cannot be imported
@@ -160,7 +156,7 @@ def test_what_needs_ros_names_it(
         (f'starcal diagnose {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],
 )
-def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:
+def test_a_shell_completes(line, expected, tmp_path) -> None:
     """What argcomplete's function in the shell asks the tool, and what it is told."""
     told = tmp_path / 'told'
     asked = {
@@ -195,9 +191,7 @@ def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> No
         ),
     ],
 )
-def test_a_command_becomes_its_node(
-    starcal: Starcal, monkeypatch: pytest.MonkeyPatch, line: str, module: str, arguments: str
-) -> None:
+def test_a_command_becomes_its_node(starcal, monkeypatch, line, module, arguments) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
     starcal(*line.split())
@@ -207,7 +201,7 @@ def test_a_command_becomes_its_node(
 
 
 def test_no_report_is_written_where_none_is_wanted(
-    starcal: Starcal, tmp_path: Path, tiny_bag: Path, tiny_products: Path
+    starcal, tmp_path, tiny_bag, tiny_products
 ) -> None:
     write_atomically(tmp_path / 'report.html', 'of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
@@ -217,7 +211,7 @@ def test_no_report_is_written_where_none_is_wanted(
     assert not (tmp_path / 'report.html').exists()
 
 
-def test_demo_takes_the_bag_of_the_repository(tmp_path: Path) -> None:
+def test_demo_takes_the_bag_of_the_repository(tmp_path) -> None:
     bag = demo.tiny_bag(tmp_path)
     assert bag.bag == TINY
     assert bag.image_count == 10
@@ -225,9 +219,7 @@ def test_demo_takes_the_bag_of_the_repository(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_demo_makes_the_bag_where_there_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_makes_the_bag_where_there_is_none(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(demo, '__file__', str(tmp_path / 'package' / 'demo.py'))
     monkeypatch.setenv('AMENT_PREFIX_PATH', '')
     bag = demo.tiny_bag(tmp_path)
@@ -236,9 +228,7 @@ def test_demo_makes_the_bag_where_there_is_none(
 
 
 @pytest.mark.slow
-def test_demo_says_which_node_failed(
-    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_says_which_node_failed(starcal, tmp_path, monkeypatch) -> None:
     failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
     waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
     monkeypatch.setattr(
@@ -249,7 +239,7 @@ def test_demo_says_which_node_failed(
     assert_refused(starcal('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
 
-def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_error_of_an_import_stays(monkeypatch) -> None:
     def broken(_args: object) -> int:
         raise ImportError('libfreetype is not there')
 

@@ -19,7 +19,7 @@ from mission_files import (  # type: ignore[import-not-found]
 )
 import numpy as np
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ros.records import refused_image
@@ -197,9 +197,7 @@ def files_in(folder: Path) -> list[Path]:
 
 @pytest.mark.usefixtures('forked_readers')
 @pytest.mark.parametrize('line', WRONG)
-def test_a_mistake_ends_in_one_line_and_writes_nothing(
-    line: str, inputs: Path, starcal: Starcal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mistake_ends_in_one_line_and_writes_nothing(line, inputs, starcal, monkeypatch) -> None:
     monkeypatch.chdir(inputs)
     before = files_in(inputs)
     answer = starcal(*shlex.split(line.format(**KEYS)))

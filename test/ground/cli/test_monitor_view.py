@@ -47,9 +47,7 @@ def test_nothing_received_is_said() -> None:
         ('', ['calibrator', 'sat1/other'], ''),
     ],
 )
-def test_nodes_in_another_namespace_are_named(
-    namespace: str, nodes: list[str], remedy: str
-) -> None:
+def test_nodes_in_another_namespace_are_named(namespace, nodes, remedy) -> None:
     health = dict.fromkeys(nodes, (0, 'ok'))
     text = shown(Received(namespace=namespace, health=health))
     asked = f'nothing of calibrator in /{namespace}: try {remedy} '
@@ -114,7 +112,7 @@ def test_a_refused_candidate_shows_the_failed_check_first() -> None:
         (1.0, 0.0, 'max_x', 0.0),
     ],
 )
-def test_the_share_of_a_limit(found: float, limit: float, option: str, share: float) -> None:
+def test_the_share_of_a_limit(found, limit, option, share) -> None:
     assert share_of_limit(check(found, limit, option)) == share
 
 

@@ -10,7 +10,7 @@ import resource
 import shutil
 
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 pytestmark = pytest.mark.usefixtures('forked_readers')
 _MOST_BYTES = 1 << 30  # that a file adds to the memory
@@ -83,9 +83,7 @@ MAY_LACK = ('file of a bag', 'residuals.npz', 'observations.mcap', '--params of 
 
 @pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('name', FILES)
-def test_a_file_that_is_none_costs_one_line(
-    name: str, kind: str, campaign: Path, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_file_that_is_none_costs_one_line(name, kind, campaign, tmp_path, starcal) -> None:
     here = tmp_path / 'campaign'
     shutil.copytree(campaign, here)
     file = here / PLACES.get(name, 'file')

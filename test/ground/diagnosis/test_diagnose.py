@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass
 import functools
@@ -410,7 +410,7 @@ def expanded(pixels: Any) -> Any:
     ],
 )
 def test_mistakes_of_a_rendered_and_of_a_real_night(
-    night: Night, catalog: StarCatalog, changes: Any, causes: list[str], value: Any, words: str
+    night, catalog, changes, causes, value, words
 ) -> None:
     found = found_in(together(*changes)(night), catalog)
     assert [found.cause, *found.also] == causes
@@ -421,7 +421,7 @@ def test_mistakes_of_a_rendered_and_of_a_real_night(
 
 
 @pytest.mark.parametrize('missing', [False, True])
-def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
+def test_alignment(night, catalog, missing) -> None:
     right = night.setup.prior.star_tracker_from_camera
     tilted = turned(Rotation.from_euler('x', 10.0, degrees=True))
     found = found_in((unaligned if missing else tilted)(night), catalog)
@@ -433,7 +433,7 @@ def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
     assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.2)
 
 
-def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog) -> None:
+def test_alignment_by_stars_among_the_structure_of_a_corona(catalog) -> None:
     """Eighty wide spots, most of them brighter than the stars: the compact sources are known."""
     rng = np.random.default_rng(5)
 
@@ -458,7 +458,7 @@ def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog
         *[(granasat_night, late_s) for late_s in (-41.0, 33.0)],
     ],
 )
-def test_clock(catalog: StarCatalog, night_of: Callable[[], Night], late_s: float) -> None:
+def test_clock(catalog, night_of, late_s) -> None:
     found = found_in(late(late_s)(night_of()), catalog)
     assert found.cause == 'clock'
     # A tenth of a second of 2 degrees a second is what the star tracker's mounting would hide.
@@ -480,7 +480,7 @@ def at_rest(count: int) -> Night:
 
 
 @pytest.mark.parametrize('count', [1, 4])
-def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
+def test_images_that_do_not_turn(catalog, count) -> None:
     resting = at_rest(count)
     assert found_in(resting, catalog).cause == 'none'
     assert found_in(conjugated(resting), catalog).cause == 'attitude_direction'
@@ -579,9 +579,7 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
         ),
     ],
 )
-def test_a_mistake_is_named_and_nothing_else(
-    changes: Sequence[Change], causes: list[str], words: str, catalog: StarCatalog
-) -> None:
+def test_a_mistake_is_named_and_nothing_else(changes, causes, words, catalog) -> None:
     found = found_in(together(*changes)(slewing_night()), catalog)
     assert [found.cause, *found.also] == (causes or ['none'])
     assert words in ' '.join([found.sentence, *found.evidence, *found.mend])
@@ -589,7 +587,7 @@ def test_a_mistake_is_named_and_nothing_else(
     assert not {'unknown', 'none'} & {*found.also}
 
 
-def test_the_numbers_of_a_camera_matrix(catalog: StarCatalog) -> None:
+def test_the_numbers_of_a_camera_matrix(catalog) -> None:
     """Those that go into the camera file are right."""
     night = slewing_night()
     fx, cx, cy = (float(night.setup.prior.camera.parameters[k]) for k in (0, 3, 4))
@@ -618,7 +616,7 @@ def test_the_numbers_of_a_camera_matrix(catalog: StarCatalog) -> None:
         (-12600.0, '3.5 h is the difference of two time zones'),
     ],
 )
-def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: StarCatalog) -> None:
+def test_a_clock_of_another_scale_or_zone(late_s, words, catalog) -> None:
     """Attitudes of a whole day, in which the images are somewhere."""
     night = slewing_night()
     steady = np.arange(-50_000, 50_000, 10, dtype=np.int64) * 1_000_000_000 + START_NS
@@ -642,7 +640,7 @@ def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: St
     ],
 )
 def test_a_size_without_known_stars_has_the_remedies_of_all_that_it_can_be(
-    shape: tuple[int, int], remedies: list[str]
+    shape, remedies
 ) -> None:
     setup = read_setup(Path(__file__).parents[3] / 'bags' / 'tiny' / 'params.yaml')
     pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)

@@ -11,7 +11,7 @@ from mission_files import attitudes, frames_of, images, TINY, write_pngs, write_
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
@@ -32,9 +32,7 @@ def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
-def test_a_bag_of_which_nothing_is_stated(
-    tmp_path: Path, direction: str, starcal: Starcal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bag_of_which_nothing_is_stated(tmp_path, direction, starcal, monkeypatch) -> None:
     monkeypatch.setenv('COLUMNS', str(COLUMNS))
     is_plain = direction == 'st_to_inertial'
     bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', -1)
@@ -77,7 +75,7 @@ def test_a_bag_of_which_nothing_is_stated(
 
 
 @pytest.mark.slow
-def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path: Path, starcal: Starcal) -> None:
+def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path, starcal) -> None:
     bag = with_attitudes(tmp_path / 'b.mcap', shift_s=5)
     assert_refused(
         starcal('calibrate', bag, *LENS, '-o', tmp_path / 'out', '--quiet'),
@@ -90,7 +88,7 @@ def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path: Path, starcal: Starca
 
 
 @pytest.mark.slow
-def test_streaks_that_are_measured_are_identified_too(tmp_path: Path, starcal: Starcal) -> None:
+def test_streaks_that_are_measured_are_identified_too(tmp_path, starcal) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
     line = ['simulate', '-o', bag, '--scenario', 'tiny', '--smear', 8, '--images', 5]
@@ -104,7 +102,7 @@ def test_streaks_that_are_measured_are_identified_too(tmp_path: Path, starcal: S
 
 
 @pytest.mark.slow
-def test_photographs_of_which_nothing_is_stated(tmp_path: Path, starcal: Starcal) -> None:
+def test_photographs_of_which_nothing_is_stated(tmp_path, starcal) -> None:
     night, out = write_pngs(tmp_path / 'night', frames_of(3)), tmp_path / 'out'
     command = ['calibrate', night, '-o', out, '--no-report']
     status, text, notes = starcal(*command, '--focal-length-mm', 50, '--pixel-size-um', 10)
@@ -123,7 +121,7 @@ def test_photographs_of_which_nothing_is_stated(tmp_path: Path, starcal: Starcal
 
 @pytest.mark.slow
 def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air(
-    tmp_path: Path, starcal: Starcal
+    tmp_path, starcal
 ) -> None:
     """A bag in space: its stars contradict the ground, and the sigma holds half of the air."""
     given = [TINY, '--params', TINY / 'params.yaml', '--set', 'observer=ground']
@@ -138,9 +136,7 @@ def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air
 
 
 @pytest.mark.slow
-def test_a_requirement_is_answered_for_people_and_programs(
-    tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_requirement_is_answered_for_people_and_programs(tmp_path, starcal) -> None:
     command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '--no-report', '--json']
     command += ['-o', tmp_path, '--set', 'star_tracker_slow_arcsec=5']
     status, out, _ = starcal(*command, '--require', 'line_of_sight=20arcsec@98%')

@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import json
 import os
-from pathlib import Path
 
 from astropy.io import fits
 import cv2
@@ -17,7 +16,7 @@ from mission_files import images as tiny_images
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from bench.night_sky import calibrated, camera_of, off_arcsec
 from starcal_ground.api import calibrate_images
@@ -71,7 +70,7 @@ def difference_and_sigma_arcsec(calibration: starcal_ros.Calibration) -> tuple[f
 
 @pytest.mark.slow
 def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignment(
-    tmp_path: Path, starcal: Starcal
+    tmp_path, starcal
 ) -> None:
     bag = write_tiny(tmp_path / 'bag.mcap', tiny_images()[:5], ())
     status, said, _ = starcal('calibrate', bag, *LENS, '-o', tmp_path / 'out')
@@ -100,7 +99,7 @@ def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignme
 
 @pytest.mark.slow
 def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_clock(
-    tmp_path: Path,
+    tmp_path,
 ) -> None:
     mirrored = [one.pixels[:, ::-1].copy() for one in tiny_images()]
     calibration = calibrate_images(write_pngs(tmp_path / 'night', mirrored))
@@ -111,9 +110,7 @@ def test_mirrored_pictures_give_the_camera_without_attitudes_focal_length_and_cl
 
 
 @pytest.mark.slow
-def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(
-    tmp_path: Path, starcal: Starcal
-) -> None:
+def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(tmp_path, starcal) -> None:
     folder, table, out = tmp_path / 'night', tmp_path / 'times.csv', tmp_path / 'out'
     shown = tiny_images()[:6]
     files = sorted(write_pngs(folder, [one.pixels[::-1] for one in shown]).iterdir())
@@ -148,7 +145,7 @@ def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(
     ],
 )
 def test_the_axis_of_a_mirror_image_is_that_of_the_file_and_is_in_the_products(
-    tmp_path: Path, kind: str, words: str, starcal: Starcal
+    tmp_path, kind, words, starcal
 ) -> None:
     """The principal point, 60 and 50 px off the middle, is that of the pixels named."""
     folder, out = tmp_path / 'night', tmp_path / 'out'
@@ -186,9 +183,7 @@ def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('camera', [44, 109, 137])
-def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(
-    tmp_path: Path, camera: int
-) -> None:
+def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(tmp_path, camera) -> None:
     """
     As a pinhole, the corners of 44 without stars were off by 22 of their sigmas, and accepted.
 
@@ -222,7 +217,7 @@ def lights(seed: int, count: int = 60) -> Pixels:
 
 
 @pytest.mark.slow
-def test_a_zoom_between_the_frames_is_named(tmp_path: Path) -> None:
+def test_a_zoom_between_the_frames_is_named(tmp_path) -> None:
     frames = frames_of(6)
     frames[3:] = [zoomed(pixels, 1.1) for pixels in frames[3:]]
     folder = write_pngs(tmp_path / 'night', frames)
@@ -243,7 +238,7 @@ def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
 
 
 @pytest.mark.slow
-def test_a_change_of_focus_is_refused_by_the_gate(tmp_path: Path) -> None:
+def test_a_change_of_focus_is_refused_by_the_gate(tmp_path) -> None:
     frames = frames_of(6)
     frames[3:] = [zoomed(pixels, 1.005) for pixels in frames[3:]]
     calibration = calibrate_images(write_pngs(tmp_path / 'night', frames))
@@ -252,9 +247,7 @@ def test_a_change_of_focus_is_refused_by_the_gate(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_bad_files_among_photographs_cost_a_line_for_each_reason(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_files_among_photographs_cost_a_line_for_each_reason(tmp_path, capfd) -> None:
     nights = frames_of(4)
     folder = write_pngs(tmp_path / 'night', [*nights, lights(0, 15)])
     os.mkfifo(folder / 'pipe.png')
@@ -298,7 +291,7 @@ def dark(seed: int) -> Pixels:
     return pixels.astype(np.uint16)
 
 
-def test_the_group_with_stars_is_taken_not_the_largest(tmp_path: Path) -> None:
+def test_the_group_with_stars_is_taken_not_the_largest(tmp_path) -> None:
     folder = write_pngs(tmp_path / 'card', [daylight(k, (400, 500)) for k in range(8)])
     for k, image in enumerate(tiny_images()[:3]):
         cv2.imwrite(str(folder / f'night{k}.png'), image.pixels)
@@ -311,9 +304,7 @@ def test_the_group_with_stars_is_taken_not_the_largest(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('other', [daylight, dark])
-def test_many_images_of_no_stars_do_not_hide_a_few_of_stars(
-    other: Callable[[int], Pixels],
-) -> None:
+def test_many_images_of_no_stars_do_not_hide_a_few_of_stars(other) -> None:
     nights = tiny_images()[:4]
     others = [Image(nights[0].time_ns - 10**9 * (k + 1), other(k)) for k in range(16)]
     found = from_stars([*others, *nights], load_catalog())
@@ -321,7 +312,7 @@ def test_many_images_of_no_stars_do_not_hide_a_few_of_stars(
 
 
 @pytest.mark.parametrize('kind', ['a slope', 'a glow', 'leaves and clouds'])
-def test_stars_on_a_bright_uneven_sky_are_counted(kind: str) -> None:
+def test_stars_on_a_bright_uneven_sky_are_counted(kind) -> None:
     """Over a daylight sky, whose levels differ by more than the stars are above it; no others."""
     v, u = np.mgrid[:512, :640]
     rng = np.random.default_rng(3)
@@ -348,7 +339,7 @@ def found_stars() -> FromStars:
 @pytest.mark.parametrize('is_colour', [False, True])
 @pytest.mark.parametrize('is_rendered', [False, True])
 def test_the_brightnesses_of_the_stars_show_a_tone_curve(
-    tmp_path: Path, is_rendered: bool, is_colour: bool, is_mirrored: bool
+    tmp_path, is_rendered, is_colour, is_mirrored
 ) -> None:
     frames = []
     for image in tiny_images()[:3]:
@@ -372,7 +363,7 @@ def test_the_brightnesses_of_the_stars_show_a_tone_curve(
 
 
 @pytest.mark.parametrize('kind', ['Dark Frame', 'FLAT', 'Bias Frame', 'Master Dark'])
-def test_frames_of_the_detector_are_left_out_by_their_headers(tmp_path: Path, kind: str) -> None:
+def test_frames_of_the_detector_are_left_out_by_their_headers(tmp_path, kind) -> None:
     for name, value in (('light', 'Light Frame'), ('other', kind)):
         hdu = fits.PrimaryHDU(np.ones((30, 40), np.float32))
         hdu.header['IMAGETYP'] = value
@@ -415,9 +406,7 @@ TOO_FEW: dict[str, tuple[Callable[[], Sequence[Pixels]], str]] = {
 @pytest.mark.parametrize(
     'name', [pytest.param(name, marks=[pytest.mark.slow] * (name == 'no sky')) for name in TOO_FEW]
 )
-def test_frames_that_show_too_few_stars_are_counted_with_the_remedy(
-    name: str, tmp_path: Path
-) -> None:
+def test_frames_that_show_too_few_stars_are_counted_with_the_remedy(name, tmp_path) -> None:
     frames, words = TOO_FEW[name]
     with pytest.raises(NotFromStars, match=words):
         calibrate_images(write_pngs(tmp_path / 'night', frames()))
@@ -431,9 +420,7 @@ def test_frames_that_show_too_few_stars_are_counted_with_the_remedy(
     ([1800.0, 1800.0, 1980.0], None),
     (np.linspace(1764.0, 1836.0, 11), None),  # a focus that drifts
 ])  # fmt: skip
-def test_a_few_images_of_another_focal_length_are_left_out_and_named(
-    focal_px: Sequence[float], others_px: tuple[float, ...] | None
-) -> None:
+def test_a_few_images_of_another_focal_length_are_left_out_and_named(focal_px, others_px) -> None:
     none = np.empty(0, np.int64)
     matches = {
         time_ns: SkyMatch(
@@ -457,7 +444,7 @@ def test_a_few_images_of_another_focal_length_are_left_out_and_named(
 
 
 @pytest.mark.parametrize('model', ['equidistant', 'rational_polynomial', 'tilted', 'auto'])
-def test_a_stated_lens_model_is_that_of_the_camera_found(tmp_path: Path, model: str) -> None:
+def test_a_stated_lens_model_is_that_of_the_camera_found(tmp_path, model) -> None:
     source = _set_up(found_stars(), [], {'lens_model': model}, tmp_path, False, Topics())
     camera, found = source.setup.prior.camera, found_stars().camera
     assert camera.model == ('plumb_bob' if model == 'auto' else model)
@@ -469,7 +456,7 @@ def test_a_stated_lens_model_is_that_of_the_camera_found(tmp_path: Path, model: 
 
 @pytest.mark.slow
 def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_stated(
-    tmp_path: Path,
+    tmp_path,
 ) -> None:
     frames = write_pngs(tmp_path / 'night', frames_of(3))
     photographs, _ = photographs_of([frames], 18.0, 10.0)  # of the small bag, within 1 %

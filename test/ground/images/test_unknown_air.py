@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import dataclasses
 import functools
 import math
-from pathlib import Path
 
 import erfa
 import numpy as np
@@ -165,7 +164,7 @@ def unmoved(pixels: Floats) -> Floats:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('wrong_clock', [False, True])
-def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: bool) -> None:
+def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock) -> None:
     errors = []
     for seed in range(4):
         images, text = with_air(seen_from(SITE, seed, wrong_clock), CAMERA)
@@ -209,7 +208,7 @@ def test_air_that_is_recorded_is_not_applied_again() -> None:
 
 
 @pytest.mark.slow
-def test_a_camera_with_attitudes_on_the_ground_needs_no_site(tmp_path: Path) -> None:
+def test_a_camera_with_attitudes_on_the_ground_needs_no_site(tmp_path) -> None:
     """Recorded with a wrong clock; the prior camera is off by 2 % and 20 px."""
     prior = CameraGeometry(CAMERA.replace(fx=2040.0, fy=2040.0, cx=591.0), np.eye(4)[3])
     values = {'observer': 'ground', 'star_tracker_sigma_arcsec': [10.0, 10.0, 10.0]}

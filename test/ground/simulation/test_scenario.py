@@ -7,7 +7,6 @@ import dataclasses
 from datetime import datetime, timezone
 import json
 import math
-from pathlib import Path
 
 import erfa
 import numpy as np
@@ -145,9 +144,7 @@ def test_a_drift_is_linear_from_the_date_of_the_scenario() -> None:
 
 
 @pytest.mark.slow
-def test_a_trend_finds_the_drift_of_simulated_bags(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_trend_finds_the_drift_of_simulated_bags(tmp_path, capsys) -> None:
     for k in range(CAMPAIGNS):
         bag, out = tmp_path / 'bags' / str(k), tmp_path / 'mission' / str(k)
         camera = ['--scenario', 'tiny', '--images', '4', '--seed', str(k), '--camera-seed', '1']

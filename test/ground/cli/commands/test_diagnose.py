@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 from pathlib import Path
 
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import pytest
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 import yaml
 
 REAL_SKY = Path(__file__).parents[5] / 'shared' / 'realsky'
@@ -39,7 +37,7 @@ def _of_camera(folder: Path, **numbers: float) -> list[str]:
     ],
 )
 def test_it_says_that_all_fits_only_of_what_calibrate_accepts(
-    given: Callable[[Path], list[str]], cause: str | None, tmp_path: Path, starcal: Starcal
+    given, cause, tmp_path, starcal
 ) -> None:
     arguments = given(tmp_path)
     if not Path(arguments[0]).exists():

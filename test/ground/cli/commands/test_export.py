@@ -9,7 +9,6 @@ from pathlib import Path
 from export_calibrations import calibration  # type: ignore[import-not-found]
 import pytest
 import spiceypy
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 
 from starcal_ros.formats.products.product_files import write_calibration
 
@@ -21,7 +20,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / 'out'
 
 
-def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, starcal: Starcal) -> None:
+def test_export_writes_kernels_that_load(folder, tmp_path, starcal) -> None:
     kernels = tmp_path / 'deep/kernels'
     line = (
         f'export {folder} --to spice -o {kernels} --spacecraft-id -999 --star-tracker-id -999100'
@@ -35,13 +34,13 @@ def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, starcal: 
     spiceypy.kclear()
 
 
-def test_export_states_the_cost_of_each_part(folder, tmp_path: Path, starcal: Starcal) -> None:
+def test_export_states_the_cost_of_each_part(folder, tmp_path, starcal) -> None:
     lines = starcal('export', folder, '--to', 'opencv', '-o', tmp_path).out.splitlines()
     assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')
 
 
 @pytest.mark.parametrize('accepted', [True, False])
-def test_export_warns_of_a_refused_calibration(folder, tmp_path, starcal, accepted: bool) -> None:
+def test_export_warns_of_a_refused_calibration(folder, tmp_path, starcal, accepted) -> None:
     reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
     judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
     write_calibration(judged, folder / 'calibration.json')

@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 
 import pytest
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 _PARAMS = ['--params', str(TINY / 'params.yaml')]
@@ -22,9 +21,7 @@ def allowed(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_table_and_the_file_say_the_same(
-    allowed: Path, tiny_products: Path, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_the_table_and_the_file_say_the_same(allowed, tiny_products, tmp_path, starcal) -> None:
     output = tmp_path / 'plan.csv'
     observed = [str(tiny_products / 'observations.mcap'), *_PARAMS]
     given = ['--pointings', str(allowed), '--images', '5', '--minimise', 'map']

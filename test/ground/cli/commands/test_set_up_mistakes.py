@@ -109,9 +109,7 @@ def said(
         (_of_pixels(lambda p: p[::2, ::2]), 0.0, ['binned 2 x 2', 'fx, fy, cx, cy = 900.']),
     ],
 )  # fmt: skip
-def test_a_mistake_of_the_bag(
-    write: Write, shift_s: float | None, words: list[str], tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_mistake_of_the_bag(write, shift_s, words, tmp_path, starcal) -> None:
     path = bag(tmp_path / 'bag.mcap', write, shift_s)
     for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():
         for word in words:
@@ -119,7 +117,7 @@ def test_a_mistake_of_the_bag(
 
 
 @pytest.mark.slow
-def test_clocks_that_cannot_be_matched_are_two_clocks(tmp_path: Path, starcal: Starcal) -> None:
+def test_clocks_that_cannot_be_matched_are_two_clocks(tmp_path, starcal) -> None:
     """With the attitudes of one image only no shift can be found."""
     path = bag(tmp_path / 'bag.mcap', _raw, 7200.0, cut=4)
     for text in said(starcal, tmp_path, path, params_with(tmp_path)).values():
@@ -135,17 +133,13 @@ def test_clocks_that_cannot_be_matched_are_two_clocks(tmp_path: Path, starcal: S
         ({'magnitude_limit': 2.0}, ['magnitude_limit: 2 leaves', 'raise it']),
     ],
 )
-def test_a_mistake_of_the_parameters(
-    changes: dict[str, Any], words: list[str], tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_mistake_of_the_parameters(changes, words, tmp_path, starcal) -> None:
     for text in said(starcal, tmp_path, TINY, params_with(tmp_path, **changes)).values():
         for word in words:
             assert word in text
 
 
-def test_an_uncertainty_of_the_mounting_that_is_too_small(
-    tmp_path: Path, starcal: Starcal
-) -> None:
+def test_an_uncertainty_of_the_mounting_that_is_too_small(tmp_path, starcal) -> None:
     """A field of half a degree, off by another one, and stated to be known to 0.01 degrees."""
     given = dataclasses.replace(scenario('narrow'), image_count=6)
     mistakes = simulated_bag.Mistakes(alignment_error_deg=0.5)
@@ -158,7 +152,7 @@ def test_an_uncertainty_of_the_mounting_that_is_too_small(
     assert 'Set prior_alignment: [' in found
 
 
-def test_the_remedy_is_named_without_parameters(tmp_path: Path, starcal: Starcal) -> None:
+def test_the_remedy_is_named_without_parameters(tmp_path, starcal) -> None:
     path = bag(tmp_path / 'bag.mcap', _bmp)
     status, out, _ = starcal('diagnose', path)
     assert status == 3

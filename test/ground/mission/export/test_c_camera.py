@@ -170,7 +170,7 @@ def check_slopes(
 
 @pytest.mark.parametrize('with_field', [False, True])
 @pytest.mark.parametrize('model', MODELS)
-def test_c_gives_the_numbers_of_python(tmp_path: Path, model: str, with_field: bool) -> None:
+def test_c_gives_the_numbers_of_python(tmp_path, model, with_field) -> None:
     made = with_correlations(calibration(model, with_field=with_field, temperature=True))
     program = built(made, tmp_path, level='-O1' if with_field else '-O0')
     assert run(program, 'selftest') == (0, '')
@@ -180,14 +180,14 @@ def test_c_gives_the_numbers_of_python(tmp_path: Path, model: str, with_field: b
 
 @pytest.mark.parametrize(('compiler', 'standard'), COMPILERS)
 def test_it_compiles_without_a_warning_and_passes_its_self_test(
-    tmp_path: Path, compiler: str, standard: str
+    tmp_path, compiler, standard
 ) -> None:
     made = calibration('tilted', with_field=True)
     program = built(made, tmp_path, compiler, standard, '-O1')
     assert run(program, 'selftest') == (0, '')
 
 
-def test_the_budget_and_the_identity_of_the_calibration(tmp_path: Path) -> None:
+def test_the_budget_and_the_identity_of_the_calibration(tmp_path) -> None:
     budget = (SigmaPart('total', 0.16, 0.4, ''), SigmaPart('stars', 0.15, 0.1, 'estimated'))
     made = dataclasses.replace(calibration(), sigma_budget=budget)
     program = built(made, tmp_path)
@@ -202,7 +202,7 @@ def test_the_budget_and_the_identity_of_the_calibration(tmp_path: Path) -> None:
     assert identity == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_program_takes_a_new_table_without_compiling_again(tmp_path: Path) -> None:
+def test_a_program_takes_a_new_table_without_compiling_again(tmp_path) -> None:
     program = built(calibration('plumb_bob'), tmp_path)
     newer = with_correlations(calibration('equidistant', with_field=True, temperature=True))
     done = export(newer, 'c', tmp_path, Request(table=True))
@@ -218,7 +218,7 @@ def sealed(table: bytearray) -> bytes:
     return bytes(table)
 
 
-def test_damaged_truncated_and_foreign_tables_are_refused(tmp_path: Path) -> None:
+def test_damaged_truncated_and_foreign_tables_are_refused(tmp_path) -> None:
     made = calibration('plumb_bob', with_field=True)
     program, table = built(made, tmp_path), c_table(made)
     path = tmp_path / 'table.bin'
@@ -253,7 +253,7 @@ def test_damaged_truncated_and_foreign_tables_are_refused(tmp_path: Path) -> Non
     assert status(sealed(wide)) == TOO_LARGE
 
 
-def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path: Path) -> None:
+def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path) -> None:
     """Each number in turn out of all range, with a CRC that fits: no result, or a finite one."""
     budget = (SigmaPart('total', 0.16, 0.4, ''),)
     made = dataclasses.replace(calibration('tilted', with_field=True), sigma_budget=budget)
@@ -281,7 +281,7 @@ def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path: Path) 
         assert run(program, 'status', path)[0] == DAMAGED
 
 
-def test_a_table_that_is_not_this_calibration_fails_its_self_test(tmp_path: Path) -> None:
+def test_a_table_that_is_not_this_calibration_fails_its_self_test(tmp_path) -> None:
     made = calibration('plumb_bob')
     program, table = built(made, tmp_path), bytearray(c_table(made))
     focal_px = struct.unpack('<d', table[120:128])[0]
@@ -291,7 +291,7 @@ def test_a_table_that_is_not_this_calibration_fails_its_self_test(tmp_path: Path
     assert run(program, 'selftest', path)[0] == 10
 
 
-def test_directions_that_the_camera_does_not_see_are_refused(tmp_path: Path) -> None:
+def test_directions_that_the_camera_does_not_see_are_refused(tmp_path) -> None:
     made = calibration('plumb_bob')
     strong = made.geometry.camera.replace(k1=-0.9, k2=0.0, k3=0.0)
     made = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=strong))
@@ -305,7 +305,7 @@ def test_directions_that_the_camera_does_not_see_are_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize('with_field', [False, True])
-def test_c_and_python_have_the_same_edge_of_the_detector(tmp_path: Path, with_field: bool) -> None:
+def test_c_and_python_have_the_same_edge_of_the_detector(tmp_path, with_field) -> None:
     made = calibration('plumb_bob', with_field=with_field)
     camera = made.geometry.camera
     right, bottom = camera.width - 0.5, camera.height - 0.5
@@ -326,7 +326,7 @@ def test_c_and_python_have_the_same_edge_of_the_detector(tmp_path: Path, with_fi
         np.testing.assert_array_equal(np.isnan(found), np.tile(outside, (found.shape[1], 1)).T)
 
 
-def test_the_function_of_the_page_compiles(tmp_path: Path) -> None:
+def test_the_function_of_the_page_compiles(tmp_path) -> None:
     for name, text in c_files(calibration()).items():
         (tmp_path / name).write_text(text)
     page = Path(__file__).parents[4] / 'docs/onboard.md'
@@ -335,7 +335,7 @@ def test_the_function_of_the_page_compiles(tmp_path: Path) -> None:
     subprocess.run(['gcc', '-std=c99', *WARNINGS, '-c', 'page.c'], cwd=tmp_path, check=True)
 
 
-def test_it_uses_no_heap_and_no_function_but_those_of_libm(tmp_path: Path) -> None:
+def test_it_uses_no_heap_and_no_function_but_those_of_libm(tmp_path) -> None:
     for name, text in c_files(calibration('tilted', with_field=True)).items():
         (tmp_path / name).write_text(text)
     made = tmp_path / 'camera.o'

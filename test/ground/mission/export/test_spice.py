@@ -139,7 +139,7 @@ def test_numbers_read_back_but_for_two_last_bits(load) -> None:
     np.testing.assert_allclose(q[[1, 2, 3, 0]], xyzw, LAST_BITS, 0)
 
 
-def test_the_kernel_of_the_mission_may_define_the_star_tracker(load, tmp_path: Path) -> None:
+def test_the_kernel_of_the_mission_may_define_the_star_tracker(load, tmp_path) -> None:
     made = calibration()
     names = SpiceNames(-123, -123400, 0, 'ABC_NAC', 'ABC_ST1')
     fk, _ = load(made, names)
@@ -177,14 +177,12 @@ def test_kernels_are_ascii_with_lines_that_spice_reads(load) -> None:
         (SpiceNames(-99999999), 'shorter NAIF ID'),
     ],
 )
-def test_names_that_spice_does_not_take_are_refused(
-    names: SpiceNames, words: str, tmp_path: Path
-) -> None:
+def test_names_that_spice_does_not_take_are_refused(names, words, tmp_path) -> None:
     with pytest.raises(OptionError, match=words):
         export(calibration(), 'spice', tmp_path, Request(names))
 
 
-def test_a_field_of_view_wider_than_a_half_space_is_left_out(tmp_path: Path) -> None:
+def test_a_field_of_view_wider_than_a_half_space_is_left_out(tmp_path) -> None:
     made = calibration('equidistant')
     camera = made.geometry.camera.replace(fx=400.0, fy=400.0)
     wide = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=camera))
@@ -224,9 +222,7 @@ def written(
 
 
 @pytest.mark.parametrize('tracker', [0, FRAME_ID])
-def test_spice_has_the_attitude_of_each_image_and_none_between(
-    tmp_path: Path, tracker: int
-) -> None:
+def test_spice_has_the_attitude_of_each_image_and_none_between(tmp_path, tracker) -> None:
     refused = refused_image(FIRST_NS - 10**10, 1296, 1024, 'no_match', '')
     images = [refused, *map(observed, range(len(TRUTH)))]
     done = written(tmp_path, MADE, images, tracker)
@@ -254,7 +250,7 @@ def test_spice_has_the_attitude_of_each_image_and_none_between(
     spiceypy.kclear()
 
 
-def test_without_stars_or_clock_it_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+def test_without_stars_or_clock_it_is_refused_and_nothing_is_written(tmp_path) -> None:
     with pytest.raises(ProductError, match='no image with stars'):
         written(tmp_path, MADE, [], 0)
     with pytest.raises(OptionError, match='^--kernels: give the leap seconds kernel'):

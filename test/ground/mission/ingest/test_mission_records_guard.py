@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import gzip
 import os
 from pathlib import Path
@@ -44,7 +44,7 @@ def write_tiled(path: Path, side: int) -> None:
     fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
 
 
-def test_a_tiled_image_of_ordinary_size_is_read(tmp_path: Path) -> None:
+def test_a_tiled_image_of_ordinary_size_is_read(tmp_path) -> None:
     write_tiled(tmp_path / 'a.fits', 600)
     with Guard() as guard:  # astropy is imported in its time
         found = guard.call(tmp_path / 'a.fits', look, tmp_path / 'a.fits', TIMED)
@@ -71,9 +71,7 @@ def write_empty_extensions(path: Path) -> None:
     ],
     ids=['small tiled image', 'header without end', 'many empty extensions'],
 )
-def test_a_file_may_not_take_gigabytes_or_minutes(
-    name: str, write: Callable[[Path], None], why: str, tmp_path: Path, guard: Guard
-) -> None:
+def test_a_file_may_not_take_gigabytes_or_minutes(name, write, why, tmp_path, guard) -> None:
     path = tmp_path / name
     write(path)
     with pytest.raises(IngestError, match=rf'{re.escape(name)}: .*({why})') as error:
@@ -81,13 +79,13 @@ def test_a_file_may_not_take_gigabytes_or_minutes(
     assert '\n' not in str(error.value)
 
 
-def test_a_reader_may_not_wait_for_a_pipe(tmp_path: Path, forked_readers: None) -> None:
+def test_a_reader_may_not_wait_for_a_pipe(tmp_path, forked_readers) -> None:
     os.mkfifo(tmp_path / 'pipe')
     with Guard(wall_s=1.0) as guard, pytest.raises(IngestError, match='than 1 s .* a pipe'):
         guard.call('pipe', os.open, tmp_path / 'pipe', os.O_RDONLY)
 
 
-def test_a_reader_that_ends_costs_its_call_only(guard: Guard) -> None:
+def test_a_reader_that_ends_costs_its_call_only(guard) -> None:
     for function, args, why in (
         (bytearray, (2**31,), 'x: needs more than 1 GB of memory'),
         (os.abort, (), 'x: ends its reader with status -6'),
@@ -99,7 +97,7 @@ def test_a_reader_that_ends_costs_its_call_only(guard: Guard) -> None:
         assert guard.call('x', abs, -3) == 3
 
 
-def test_what_a_library_prints_is_no_answer(guard: Guard) -> None:
+def test_what_a_library_prints_is_no_answer(guard) -> None:
     assert guard.call('x', os.write, 1, b'printed') == 7
     assert guard.call('x', print, 'printed') is None
 

@@ -69,9 +69,7 @@ def run(starcal: Starcal) -> Starcal:
 
 
 @pytest.mark.slow
-def test_the_imported_bag_gives_the_calibration_of_the_original(
-    night: Path, tmp_path: Path, run: Starcal
-) -> None:
+def test_the_imported_bag_gives_the_calibration_of_the_original(night, tmp_path, run) -> None:
     aem, bag = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag'
     velocities = ['--velocity', write_velocities(tmp_path / 'velocity.csv')]
     prior = ['--camera', TINY / 'camera.yaml', '--alignment', *ALIGNMENT]
@@ -95,7 +93,7 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
     assert record['scale'] == {'offset': 0.0, 'step': 1.0, 'dtype': images()[0].pixels.dtype.name}
 
 
-def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_a_ck_has_an_attitude_at_each_image(night, tmp_path, run) -> None:
     kernels = write_ck(tmp_path)
     bag = tmp_path / 'bag.mcap'
     attitude = ['--attitude', *kernels, '--star-tracker', FRAME_ID]
@@ -108,7 +106,7 @@ def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, run: St
 
 
 @pytest.mark.slow
-def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_several_star_trackers_of_one_aem(night, tmp_path, run) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     start = aem.read_text().index('META_START')
     second = aem.read_text()[start:].replace('STARTRACKER_1', 'ST-2')
@@ -131,7 +129,7 @@ def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, run: Star
     assert values['more_alignments'] == list(ALIGNMENT)
 
 
-def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_images_without_attitudes_are_named(night, tmp_path, run) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     lines = aem.read_text().splitlines()
     start = lines.index('DATA_START') + 1
@@ -143,7 +141,7 @@ def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, run: St
     assert 'images are in gaps of up to' in out and 'have no attitude about them' in out
 
 
-def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_attitudes_of_another_day_are_refused(night, tmp_path, run) -> None:
     aem = write_aem(tmp_path / 'a.aem')
     aem.write_text(aem.read_text().replace('2026-05-15T07:', '2027-05-15T07:'))
     spans = [
@@ -157,9 +155,7 @@ def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, run: 
     )
 
 
-def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
-    night: Path, tmp_path: Path, run: Starcal
-) -> None:
+def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(night, tmp_path, run) -> None:
     (tmp_path / 'bag').mkdir()
     camera = shutil.copy(TINY / 'camera.yaml', tmp_path / 'bag/camera.yaml')
     for images_of in ('[0-3].fits', '*.fits'):
@@ -169,7 +165,7 @@ def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
     assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
 
 
-def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_a_hostile_file_costs_one_line(night, tmp_path, run) -> None:
     (tmp_path / 'cut.fits').write_bytes(b'nothing')
     with (tmp_path / 'huge.fits').open('wb') as file:
         file.write(fits.PrimaryHDU(np.zeros((2, 2))).header.tostring().encode())
@@ -185,7 +181,7 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, run: Starcal
     assert 'huge.fits: needs more than 1 GB of memory to be read' in second
 
 
-def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, run: Starcal) -> None:
+def test_the_pixels_of_the_camera_are_in_the_record(tmp_path, run) -> None:
     for number, image in enumerate(images()[:3]):
         upside_down = Image(image.time_ns, image.pixels[::-1].copy())
         header = {'DATE-AVG': date(image.time_ns), 'ROWORDER': 'BOTTOM-UP'}
@@ -201,7 +197,7 @@ def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, run: Starcal
 
 @pytest.mark.slow
 def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_them(
-    night: Path, tmp_path: Path, run: Starcal
+    night, tmp_path, run
 ) -> None:
     """Of two bags with files of one name, and of the observations of their calibration."""
     aem, prior = write_aem(tmp_path / 'a.aem'), ['--camera', str(TINY / 'camera.yaml')]
@@ -222,9 +218,7 @@ def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_th
 
 
 @pytest.mark.slow
-def test_imports_and_simulations_do_not_replace_each_other(
-    night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
-) -> None:
+def test_imports_and_simulations_do_not_replace_each_other(night, tmp_path, run, starcal) -> None:
     """Each may be repeated: the files beside a bag would else be those of another one."""
     aem, imported, simulated = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'sim'
     for _ in range(2):
@@ -235,9 +229,7 @@ def test_imports_and_simulations_do_not_replace_each_other(
 
 
 @pytest.mark.slow
-def test_observations_carry_the_originals_of_their_bag(
-    night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
-) -> None:
+def test_observations_carry_the_originals_of_their_bag(night, tmp_path, run, starcal) -> None:
     aem, bag, out = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'out'
     assert run(aem, night / '*.fits').status == 0
     params = ['--params', str(TINY / 'params.yaml'), '--no-report', '--quiet']
@@ -251,7 +243,7 @@ def test_observations_carry_the_originals_of_their_bag(
     assert all(digest in page for digest in originals.values())
 
 
-def test_a_coarse_scale_is_named(tmp_path: Path, run: Starcal) -> None:
+def test_a_coarse_scale_is_named(tmp_path, run) -> None:
     for number, image in enumerate(images()[:3]):
         write_fits(tmp_path / f'{number}.fits', image, 'float32')
     aem = write_aem(tmp_path / 'a.aem')

@@ -40,7 +40,7 @@ def test_a_pattern_names_spacecraft_and_camera(pattern, name, expected) -> None:
     assert Cameras(pattern).of(name) == dict(zip(('spacecraft', 'camera'), expected, strict=True))
 
 
-def test_the_names_are_replaced_in_the_path_of_the_parameters(tmp_path: Path) -> None:
+def test_the_names_are_replaced_in_the_path_of_the_parameters(tmp_path) -> None:
     cameras = Cameras('{spacecraft}/*', str(tmp_path / '{spacecraft}.yaml'))
     assert cameras.params_of('B/y.mcap') == str(tmp_path / 'B.yaml')
     assert Cameras().params_of('x') == ''
@@ -49,14 +49,14 @@ def test_the_names_are_replaced_in_the_path_of_the_parameters(tmp_path: Path) ->
 @pytest.mark.parametrize(
     'text', ['cameras.csv', '{camera', '{other}/x', '{camera}/{camera}', '{spacecraft}/{camera}}']
 )
-def test_a_bad_pattern_is_one_line(text: str) -> None:
+def test_a_bad_pattern_is_one_line(text) -> None:
     with pytest.raises(StarcalError, match='not a pattern with') as caught:
         Cameras(text)
     assert '\n' not in str(caught.value)
 
 
 @pytest.mark.slow
-def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path: Path) -> None:
+def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path) -> None:
     for day in range(4):
         for name in ('A', 'B'):
             write(tmp_path / f'fleet/{name}/nav/{day}', day, stars_used=100 + ord(name))
