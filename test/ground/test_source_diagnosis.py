@@ -59,7 +59,8 @@ def contents_of(path: Path) -> Contents:
     return without_setup([path], ASKED, OptionError('not found')).contents
 
 
-def write_spoilt(path: Path, images: list[Image]) -> None:
+@pytest.fixture(scope='module')
+def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     The tiny bag with an image of each fault: sky, stamp, size, attitude.
 
@@ -67,6 +68,8 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
     dark; image 5 is cut; the samples about image 7 are no rotations; after image 9 the attitudes
     end, and one more image comes.
     """
+    path: Path = tmp_path_factory.mktemp('bag') / 'spoilt.mcap'
+    images: tuple[Image, ...] = tiny_images()
     stamps = [image.time_ns for image in images]
 
     def near(k: int, time_ns: int) -> bool:
@@ -87,13 +90,12 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
             for _ in range(2 if k == 3 else 1):
                 writer.write_image(IMAGE, Image(image.time_ns, pixels), 'camera')
         writer.write_image(IMAGE, Image(stamps[-1] + 10**10, images[-1].pixels), 'camera')
+    return path
 
 
 @pytest.mark.slow
-def test_verdicts_are_those_of_the_calibration(tmp_path, setup) -> None:
-    path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images())
-    quick = contents_of(path)
+def test_verdicts_are_those_of_the_calibration(spoilt, setup) -> None:
+    quick = contents_of(spoilt)
     assert {r.reason: r.count for r in quick.refused} == {
         'no_attitude': 2,
         'attitude_gap': 1,
@@ -103,14 +105,14 @@ def test_verdicts_are_those_of_the_calibration(tmp_path, setup) -> None:
     assert quick.images == quick.looked_at == 12 and not quick.stars_per_image
     seen = []
     progress = lambda count: contextlib.nullcontext(lambda: seen.append(count))  # noqa: E731
-    examined = examine(Source((path,), ASKED, setup), progress)
+    examined = examine(Source((spoilt,), ASKED, setup), progress)
     full = examined.contents
     by_reason = {r.reason: r.count for r in full.refused}
     # With the stars and the camera, two more: the dark image and the cut one.
     expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
     assert seen == 12 * [12] and full.images == full.looked_at == 12
-    observed = list(topics.read([path], Topics(IMAGE, ATTITUDE), setup))
+    observed = list(topics.read([spoilt], Topics(IMAGE, ATTITUDE), setup))
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')
@@ -131,10 +133,8 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path, starcal) -> None:
     assert status == EXIT_REFUSED and 'longest attitude gap' not in out
 
 
-def test_the_topics_are_told(tmp_path) -> None:
-    path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images())
-    attitude, image = sorted(contents_of(path).topics, key=lambda t: -t.bad)
+def test_the_topics_are_told(spoilt) -> None:
+    attitude, image = sorted(contents_of(spoilt).topics, key=lambda t: -t.bad)
     assert (attitude.name, attitude.bad) == (ATTITUDE, 4)
     assert attitude.rate_hz == pytest.approx(2.0) and attitude.count == 34
     assert image.name == IMAGE and image.count == 12 and image.bad == 0
@@ -176,10 +176,9 @@ def test_compressed_images_are_told_apart(tmp_path) -> None:
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 
-def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path) -> None:
+def test_a_cut_bag_is_read_as_far_as_it_goes(spoilt, tmp_path) -> None:
     cut = tmp_path / 'cut.mcap'
-    write_spoilt(cut, tiny_images())
-    cut.write_bytes(cut.read_bytes()[:-10_000])  # in the second chunk
+    cut.write_bytes(spoilt.read_bytes()[:-10_000])  # in the second chunk
     found = contents_of(cut)
     (damage,) = found.damage
     assert 'truncated' in damage
@@ -197,14 +196,12 @@ def test_recorded_observations_need_no_parameters(tiny_products, starcal) -> Non
 
 
 @pytest.mark.slow
-def test_the_tool_says_it_to_people_and_programs(tmp_path, starcal) -> None:
-    path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images())
-    status, out, _ = starcal('diagnose', path)
+def test_the_tool_says_it_to_people_and_programs(spoilt, starcal) -> None:
+    status, out, _ = starcal('diagnose', spoilt)
     assert status == 0
     assert '5 of 12 images' in out and 'attitude_gap' in out
     assert 'over 2 s' in out and 'too far apart' in out  # this image's, and what it means
-    made = json.loads(starcal('diagnose', path, '--json', '--params', PARAMS).out)['contents']
+    made = json.loads(starcal('diagnose', spoilt, '--json', '--params', PARAMS).out)['contents']
     assert made['images'] == 12 and len(made['stars_per_image']) == 5
     assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
 
