@@ -213,9 +213,12 @@ def test_a_program_takes_a_new_table_without_compiling_again(tmp_path) -> None:
     compare(newer, program, REFERENCE_DEGC, table)
 
 
-def sealed(table: bytearray) -> bytes:
-    table[16:20] = struct.pack('<I', zlib.crc32(bytes(table[20:])))
-    return bytes(table)
+def forged(table: bytes, place: int, kind: str, value: float) -> bytes:
+    """A table with another number at a place, and a CRC that fits."""
+    changed = bytearray(table)
+    struct.pack_into(kind, changed, place, value)
+    struct.pack_into('<I', changed, 16, zlib.crc32(bytes(changed[20:])))
+    return bytes(changed)
 
 
 def test_damaged_truncated_and_foreign_tables_are_refused(tmp_path) -> None:
@@ -239,18 +242,12 @@ def test_damaged_truncated_and_foreign_tables_are_refused(tmp_path) -> None:
         assert status(bytes(flipped)) == DAMAGED
     # Numbers that no starcal writes, with a CRC that fits.
     for place, value in [(20, 5), (24, 0), (32, 1 << 31), (36, 1 << 30), (44, 4096), (48, 8)]:
-        forged = bytearray(table)
-        forged[place : place + 4] = struct.pack('<I', value)
-        assert status(sealed(forged)) == DAMAGED, place
-    for focal_px in (float('nan'), float('inf'), -3600.0):
-        forged = bytearray(table)
-        forged[120:128] = struct.pack('<d', focal_px)
-        assert status(sealed(forged)) == DAMAGED
+        assert status(forged(table, place, '<I', value)) == DAMAGED, place
+    for focal_px in (math.nan, math.inf, -3600.0):
+        assert status(forged(table, 120, '<d', focal_px)) == DAMAGED
     count = made.geometry.camera.field.coefficients.shape[1]
-    wide = bytearray(table)
     place = len(table) - 2 * count * (2 * count + 1) - 4 * count
-    wide[place : place + 2] = struct.pack('<H', 128)
-    assert status(sealed(wide)) == TOO_LARGE
+    assert status(forged(table, place, '<H', 128)) == TOO_LARGE
 
 
 def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path) -> None:
@@ -264,9 +261,7 @@ def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path) -> Non
     refused = 0
     for place in numbers:
         for value in (1e308, -1e308, 1e160):
-            forged = bytearray(table)
-            forged[place : place + 8] = struct.pack('<d', value)
-            path.write_bytes(sealed(forged))
+            path.write_bytes(forged(table, place, '<d', value))
             status, text = run(program, 'sights', path, lines=pixels)
             assert status in (0, 8, 100 + DAMAGED), place
             for row in map(str.split, text.splitlines()):
@@ -275,19 +270,15 @@ def test_no_number_of_a_table_makes_a_result_that_is_not_finite(tmp_path) -> Non
                 refused += len(row) == 1
     assert refused > 0
     for value in (math.nan, math.inf):
-        forged = bytearray(table)
-        forged[at + 32 : at + 40] = struct.pack('<d', value)
-        path.write_bytes(sealed(forged))
+        path.write_bytes(forged(table, at + 32, '<d', value))
         assert run(program, 'status', path)[0] == DAMAGED
 
 
 def test_a_table_that_is_not_this_calibration_fails_its_self_test(tmp_path) -> None:
     made = calibration('plumb_bob')
-    program, table = built(made, tmp_path), bytearray(c_table(made))
-    focal_px = struct.unpack('<d', table[120:128])[0]
-    table[120:128] = struct.pack('<d', focal_px + 1e-6)
-    path = tmp_path / 'table.bin'
-    path.write_bytes(sealed(table))
+    program, table, path = built(made, tmp_path), c_table(made), tmp_path / 'table.bin'
+    (focal_px,) = struct.unpack_from('<d', table, 120)
+    path.write_bytes(forged(table, 120, '<d', focal_px + 1e-6))
     assert run(program, 'selftest', path)[0] == 10
 
 
