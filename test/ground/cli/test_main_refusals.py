@@ -38,6 +38,7 @@ FILES = {
 KEYS = {
     'bag': str(TINY),
     'bags': str(TINY.parent),
+    'params': f'--params {TINY}/params.yaml',
     'stated': f'{TINY} --params {TINY}/params.yaml -o new',
     'import': 'import --attitude a.aem -o new --images',
 }
@@ -49,10 +50,10 @@ WRONG: dict[str, tuple[str, ...]] = {
     "diagnose ''": ('empty path',),
     'calibrate': ('BAG',),
     'calibrate {bag}': ('-o/--output DIR: not given', 'e.g. -o out'),
-    "calibrate {bag} --params {bag}/params.yaml -o ''": ('--output',),
+    "calibrate {bag} {params} -o ''": ('--output',),
     'calibrate {bag} --params {bag}/tiny_0.mcap -o new': ('larger than',),
-    'calibrate {bags} --params {bag}/params.yaml -o new': ('did you mean', str(TINY)),
-    'calibrate {bag} --params {bag}/params.yaml -o notes.txt': ('notes.txt',),
+    'calibrate {bags} {params} -o new': ('did you mean', str(TINY)),
+    'calibrate {bag} {params} -o notes.txt': ('notes.txt',),
     'calibrate {bag} --params no_head.yaml -o new': ('write /**: and ros__parameters: above',),
     'calibrate {bag} --params no_node.yaml -o new': ('write /**: above',),
     'calibrate {bag} --params other_node.yaml -o new': ('no section /**', 'other_node'),
@@ -86,26 +87,23 @@ WRONG: dict[str, tuple[str, ...]] = {
     # What is stated of a star tracker has to be there.
     'calibrate night -o new --set star_tracker_slow_arcsec=5': (
         'star_tracker_slow_arcsec: stated, but image files have no attitudes', '--camera-alone'),
-    'calibrate night --params {bag}/params.yaml -o new': (
-        'a bag that has them (starcal import)',),
+    'calibrate night {params} -o new': ('a bag that has them (starcal import)',),
     'calibrate night.mcap -o begun --set star_tracker_slow_arcsec=5': ('--camera-alone',),
     'diagnose night --set star_tracker_slow_arcsec=5': ('--camera-alone',),
-    'diagnose night/0.png --params {bag}/params.yaml': ('a bag that has them (starcal import)',),
+    'diagnose night/0.png {params}': ('a bag that has them (starcal import)',),
     'plan night --set star_tracker_slow_arcsec=5': ('--camera-alone',),
     # By the stars alone: a file that is none is named.
     'calibrate cut -o begun': ('no image can be read; left out: 1 file (001.fits): not',),
     'diagnose cut/001.fits': ('no image can be read; left out: 1 file (001.fits): not',),
     'calibrate observations.mcap -o begun': ('shows no camera: give the parameter file',),
     'calibrate colour.mcap -o begun': ('set image_channel, e.g. to green',),
-    'calibrate colour.mcap --params {bag}/params.yaml -o begun': (
-        'set image_channel, e.g. to green',),
+    'calibrate colour.mcap {params} -o begun': ('set image_channel, e.g. to green',),
     'plan nothing': ('nothing: no .mcap files in the folder, nor images',),
-    'plan {bag} --params {bag}/params.yaml --pointings ra_dec.csv': (
-        'no column ra_deg and dec_deg',),
-    'plan {bag} --params {bag}/params.yaml --pointings north.csv': (
+    'plan {bag} {params} --pointings ra_dec.csv': ('no column ra_deg and dec_deg',),
+    'plan {bag} {params} --pointings north.csv': (
         "line 2: could not convert string to float: 'north'",),
-    'plan {bag} --params {bag}/params.yaml --pointings none.csv': ('no pointings',),
-    'plan {bag} --params {bag}/params.yaml --pointings beyond.csv': ('not a direction',),
+    'plan {bag} {params} --pointings none.csv': ('no pointings',),
+    'plan {bag} {params} --pointings beyond.csv': ('not a direction',),
     'compare none': ('B',),
     'compare none none': ('none', 'No such file'),
     'compare {bag} {bag}': (str(TINY), 'no calibration.json'),

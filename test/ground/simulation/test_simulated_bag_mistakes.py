@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 def test_each_is_named(options, cause, tmp_path, starcal) -> None:
     bag = tmp_path / 'bag'
     made = starcal('simulate', '-o', bag, '--scenario', 'tiny', '--images', 4, *options)
-    assert made.status == 0
+    assert made.status == 0 and 'truth.json' in made.out and 'params.yaml' in made.out
     assert json.loads((bag / 'truth.json').read_text())['images'] == 4
     status, out, _ = starcal('diagnose', bag, '--params', bag / 'params.yaml', '--json')
     found = json.loads(out)
