@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -62,16 +60,9 @@ def test_public_names_are_those_that_can_be_imported() -> None:
         'write_calibration',
     ],
 )
-def test_an_old_name_leads_to_the_new_one(name: str) -> None:
+def test_an_old_name_leads_to_the_new_one(name) -> None:
     with pytest.raises(ImportError, match=f'^starcal_ros.{name} is starcal_ground.{name} now$'):
         exec(f'from starcal_ros import {name}')
-
-
-@pytest.mark.parametrize('package', ['starcal_ros', 'starcal_ground'])
-def test_the_import_alone_loads_nothing(package: str) -> None:
-    show = f'import sys; import {package}; print(*sys.modules)'
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
-    assert not {'numpy', 'cv2', 'starcal_ground.api'} & set(done.stdout.split())
 
 
 @pytest.mark.slow
@@ -130,7 +121,7 @@ def test_one_covariance_serves_all_stars() -> None:
         ('catalog_id', [1, 2], 'catalog_id: 2 numbers, not [0-9]+'),
     ],
 )
-def test_a_bad_array_is_named(argument: str, value: Any, complaint: str) -> None:
+def test_a_bad_array_is_named(argument, value, complaint) -> None:
     image = dict(arrays(ensemble().images[0]), **{argument: value})
     with pytest.raises(ValueError, match=complaint):
         starcal_ground.observations_of(SCENARIO.prior.camera, **image)
@@ -151,7 +142,7 @@ def test_too_few_images_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_bag_gives_what_the_tool_gives(tiny_bag: Path, tiny_products: Path) -> None:
+def test_a_bag_gives_what_the_tool_gives(tiny_bag, tiny_products) -> None:
     found = starcal_ground.calibrate_bag(tiny_bag, tiny_bag / 'params.yaml')
     written = starcal_ground.read_calibration(tiny_products)
     assert found.provenance == written.provenance
@@ -163,7 +154,7 @@ def test_a_bag_gives_what_the_tool_gives(tiny_bag: Path, tiny_products: Path) ->
     assert again.stars_used == found.stars_used
 
 
-def test_a_calibration_is_written_and_read(tiny_products: Path, tmp_path: Path) -> None:
+def test_a_calibration_is_written_and_read(tiny_products, tmp_path) -> None:
     calibration = starcal_ground.read_calibration(tiny_products)
     starcal_ground.write_calibration(calibration, tmp_path)
     starcal_ground.write_calibration(calibration, tmp_path / 'other.json')
@@ -190,7 +181,7 @@ def test_lines_of_sight_are_of_either_frame() -> None:
 
 
 @pytest.mark.parametrize('frame', ['camera', 'star_tracker'])
-def test_a_direction_is_projected_from_either_frame(frame: lookup.Frame) -> None:
+def test_a_direction_is_projected_from_either_frame(frame) -> None:
     pixels = np.array([[0.0, 0.0], [100.0, 50.0], [639.0, 511.0]])
     sights = starcal_ground.lines_of_sight(SCENARIO.truth, pixels, frame)
     back = starcal_ground.project(SCENARIO.truth, 3.0 * sights, frame)
@@ -198,9 +189,7 @@ def test_a_direction_is_projected_from_either_frame(frame: lookup.Frame) -> None
 
 
 @pytest.mark.parametrize(('frame', 'column'), [('camera', 1), ('star_tracker', 2)])
-def test_sigmas_of_lines_of_sight_are_those_of_the_table(
-    tiny_products: Path, frame: lookup.Frame, column: int
-) -> None:
+def test_sigmas_of_lines_of_sight_are_those_of_the_table(tiny_products, frame, column) -> None:
     calibration = starcal_ground.read_calibration(tiny_products)
     pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
     table = lookup.line_of_sight_table(
@@ -216,7 +205,7 @@ def test_sigmas_of_lines_of_sight_are_those_of_the_table(
     assert (np.abs(along) < 1e-9 * np.trace(covariance, axis1=-2, axis2=-1)).all()
 
 
-def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny_products: Path) -> None:
+def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny_products) -> None:
     alone = dataclasses.replace(starcal_ground.read_calibration(tiny_products), parent_frame='')
     for camera in (alone, alone.geometry.camera):
         assert starcal_ground.lines_of_sight(camera, [1.0, 2.0]).shape == (3,)
@@ -224,7 +213,7 @@ def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny_products: Path) ->
             starcal_ground.lines_of_sight(camera, [1.0, 2.0], 'star_tracker')
 
 
-def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products: Path) -> None:
+def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products) -> None:
     one, same = (starcal_ground.read_calibration(tiny_products) for _ in range(2))
     assert one == same and one != 'calibration'
     assert one != dataclasses.replace(one, covariance=2 * one.covariance)

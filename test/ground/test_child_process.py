@@ -45,32 +45,25 @@ def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str
     [
         ['--version'],
         # The lens is stated, so that the search for the camera, whose modules count too, is short.
-        [
-            *('diagnose', 'BAG'),
-            *('--focal-length-mm', '18', '--pixel-size-um', '10'),
-        ],
-        [
-            *('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml'),
-        ],
+        [*('diagnose', 'BAG'), *('--focal-length-mm', '18', '--pixel-size-um', '10')],
+        [*('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml')],
     ],
     ids=['version', 'diagnose', 'trend'],
 )
-def test_modules_of_the_current_folder_are_not_run(
-    hostile: Path, few_images: Path, start: list[str], arguments: list[str]
-) -> None:
+def test_modules_of_the_current_folder_are_not_run(hostile, few_images, start, arguments) -> None:
     given = [word.replace('BAG', str(few_images)) for word in arguments]
     done = run([*start, *given], hostile)
     assert done.returncode == 0, done.stderr
     assert not (hostile / 'marks').exists(), (hostile / 'marks').read_text()
 
 
-def test_the_marks_are_left_without_the_safe_path(hostile: Path) -> None:
+def test_the_marks_are_left_without_the_safe_path(hostile) -> None:
     """The test above could fail."""
     subprocess.run([sys.executable, '-c', 'import yaml'], cwd=hostile, check=True)
     assert (hostile / 'marks').read_text() == 'yaml\n'
 
 
-def test_other_programs_keep_their_path(tmp_path: Path) -> None:
+def test_other_programs_keep_their_path(tmp_path) -> None:
     (tmp_path / 'program.py').write_text('import starcal_ros, beside; print(beside.NAME)')
     (tmp_path / 'beside.py').write_text("NAME = 'beside'")
     for command in (['-m', 'program'], ['program.py']):

@@ -69,7 +69,7 @@ def compared(tmp_path: Path, starcal: Starcal) -> Compared:
     return run
 
 
-def test_nothing_differs_from_itself(tiny: Calibration) -> None:
+def test_nothing_differs_from_itself(tiny) -> None:
     found = compare(tiny, tiny)
     assert not found.difference.any()
     assert found.total.value == 0 and found.total.p_value == 1
@@ -89,7 +89,7 @@ def opencv_sight(calibration: Calibration) -> np.ndarray:
     )
 
 
-def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
+def test_the_map_is_what_opencv_says(tiny) -> None:
     a = moved(tiny, skew=-tiny.geometry.camera.parameters[1])
     b = moved(a, (2e-5, -1e-5, 4e-5), fx=1.0, cy=-0.5, k1=0.01, p2=1e-4)
     expected_px = np.linalg.norm(opencv_sight(b) - opencv_sight(a), axis=1) * float(
@@ -104,7 +104,7 @@ def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
     np.testing.assert_allclose(found.difference[10:], [2e-5, -1e-5, 4e-5], atol=1e-15)
 
 
-def test_a_turn_is_taken_off(tiny: Calibration) -> None:
+def test_a_turn_is_taken_off(tiny) -> None:
     found = compare(tiny, moved(tiny, (100 * ARCSECOND_RAD, 0.0, 0.0)))
     assert found.rotation_rad == pytest.approx(100 * ARCSECOND_RAD)
     middle = GRID // 2
@@ -114,7 +114,7 @@ def test_a_turn_is_taken_off(tiny: Calibration) -> None:
     assert found.after.length_px.max() < 1e-9
 
 
-def test_sigmas_of_the_maps_are_those_of_the_table(tiny: Calibration) -> None:
+def test_sigmas_of_the_maps_are_those_of_the_table(tiny) -> None:
     """Angles over angles, also where B has another focal length."""
     lens = dataclasses.replace(tiny.geometry.camera, field=None)
     geometry = dataclasses.replace(tiny.geometry, camera=lens)
@@ -137,7 +137,7 @@ def test_sigmas_of_the_maps_are_those_of_the_table(tiny: Calibration) -> None:
     assert made['alignment_arcsec'] == pytest.approx(expected_arcsec, rel=1e-12)
 
 
-def test_a_reference_temperature_of_one_alone_is_noted(tiny: Calibration) -> None:
+def test_a_reference_temperature_of_one_alone_is_noted(tiny) -> None:
     terms = TemperatureTerms(20.0, (), (), (), ())
     at_20, at_25 = (
         dataclasses.replace(tiny, temperature=dataclasses.replace(terms, reference_degc=degc))
@@ -148,7 +148,7 @@ def test_a_reference_temperature_of_one_alone_is_noted(tiny: Calibration) -> Non
         assert any('different temperatures' in note for note in notes) is noted
 
 
-def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
+def test_what_was_held_has_no_sigma(tiny) -> None:
     covariance = tiny.covariance.copy()
     cx = PARAMETER_NAMES.index('cx')
     covariance[cx] = covariance[:, cx] = 0.0
@@ -166,7 +166,7 @@ def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
     assert json.loads(made)['chi2'] is None
 
 
-def test_notes_say_what_weakens_the_sigmas(tiny: Calibration) -> None:
+def test_notes_say_what_weakens_the_sigmas(tiny) -> None:
     assert any('the same stars' in note for note in compare(tiny, tiny).notes)
     refused = dataclasses.replace(
         tiny, accepted=False, reasons=('too bad',), parent_frame='other', provenance={}
@@ -177,9 +177,7 @@ def test_notes_say_what_weakens_the_sigmas(tiny: Calibration) -> None:
     assert not any('the same stars' in note for note in notes)
 
 
-def test_cameras_alone_are_compared_without_an_alignment(
-    tiny: Calibration, compared: Compared
-) -> None:
+def test_cameras_alone_are_compared_without_an_alignment(tiny, compared) -> None:
     """Their alignment is of the prior camera: 82 arcsec of sigma, and no fit of any size."""
     alone = dataclasses.replace(tiny, parent_frame='')
     turned = dataclasses.replace(moved(tiny, (1e-2, 0.0, 0.0), fx=0.01), parent_frame='')
@@ -191,7 +189,7 @@ def test_cameras_alone_are_compared_without_an_alignment(
     assert content['alignment_arcsec'] is content['lines_of_sight'] is None
 
 
-def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
+def test_cameras_of_other_sizes_are_refused(tiny) -> None:
     camera = tiny.geometry.camera
     bigger = dataclasses.replace(
         tiny.geometry, camera=CameraModel(camera.width + 1, camera.height, camera.parameters)
@@ -201,9 +199,7 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
 
 
 @pytest.mark.parametrize('model', ['rational_polynomial', 'equidistant'])
-def test_two_lens_models_are_compared_by_their_lines_of_sight(
-    tiny: Calibration, model: str, compared: Compared
-) -> None:
+def test_two_lens_models_are_compared_by_their_lines_of_sight(tiny, model, compared) -> None:
     camera, worst_px = convert(tiny.geometry.camera, model)
     count = len(camera.parameters) + 3
     geometry = dataclasses.replace(tiny.geometry, camera=camera)
@@ -219,7 +215,7 @@ def test_two_lens_models_are_compared_by_their_lines_of_sight(
     assert content['parameter_names'] == content['difference'] == []
 
 
-def test_the_tool_compares(tiny: Calibration, compared: Compared) -> None:
+def test_the_tool_compares(tiny, compared) -> None:
     out, made = compared(tiny, moved(tiny, fx=0.5))
     (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
     sigma = np.sqrt(2) * tiny.sigma[0]
@@ -229,9 +225,7 @@ def test_the_tool_compares(tiny: Calibration, compared: Compared) -> None:
     assert made['lines_of_sight']['worst_px'] == pytest.approx(0.5 * 319.5 / 1801, rel=0.1)
 
 
-def test_the_truth_of_a_simulated_bag_has_no_sigma(
-    tiny: Calibration, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_the_truth_of_a_simulated_bag_has_no_sigma(tiny, tmp_path, starcal) -> None:
     write_calibration(tiny, tmp_path / 'calibration.json')
     truth = tmp_path / 'truth.json'
     shutil.copy(TINY / 'truth.json', truth)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import contextlib
 from pathlib import Path
 import re
@@ -106,9 +105,7 @@ def run_remedy(words: str, folder: Path) -> None:
         (write_compressed_file, 'a flight.mcap.zstd', 'a flight.mcap'),
     ],
 )
-def test_the_command_that_is_named_makes_a_bag_that_is_read(
-    write: Callable[[Path], None], name: str, read: str, tmp_path: Path
-) -> None:
+def test_the_command_that_is_named_makes_a_bag_that_is_read(write, name, read, tmp_path) -> None:
     if 'compressed' in write.__name__ and shutil.which('zstd') is None:
         pytest.skip('zstd is not installed')
     write(tmp_path / name)
@@ -120,7 +117,7 @@ def test_the_command_that_is_named_makes_a_bag_that_is_read(
     assert any(topic.type_name == ATTITUDE_TYPE for topic in reader.topics([tmp_path / read]))
 
 
-def test_a_file_of_a_sqlite_bag_is_converted_as_its_folder(tmp_path: Path) -> None:
+def test_a_file_of_a_sqlite_bag_is_converted_as_its_folder(tmp_path) -> None:
     write_sqlite(tmp_path / 'flight')
     (file,) = (tmp_path / 'flight').glob('*.db3')
     with pytest.raises(BagError) as error:
@@ -137,7 +134,7 @@ def test_a_file_of_a_sqlite_bag_is_converted_as_its_folder(tmp_path: Path) -> No
 )
 @pytest.mark.parametrize('in_a_folder', [False, True])
 def test_an_image_in_place_of_a_bag_is_named_with_the_commands_that_take_it(
-    name: str, start: bytes, kind: str, in_a_folder: bool, tmp_path: Path
+    name, start, kind, in_a_folder, tmp_path
 ) -> None:
     (tmp_path / name).write_bytes(start + bytes(40))
     with pytest.raises(BagError) as error:
@@ -148,9 +145,7 @@ def test_an_image_in_place_of_a_bag_is_named_with_the_commands_that_take_it(
 
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
-def test_files_are_read_in_the_order_of_their_first_messages(
-    order: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_files_are_read_in_the_order_of_their_first_messages(order, tmp_path) -> None:
     """A shell gives rec_10 before rec_2."""
     pixels = np.zeros((4, 4), np.uint8)
     names = ['rec_2.mcap', 'rec_10.mcap', 'rec_11.mcap']
@@ -178,16 +173,14 @@ def test_files_are_read_in_the_order_of_their_first_messages(
         ('night2', ['night2']),
     ],
 )
-def test_a_folder_that_exists_is_no_pattern(
-    tmp_path: Path, pattern: str, names: list[str]
-) -> None:
+def test_a_folder_that_exists_is_no_pattern(tmp_path, pattern, names) -> None:
     (tmp_path / 'night[1]').mkdir()
     for name in ('a.png', 'b.png'):
         (tmp_path / 'night[1]' / name).touch()
     assert matching(tmp_path / pattern) == [tmp_path / name for name in names]
 
 
-def test_a_folder_of_folders_with_images_names_them(tmp_path: Path) -> None:
+def test_a_folder_of_folders_with_images_names_them(tmp_path) -> None:
     for night in ('a', 'b', 'no images'):
         (tmp_path / night).mkdir()
         (tmp_path / night / 'x.png').write_bytes(b'' if ' ' in night else b'\x89PNG\r\n\x1a\n')

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from starcal_ground.products import (
@@ -21,7 +19,7 @@ RECORD = NotCalibrated(
 )
 
 
-def test_round_trip_without_older_products(tmp_path: Path) -> None:
+def test_round_trip_without_older_products(tmp_path) -> None:
     kept = tmp_path / 'observations.mcap'
     for name in ('calibration.json', 'camera_info.yaml', 'residuals.npz', 'report.html'):
         (tmp_path / name).write_text('old')
@@ -31,18 +29,18 @@ def test_round_trip_without_older_products(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {NOT_CALIBRATED_FILE, kept.name}
 
 
-def test_no_failure(tmp_path: Path) -> None:
+def test_no_failure(tmp_path) -> None:
     assert read_not_calibrated(tmp_path) is None
 
 
 @pytest.mark.parametrize('text', ['', '[]', '{"reason": "x"}', '{"images_refused": 3}'])
-def test_damage_is_one_line(tmp_path: Path, text: str) -> None:
+def test_damage_is_one_line(tmp_path, text) -> None:
     (tmp_path / NOT_CALIBRATED_FILE).write_text(text)
     with pytest.raises(ProductError, match='not a record of a failure: |not JSON: '):
         read_not_calibrated(tmp_path)
 
 
-def test_a_file_is_recognised_by_any_name(tmp_path: Path) -> None:
+def test_a_file_is_recognised_by_any_name(tmp_path) -> None:
     path = tmp_path / 'a'
     path.write_text('')
     (tmp_path / 'link').symlink_to(path)

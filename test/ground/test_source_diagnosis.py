@@ -13,7 +13,6 @@ from mission_files import attitudes, params_with, TINY, write_compressed, write_
 from mission_files import images as tiny_images
 import numpy as np
 import pytest
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import topics
@@ -46,7 +45,7 @@ def setup() -> Setup:
         (30.0, '; RA 180.00, Dec +1.00; RA 210.00, Dec +1.00, and 2 more'),
     ],
 )
-def test_the_sky_that_a_catalog_lacks_is_named(step_deg: float, words: str) -> None:
+def test_the_sky_that_a_catalog_lacks_is_named(step_deg, words) -> None:
     details = [
         f'0.1 stars; needed: RA {step_deg * k:.2f}, Dec +1.00, radius 0.30 deg' for k in range(10)
     ]
@@ -60,7 +59,8 @@ def contents_of(path: Path) -> Contents:
     return without_setup([path], ASKED, OptionError('not found')).contents
 
 
-def write_spoilt(path: Path, images: list[Image]) -> None:
+@pytest.fixture(scope='module')
+def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     The tiny bag with an image of each fault: sky, stamp, size, attitude.
 
@@ -68,6 +68,8 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
     dark; image 5 is cut; the samples about image 7 are no rotations; after image 9 the attitudes
     end, and one more image comes.
     """
+    path: Path = tmp_path_factory.mktemp('bag') / 'spoilt.mcap'
+    images: tuple[Image, ...] = tiny_images()
     stamps = [image.time_ns for image in images]
 
     def near(k: int, time_ns: int) -> bool:
@@ -88,13 +90,12 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
             for _ in range(2 if k == 3 else 1):
                 writer.write_image(IMAGE, Image(image.time_ns, pixels), 'camera')
         writer.write_image(IMAGE, Image(stamps[-1] + 10**10, images[-1].pixels), 'camera')
+    return path
 
 
 @pytest.mark.slow
-def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> None:
-    path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images())
-    quick = contents_of(path)
+def test_verdicts_are_those_of_the_calibration(spoilt, setup) -> None:
+    quick = contents_of(spoilt)
     assert {r.reason: r.count for r in quick.refused} == {
         'no_attitude': 2,
         'attitude_gap': 1,
@@ -104,14 +105,14 @@ def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> 
     assert quick.images == quick.looked_at == 12 and not quick.stars_per_image
     seen = []
     progress = lambda count: contextlib.nullcontext(lambda: seen.append(count))  # noqa: E731
-    examined = examine(Source((path,), ASKED, setup), progress)
+    examined = examine(Source((spoilt,), ASKED, setup), progress)
     full = examined.contents
     by_reason = {r.reason: r.count for r in full.refused}
     # With the stars and the camera, two more: the dark image and the cut one.
     expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
     assert seen == 12 * [12] and full.images == full.looked_at == 12
-    observed = list(topics.read([path], Topics(IMAGE, ATTITUDE), setup))
+    observed = list(topics.read([spoilt], Topics(IMAGE, ATTITUDE), setup))
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')
@@ -120,7 +121,7 @@ def test_verdicts_are_those_of_the_calibration(tmp_path: Path, setup: Setup) -> 
     assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
 
 
-def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path: Path, starcal: Starcal) -> None:
+def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path, starcal) -> None:
     """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
     alone = [(0, np.array([0.0, 0.0, 0.0, 1.0]))]
     path = write_tiny(tmp_path / 'images.mcap', tiny_images()[:1], alone)
@@ -132,10 +133,8 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path: Path, starcal: St
     assert status == EXIT_REFUSED and 'longest attitude gap' not in out
 
 
-def test_the_topics_are_told(tmp_path: Path) -> None:
-    path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images())
-    attitude, image = sorted(contents_of(path).topics, key=lambda t: -t.bad)
+def test_the_topics_are_told(spoilt) -> None:
+    attitude, image = sorted(contents_of(spoilt).topics, key=lambda t: -t.bad)
     assert (attitude.name, attitude.bad) == (ATTITUDE, 4)
     assert attitude.rate_hz == pytest.approx(2.0) and attitude.count == 34
     assert image.name == IMAGE and image.count == 12 and image.bad == 0
@@ -145,7 +144,7 @@ def test_the_topics_are_told(tmp_path: Path) -> None:
     assert image.last_ns == tiny_images()[-1].time_ns + 10**10
 
 
-def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path: Path) -> None:
+def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path) -> None:
     path = tmp_path / 'more.mcap'
     with BagWriter(path) as writer:
         for k in (0, 2, 1):
@@ -162,7 +161,7 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
     assert 'starcal import' in sentence and '/lens' in sentence
 
 
-def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
+def test_compressed_images_are_told_apart(tmp_path) -> None:
     path = tmp_path / 'png.mcap'
     with BagWriter(path) as writer:
         for image, ending in zip(tiny_images(), ('png', 'jpg', 'bmp'), strict=False):
@@ -177,10 +176,9 @@ def test_compressed_images_are_told_apart(tmp_path: Path) -> None:
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 
-def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_cut_bag_is_read_as_far_as_it_goes(spoilt, tmp_path) -> None:
     cut = tmp_path / 'cut.mcap'
-    write_spoilt(cut, tiny_images())
-    cut.write_bytes(cut.read_bytes()[:-10_000])  # in the second chunk
+    cut.write_bytes(spoilt.read_bytes()[:-10_000])  # in the second chunk
     found = contents_of(cut)
     (damage,) = found.damage
     assert 'truncated' in damage
@@ -188,7 +186,7 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     assert 0 < images < 10 and found.images == images
 
 
-def test_recorded_observations_need_no_parameters(tiny_products: Path, starcal: Starcal) -> None:
+def test_recorded_observations_need_no_parameters(tiny_products, starcal) -> None:
     path = tiny_products / 'observations.mcap'
     found = contents_of(path)
     assert found.stars_per_image and found.images == 10 and not found.refused
@@ -198,19 +196,17 @@ def test_recorded_observations_need_no_parameters(tiny_products: Path, starcal: 
 
 
 @pytest.mark.slow
-def test_the_tool_says_it_to_people_and_programs(tmp_path: Path, starcal: Starcal) -> None:
-    path = tmp_path / 'spoilt.mcap'
-    write_spoilt(path, tiny_images())
-    status, out, _ = starcal('diagnose', path)
+def test_the_tool_says_it_to_people_and_programs(spoilt, starcal) -> None:
+    status, out, _ = starcal('diagnose', spoilt)
     assert status == 0
     assert '5 of 12 images' in out and 'attitude_gap' in out
     assert 'over 2 s' in out and 'too far apart' in out  # this image's, and what it means
-    made = json.loads(starcal('diagnose', path, '--json', '--params', PARAMS).out)['contents']
+    made = json.loads(starcal('diagnose', spoilt, '--json', '--params', PARAMS).out)['contents']
     assert made['images'] == 12 and len(made['stars_per_image']) == 5
     assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
 
 
-def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path: Path, starcal: Starcal) -> None:
+def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path, starcal) -> None:
     alone = [(5, np.array([0.0, 0.0, 0.0, 1.0]))]
     path = write_tiny(tmp_path / 'two.mcap', tiny_images()[:2], alone)
     status, out, _ = starcal('diagnose', path)
@@ -232,7 +228,7 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path: Path, starcal: St
     ],
 )
 def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
-    direction: str, cause: str, words: str, tmp_path: Path, starcal: Starcal
+    direction, cause, words, tmp_path, starcal
 ) -> None:
     last = tiny_images()[-1]
     later = (Image(last.time_ns + k * 10**11, last.pixels) for k in (1, 2))

@@ -11,7 +11,6 @@ from astropy.io import fits
 import cv2
 import numpy as np
 import pytest
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
@@ -51,7 +50,7 @@ def centroid_px(values: Any, near_px: Floats) -> Floats:
 
 
 @pytest.mark.parametrize('k1', [-0.3, 0.3])
-def test_stars_are_where_a_pinhole_camera_has_them(made: Calibration, k1: float) -> None:
+def test_stars_are_where_a_pinhole_camera_has_them(made, k1) -> None:
     tiny = synthetic.scenario('tiny')
     nominal = tiny.truth.camera
     camera = nominal.replace(k1=k1, skew=0.5, fy=1.01 * float(nominal.parameters[2]))
@@ -72,9 +71,7 @@ def test_stars_are_where_a_pinhole_camera_has_them(made: Calibration, k1: float)
     assert np.abs(error_px).max() < 0.03
 
 
-def test_images_of_any_kind_are_straightened(
-    made: Calibration, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_images_of_any_kind_are_straightened(made, tmp_path, starcal) -> None:
     """As stored: colours, bits and types; with the camera that they are of then."""
     write_calibration(made, tmp_path / 'calibration.json')
     height, width = made.geometry.camera.height, made.geometry.camera.width
@@ -110,9 +107,7 @@ def test_images_of_any_kind_are_straightened(
 @pytest.mark.parametrize(
     ('flip', 'read'), [('top-bottom', np.s_[::-1]), ('left-right', np.s_[:, ::-1])]
 )
-def test_mirrored_files_are_mirrored_back(
-    made: Calibration, tmp_path: Path, flip: str, read: Any
-) -> None:
+def test_mirrored_files_are_mirrored_back(made, tmp_path, flip, read) -> None:
     """As `starcal calibrate` did, which found that their stars are mirrored."""
     plain = np.random.default_rng(1).integers(0, 255, (512, 640), np.uint8)
     cv2.imwrite(str(tmp_path / 'plain.png'), plain)

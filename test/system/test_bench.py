@@ -32,7 +32,7 @@ def found_by(name: str, tmp_path: Path) -> tuple[Any, str]:
     return json.loads(found.read_text())[name], done.stdout
 
 
-def test_solver_bench(tmp_path: Path) -> None:
+def test_solver_bench(tmp_path) -> None:
     """A row for each solver; SciPy and starcal agree to a hundredth of a sigma."""
     (compared,), said = found_by('solver', tmp_path)
     rows = {row['solver']: row for row in compared['rows']}
@@ -43,7 +43,7 @@ def test_solver_bench(tmp_path: Path) -> None:
     assert scipy['sigma off'] < 0.01 and abs(scipy['cost off']) < 1e-8
 
 
-def test_calibrate_bench(tmp_path: Path) -> None:
+def test_calibrate_bench(tmp_path) -> None:
     """A bare read takes less memory than a calibration, which ends well."""
     (table,), _ = found_by('calibrate', tmp_path)
     bare, whole, ratio = table['rows']
@@ -52,14 +52,14 @@ def test_calibrate_bench(tmp_path: Path) -> None:
     assert ratio['processor s'] == pytest.approx(whole['processor s'] / bare['processor s'])
 
 
-def test_fleet_bench(tmp_path: Path) -> None:
+def test_fleet_bench(tmp_path) -> None:
     """The command passes over all simulated calibrations, which its table has."""
     (table,), _ = found_by('fleet', tmp_path)
     assert [row['rows'] for row in table['rows']] == [100, 1000]
     assert all(row['peak MB'] > 0 for row in table['rows'])
 
 
-def test_peers_bench(tmp_path: Path) -> None:
+def test_peers_bench(tmp_path) -> None:
     """Every tool that is installed has a row; errors of starcal are within 2 sigma."""
     (errors, times), said = found_by('peers', tmp_path)
     rows = {(row['campaign'], row['tool']): row for row in errors['rows']}
@@ -105,8 +105,4 @@ def test_a_match_that_is_right_in_a_part_of_the_image_is_refused() -> None:
     off_deg = np.degrees((right.inv() * Rotation.from_quat(attitudes)).magnitude())
     shot = Exposure(image, attitudes[int(np.abs(off_deg - 2.13).argmin())], 0.0)
     with pytest.raises(ImageRefused, match='part of the image'):
-        observe_stars(
-            shot,
-            scenario.prior,
-            StarSearch(load_catalog(None, 9.0)),
-        )
+        observe_stars(shot, scenario.prior, StarSearch(load_catalog(None, 9.0)))

@@ -10,13 +10,9 @@ import shutil
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING
 
 from managers import Manager  # type: ignore[import-not-found]
 import pytest
-
-if TYPE_CHECKING:
-    from conftest import Client
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = (
@@ -32,10 +28,7 @@ TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README
 INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_STOPS_WITHIN_S = 240.0
 
-pytestmark = [
-    pytest.mark.packaging,
-    pytest.mark.slow,
-]
+pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
 # The messages in use, not only the Python files that wrap them, must be those of the workspace.
 ORIGINS = """
@@ -108,7 +101,7 @@ def in_workspace(workspace: Path, *command: str | Path) -> list[str]:
     return ['sh', '-c', sourced, 'sh', *map(str, command)]
 
 
-def test_imports_come_from_the_install_space(workspace: Path) -> None:
+def test_imports_come_from_the_install_space(workspace) -> None:
     command = in_workspace(workspace, sys.executable, '-c', ORIGINS)
     shown = subprocess.run(command, capture_output=True, text=True, cwd=workspace)
     assert shown.returncode == 0, shown.stderr
@@ -117,7 +110,7 @@ def test_imports_come_from_the_install_space(workspace: Path) -> None:
     assert [o for o in origins if not o.startswith(f'{workspace}/install/starcal/')] == []
 
 
-def test_everything_is_installed_that_the_package_reads(workspace: Path) -> None:
+def test_everything_is_installed_that_the_package_reads(workspace) -> None:
     prefix = workspace / 'install' / 'starcal'
     executables = {path.name for path in (prefix / 'lib' / 'starcal').iterdir()}
     assert executables == {
@@ -132,7 +125,7 @@ def test_everything_is_installed_that_the_package_reads(workspace: Path) -> None
             assert (sources / 'sky/data' / path.name).read_bytes() == path.read_bytes()
 
 
-def test_colcon_test_runs_the_suite(workspace: Path) -> None:
+def test_colcon_test_runs_the_suite(workspace) -> None:
     """All of it is collected, by colcon as by make; a few of it are run."""
     chosen = '-k "test_constants or test_a_match_that_is_right"'  # which imports the benches
     tested = colcon(
@@ -146,9 +139,7 @@ def test_colcon_test_runs_the_suite(workspace: Path) -> None:
     assert summary and int(summary[1]) > 2, shown.stdout
 
 
-def test_node_from_the_install_space_comes_up_and_stops(
-    workspace: Path, client: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_node_from_the_install_space_comes_up_and_stops(workspace, client, monkeypatch) -> None:
     monkeypatch.setenv('ROS_LOG_DIR', str(workspace / 'log'))
     executable = workspace / 'install/starcal/lib/starcal/star_observer'
     arguments = ('--ros-args', '-r', '__ns:=/from_colcon', '-p', 'autostart:=false')

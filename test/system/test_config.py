@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The parameter files: complete, up to date, and read by nodes and tool alike."""
+"""Parameter files and pinned requirements: complete, up to date, and read by their users."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_vehicle_gets_every_package() -> None:
 @pytest.mark.parametrize(
     'path', sorted((CONFIG / 'examples').glob('*.yaml')), ids=lambda path: path.stem
 )
-def test_examples_load(path: Path) -> None:
+def test_examples_load(path) -> None:
     if path.stem.endswith('_camera'):
         assert read_camera_info(str(path)).width > 0
         return
@@ -77,7 +77,7 @@ def test_examples_load(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path: Path) -> None:
+def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path) -> None:
     """Copied beside the prior camera, as its first line instructs: parameters are all basic."""
     text = (CONFIG / 'minimal.yaml').read_text()
     assert len(text.splitlines()) == 10
@@ -104,3 +104,22 @@ def test_the_recorder_and_the_aggregator_know_the_names_of_the_interface_documen
     assert {name.lstrip('/') for name in record['record']['topics']} <= set(published)
     assert all(name[0] == '/' for name in record['record']['topics'])  # rosbag2 expands none
     assert f'Its `name` is `{diagnostics["starcal"]["startswith"][0]}` and' in names
+
+
+def test_every_pin_has_its_digests() -> None:
+    """And there are none of other versions: `tools.write_hashes` was run after the last change."""
+    lines = (ROOT / 'requirements/hashes.txt').read_text().splitlines()
+    hashed = [line.split() for line in lines if not line.startswith('#')]
+    assert {tuple(pin.split('==')) for pin, _, _ in hashed} == tool('write_hashes').pins()
+    for _, digest, file in hashed:
+        assert re.fullmatch('sha256:[0-9a-f]{64}', digest), file
+
+
+def test_pip_is_given_the_digests(tmp_path) -> None:
+    make_venv, path = tool('make_venv'), tmp_path / 'some.txt'
+    path.write_text('# why\nempy==3.3.4 ; python_version > "3.9"  # old\n')
+    (line,) = make_venv.hashed_lines(path)
+    assert line.startswith('empy==3.3.4 ; python_version > "3.9" --hash=sha256:73ac49785b6')
+    path.write_text('empy==3.3.3\n')
+    with pytest.raises(SystemExit, match='tools.write_hashes'):
+        make_venv.hashed_lines(path)

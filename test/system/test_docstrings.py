@@ -48,9 +48,7 @@ HELD = {
     [*PUBLIC, *sorted(HELD - {*PUBLIC}, key=lambda kind: kind.__name__)],
     ids=lambda described: described.__name__,
 )
-def test_the_example_of_a_docstring_runs(
-    described: type, tiny_products: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_a_docstring_runs(described, tiny_products, tmp_path, monkeypatch) -> None:
     shutil.copytree(tiny_products, tmp_path / 'out')
     (tmp_path / 'bags').symlink_to(Path(__file__).parents[2] / 'bags')
     monkeypatch.chdir(tmp_path)

@@ -80,7 +80,7 @@ def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> No
     assert compared.total.value < count + 5 * np.sqrt(2 * count)  # 5 deviations of chi^2
 
 
-def test_the_tiny_bag_gives_the_truth(tiny_products: Path) -> None:
+def test_the_tiny_bag_gives_the_truth(tiny_products) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
     truth = read_truth(TINY / 'truth.json')
     assert calibration.accepted and calibration.reasons == ()
@@ -98,7 +98,7 @@ def test_the_tiny_bag_gives_the_truth(tiny_products: Path) -> None:
     assert error_px < 0.2 * prior_error_px
 
 
-def test_camera_info_is_the_calibration_without_skew(tiny_products: Path) -> None:
+def test_camera_info_is_the_calibration_without_skew(tiny_products) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
     camera = read_camera_info(tiny_products / 'camera_info.yaml')
     assert camera.parameters[1] == 0.0
@@ -108,9 +108,7 @@ def test_camera_info_is_the_calibration_without_skew(tiny_products: Path) -> Non
     assert worst_px == pytest.approx(calibration.zero_skew_cost_px, rel=1e-6)
 
 
-def test_recorded_observations_give_the_same_calibration(
-    tiny_products: Path, tmp_path: Path
-) -> None:
+def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path) -> None:
     bag = tiny_products / 'observations.mcap'
     done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
     assert done.returncode == 0, done.stderr
@@ -122,8 +120,9 @@ def test_recorded_observations_give_the_same_calibration(
     assert first == second
 
 
-def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
-    params = params_with(tmp_path, max_change_px=1e-6)
+def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path) -> None:
+    of_nodes = {'autostart': True, 'attitude_timeout_s': 2.0, 'use_sim_time': True}
+    params = params_with(tmp_path, max_change_px=1e-6, **of_nodes)
     done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
     assert done.returncode == 3
     assert done.stderr == ''
@@ -178,14 +177,14 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
             assert abs(row - 5) <= 2 and abs(column - 5) <= 2
 
 
-def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
+def test_a_zenith_campaign_gives_the_truth(tmp_path) -> None:
     scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
     made = simulated_bag.write_bag(scenario, tmp_path / 'bag.mcap')
     calibration = calibrated(made, tmp_path / 'out')
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 
-def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
+def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
     whole = (TINY / 'tiny_0.mcap').read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) * 7 // 10])
@@ -200,7 +199,7 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
 
 @needs_interfaces
 @pytest.mark.nodes
-def test_the_demonstration_on_the_real_graph(tmp_path: Path) -> None:
+def test_the_demonstration_on_the_real_graph(tmp_path) -> None:
     done = in_a_process('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'sigma' in done.stdout and 'alignment z' in done.stdout
@@ -211,7 +210,7 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path) -> None:
 
 @needs_interfaces
 @pytest.mark.nodes
-def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None:
+def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path) -> None:
     psutil = pytest.importorskip('psutil')
     command = [sys.executable, '-m', 'starcal_ground.cli.main', 'demo', '-o', str(tmp_path)]
     tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -226,7 +225,7 @@ def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason='the independent bag is not here')
-def test_a_bag_of_another_simulator_gives_the_truth(tmp_path: Path) -> None:
+def test_a_bag_of_another_simulator_gives_the_truth(tmp_path) -> None:
     truth = json.loads((INDEPENDENT / 'small_101.json').read_text())
     k, d = truth['k_prior'], truth['d_prior']
     K = [k[0], k[1], k[3], 0.0, k[2], k[4], 0.0, 0.0, 1.0]
@@ -253,7 +252,7 @@ def test_a_bag_of_another_simulator_gives_the_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not REAL_SKY.is_dir(), reason='the bag of the real sky is not here')
-def test_a_real_sky_calibrates_and_its_wrong_attitudes_are_refused(tmp_path: Path) -> None:
+def test_a_real_sky_calibrates_and_its_wrong_attitudes_are_refused(tmp_path) -> None:
     params = ROOT / 'config' / 'examples' / 'realsky.yaml'
     done = starcal(
         'calibrate', REAL_SKY, '--params', params, '-o', tmp_path,

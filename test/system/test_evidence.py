@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ REFUSED = (world('two lenses as ABBBA', 1.0), world('aberration reversed', 0.5))
 
 @pytest.mark.slow
 @pytest.mark.parametrize('fault', ACCEPTED, ids=lambda fault: fault.name)
-def test_an_accepted_camera_errs_by_less_than_two_sigma(fault: World) -> None:
+def test_an_accepted_camera_errs_by_less_than_two_sigma(fault) -> None:
     # Ten seeds of each give 0.6 to 1.6 in these worlds; version 0.1.0 was at 7 to 45.
     outcome = evidence.rendered(fault, 1)
     assert outcome.accepted, outcome.reasons
@@ -36,16 +35,14 @@ def test_an_accepted_camera_errs_by_less_than_two_sigma(fault: World) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('fault', REFUSED, ids=lambda fault: f'{fault.name} {fault.size:g}')
-def test_a_fault_that_the_stars_show_is_refused_by_its_name(fault: World) -> None:
+def test_a_fault_that_the_stars_show_is_refused_by_its_name(fault) -> None:
     outcome = evidence.rendered(fault, 1)
     assert not outcome.accepted
     assert any(cause in reason for cause in fault.causes for reason in outcome.reasons)
 
 
 @pytest.mark.slow
-def test_a_run_continues_and_a_page_shows_two_beside_each_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_continues_and_a_page_shows_two_beside_each_other(tmp_path, capsys) -> None:
     before, after = tmp_path / 'before.jsonl', tmp_path / 'after.jsonl'
     line = ['--only', 'sound', 'departing', '--real', str(tmp_path / 'none')]
     assert evidence.main(['-o', str(before), '--count', '1', *line]) == 0
@@ -96,7 +93,7 @@ def row(**values: object) -> dict[str, object]:
         ),
     ],
 )
-def test_a_requirement_is_met_or_not(name: str, changed: dict[str, object], met: str) -> None:
+def test_a_requirement_is_met_or_not(name, changed, met) -> None:
     found = {line[0]: line[-1] for line in make_evidence.requirements([row(**changed)]).rows}
     assert found[name] == met
 

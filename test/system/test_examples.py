@@ -23,7 +23,7 @@ def run(cwd: Path, *command: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_from_arrays(tmp_path: Path) -> None:
+def test_from_arrays(tmp_path) -> None:
     done = run(tmp_path, EXAMPLES / 'from_arrays.py')
     assert (done.returncode, done.stderr) == (0, '')
     verdict, *rows, sight = done.stdout.splitlines()
@@ -36,7 +36,7 @@ def test_from_arrays(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_from_bag(tmp_path: Path) -> None:
+def test_from_bag(tmp_path) -> None:
     written = tmp_path / 'calibration.json'
     done = run(tmp_path, EXAMPLES / 'from_bag.py', TINY, TINY / 'params.yaml', written)
     assert (done.returncode, done.stderr) == (0, '')
@@ -44,14 +44,14 @@ def test_from_bag(tmp_path: Path) -> None:
     assert read_calibration(written).accepted
 
 
-def test_from_a_bag_that_is_not_there(tmp_path: Path) -> None:
+def test_from_a_bag_that_is_not_there(tmp_path) -> None:
     done = run(tmp_path, EXAMPLES / 'from_bag.py', 'none', TINY / 'params.yaml', 'out.json')
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr == 'none: no such file or folder\n'
 
 
 @pytest.mark.slow
-def test_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook(monkeypatch) -> None:
     """Each code cell in turn, in one namespace: what Jupyter does, without Jupyter."""
     cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
     sources = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
@@ -70,7 +70,7 @@ def test_the_notebook_is_kept_without_outputs() -> None:
 
 
 @pytest.mark.slow
-def test_mission(tmp_path: Path) -> None:
+def test_mission(tmp_path) -> None:
     """FITS and AEM to kernels that spiceypy loads, with the boresight of the calibration."""
     params = TINY / 'params.yaml'
     done = run(tmp_path, EXAMPLES / 'mission.py', TINY, params, tmp_path / 'mission')
@@ -81,7 +81,7 @@ def test_mission(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['from_bag.py', 'mission.py'])
-def test_without_arguments_the_usage_is_printed(name: str, tmp_path: Path) -> None:
+def test_without_arguments_the_usage_is_printed(name, tmp_path) -> None:
     done = run(tmp_path, EXAMPLES / name)
     assert done.returncode == 2
     assert done.stderr.startswith(f'usage: python {name} BAG PARAMS ')

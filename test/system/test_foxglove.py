@@ -120,7 +120,7 @@ def made_by(name: str, folder: Path, *events: dict[str, Any]) -> Any:
 
 
 @pytest.mark.skipif(not NODE, reason='no Node on this machine')
-def test_scripts_make_a_picture_and_ratios(tmp_path: Path) -> None:
+def test_scripts_make_a_picture_and_ratios(tmp_path) -> None:
     coverage = {'coverage': [0, 1, 2, 4], 'coverage_rows': 2, 'coverage_cols': 2, 'header': {}}
     collected = {
         'parameter_names': ['fx', 'cx'], 'predicted_sigma': [0.5, 3.0], **coverage
@@ -144,7 +144,7 @@ def test_scripts_make_a_picture_and_ratios(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('path', sorted(p for p in set(paths(PANELS)) if 'studio' not in p))
-def test_each_path_is_a_field_of_a_published_topic(path: str) -> None:
+def test_each_path_is_a_field_of_a_published_topic(path) -> None:
     match = PATH.fullmatch(path)
     assert match is not None
     kind = published()[match[1]]

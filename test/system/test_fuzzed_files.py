@@ -61,7 +61,7 @@ def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60)
     spoil()
 
 
-def test_parameter_files(tmp_path: Path) -> None:
+def test_parameter_files(tmp_path) -> None:
     flow = {n: list(v) if isinstance(v, tuple) else v for n, v in bag_setup().options().items()}
     lines = [f'    {name}: {json.dumps(value)}' for name, value in flow.items()]
 
@@ -72,7 +72,7 @@ def test_parameter_files(tmp_path: Path) -> None:
     spoils(text, tmp_path / 'params.yaml', read)
 
 
-def test_camera_files(tmp_path: Path) -> None:
+def test_camera_files(tmp_path) -> None:
     def read(path: Path) -> None:
         camera = read_camera_info(path)
         project(camera, line_of_sight(camera, pixel_grid(camera, 5, 5)))
@@ -82,7 +82,7 @@ def test_camera_files(tmp_path: Path) -> None:
     spoils((BAG / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
 
 
-def test_metadata_of_bags(tmp_path: Path) -> None:
+def test_metadata_of_bags(tmp_path) -> None:
     """The bag beside it is read, not another one."""
     with BagWriter(tmp_path / 'bag') as writer:
         for k in range(3):
@@ -95,7 +95,7 @@ def test_metadata_of_bags(tmp_path: Path) -> None:
     spoils(path.read_text(), path, read)
 
 
-def test_calibration_files(tmp_path: Path) -> None:
+def test_calibration_files(tmp_path) -> None:
     path = tmp_path / CALIBRATION_FILE
     write_calibration(calibration(), path)
 
@@ -110,7 +110,7 @@ def test_calibration_files(tmp_path: Path) -> None:
     spoils(path.read_text(), path, read)
 
 
-def test_pipes_in_a_folder_are_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pipes_in_a_folder_are_no_bag(tmp_path, capsys) -> None:
     for name in ('metadata.yaml', 'a.mcap'):
         os.mkfifo(tmp_path / name)
     assert main.main(['diagnose', str(tmp_path)]) == 2

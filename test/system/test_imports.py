@@ -10,6 +10,8 @@ from pathlib import Path
 import subprocess
 import sys
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ('starcal_ros', 'starcal_ground')
 MODULES = {
@@ -24,17 +26,6 @@ WITHOUT_ROS = [
     if '.ros.' not in name or name.endswith(('.ros.archive', '.ros.image_queue', '.ros.state'))
 ]  # fmt: skip
 BLOCKS = ('body', 'orelse', 'handlers', 'finalbody')  # of an if, a try, a class
-
-
-def test_a_calibration_does_not_wait_for_what_it_seldom_needs() -> None:
-    """scipy.stats alone would make the start, one second, a third longer."""
-    show = 'import sys; from starcal_ground.cli import into_folder;'
-    show += ' from starcal_ground.images import first_setup; print(*sys.modules)'
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
-    assert 'scipy.special' in loaded and 'starcal_ros.pipeline.solve' in loaded
-    seldom = {'scipy.stats', 'starcal_ground.blind.search'}
-    assert not loaded & seldom
 
 
 def run_at_import(statements: list[ast.stmt]) -> Iterator[ast.Import | ast.ImportFrom]:
@@ -77,8 +68,34 @@ def test_each_module_imports_alone() -> None:
     graphlib.TopologicalSorter(graph).prepare()  # CycleError names the modules
 
 
-def test_none_imports_ros() -> None:
-    imports = ''.join(f'import {name}\n' for name in WITHOUT_ROS)
-    show = f"import sys\n{imports}print('rclpy' in sys.modules)"
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ('False\n', '')
+HELP = """import contextlib
+from starcal_ground.cli.main import main
+with contextlib.suppress(SystemExit): main(['--help'])"""
+ONE_COMMAND = 'from starcal_ground.cli.main import parser; parser(["lookup", "plan"])'
+CALIBRATE = 'import starcal_ground.cli.into_folder, starcal_ground.images.first_setup'
+COMMANDS = 'starcal_ground.cli.commands'
+
+
+@pytest.mark.parametrize(
+    ('start', 'needs', 'does_not_wait_for'),
+    [
+        ('import starcal_ros', '', 'numpy cv2'),
+        ('import starcal_ground', '', 'numpy cv2 starcal_ground.api'),
+        # Half a second of imports would be felt at each press of the tab key.
+        (HELP, '', 'numpy scipy cv2 mcap rosbags rclpy rich argcomplete'),
+        (ONE_COMMAND, f'{COMMANDS}.lookup', f'numpy {COMMANDS}.plan {COMMANDS}.calibrate'),
+        # scipy.stats alone would make this start, one second, a third longer.
+        (
+            CALIBRATE,
+            'scipy.special starcal_ros.pipeline.solve',
+            'scipy.stats starcal_ground.blind.search',
+        ),
+        ('\n'.join(f'import {name}' for name in WITHOUT_ROS), '', 'rclpy'),
+    ],
+    ids=['on board', 'ground', 'help', 'a command', 'a calibration', 'all without ROS'],
+)
+def test_a_start_does_not_wait_for_what_it_seldom_needs(start, needs, does_not_wait_for) -> None:
+    show = f'{start}\nimport sys; print(*sys.modules, file=sys.stderr)'
+    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
+    loaded = set(done.stderr.split())
+    assert {*needs.split()} <= loaded and not {*does_not_wait_for.split()} & loaded

@@ -116,7 +116,7 @@ def flight_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_the_source_archive_is_complete(sources: Path, unpacked: Path) -> None:
+def test_the_source_archive_is_complete(sources, unpacked) -> None:
     """It has each file of a clone but those of git and of editors, and its tests run in it."""
     clone, archive = (
         {str(path.relative_to(top)) for path in top.rglob('*') if path.is_file()}
@@ -134,7 +134,7 @@ def test_the_source_archive_is_complete(sources: Path, unpacked: Path) -> None:
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path) -> None:
+def test_a_bag_is_calibrated_without_extras(flight_install, tmp_path) -> None:
     """With the versions of this environment: in `make test VERSIONS=newest` those of today."""
     python = flight_install / 'bin/python'
     for name in OF_EXTRAS:
@@ -165,7 +165,7 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_pip_lines_of_the_tutorial(sources: Path) -> None:
+def test_pip_lines_of_the_tutorial(sources) -> None:
     """Pip accepts each line that installs from the clone, with every extra that it names."""
     lines = re.findall(r'`pip install ([^`]+)`', TUTORIAL.read_text())
     assert '.' in lines and "'.[mission]'" in lines
@@ -178,7 +178,7 @@ def test_pip_lines_of_the_tutorial(sources: Path) -> None:
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_types_and_definitions_are_installed(flight_install: Path) -> None:
+def test_types_and_definitions_are_installed(flight_install) -> None:
     packages = list(flight_install.glob('lib/python*/site-packages/starcal_[rg]*/py.typed'))
     assert {path.parent.name for path in packages} == {'starcal_ros', 'starcal_ground'}
     installed = {path.name for path in (flight_install / 'share/starcal/msg').iterdir()}

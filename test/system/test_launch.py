@@ -66,7 +66,7 @@ def used(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
-def test_composed_of_launch_alone(path: Path) -> None:
+def test_composed_of_launch_alone(path) -> None:
     """It compiles, imports only launch and launch_ros, and describes every argument."""
     compile(path.read_text(), str(path), 'exec')
     for node in ast.walk(ast.parse(path.read_text())):
@@ -79,7 +79,7 @@ def test_composed_of_launch_alone(path: Path) -> None:
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
-def test_nodes_are_those_that_are_installed(path: Path) -> None:
+def test_nodes_are_those_that_are_installed(path) -> None:
     scripts = configparser.ConfigParser()
     scripts.read(ROOT / 'setup.cfg')
     installed = scripts['options.entry_points']['console_scripts']

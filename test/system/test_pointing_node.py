@@ -29,11 +29,7 @@ from geometry_msgs.msg import PointStamped, Vector3Stamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-pytestmark = [
-    pytest.mark.nodes,
-    pytest.mark.packaging,
-    pytest.mark.slow,
-]
+pytestmark = [pytest.mark.nodes, pytest.mark.packaging, pytest.mark.slow]
 EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'pointing_node'
 # A unit vector in double precision; the table is that of the Python package.
 SAME_DIRECTION = 1e-12
@@ -67,7 +63,7 @@ def started(node: Path, client: Client) -> Iterator[None]:
 
 
 def test_it_answers_with_the_lines_of_sight_of_the_python_package(
-    client: Client, started: None, tmp_path: Path
+    client, started, tmp_path
 ) -> None:
     answers = client.collect(Vector3Stamped, 'line_of_sight')
     client.until(lambda: client.node.count_publishers('line_of_sight'))
@@ -103,7 +99,7 @@ def test_it_answers_with_the_lines_of_sight_of_the_python_package(
     assert np.abs(sights() - expected(UPLINKED, asked)).max() < SAME_DIRECTION
 
 
-def test_a_bad_table_at_the_start_costs_one_line(node: Path, tmp_path: Path) -> None:
+def test_a_bad_table_at_the_start_costs_one_line(node, tmp_path) -> None:
     command: list[str | Path] = [node, '--ros-args', '-p', f'table:={tmp_path / "none"}']
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2

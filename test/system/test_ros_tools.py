@@ -16,13 +16,10 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import pytest
 import yaml
-
-if TYPE_CHECKING:
-    from conftest import Client
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -92,9 +89,7 @@ def middleware(ros2: RosTools) -> str:
     return str(ros2.environment['RMW_IMPLEMENTATION'])
 
 
-def test_launch_replay_calibrate_and_record(
-    ros2: RosTools, tiny_bag: Path, tmp_path: Path
-) -> None:
+def test_launch_replay_calibrate_and_record(ros2, tiny_bag, tmp_path) -> None:
     """The sequence of the README with every launch argument, ended as a terminal ends it."""
     if not has_rosbag2(ros2):
         pytest.skip('ros2 bag record does not load here')
@@ -129,14 +124,14 @@ def test_launch_replay_calibrate_and_record(
     row(middleware(ros2), 'rosbag2', 'ros2 bag record', 'calibration and observations read back')
 
 
-def test_launch_arguments_are_shown(make: Make) -> None:
+def test_launch_arguments_are_shown(make) -> None:
     for file in ('starcal.launch.py', 'replay.launch.py'):
         shown = make(FAST).run('launch', 'starcal', file, '--show-args')
         assert shown.returncode == 0 and "'params_file':" in shown.stdout, shown.stderr
     row(FAST, 'launch', 'ros2 launch starcal replay.launch.py --show-args', 'every argument')
 
 
-def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
+def test_replay_launch(make, tiny_bag, tmp_path) -> None:
     ros2 = make(FAST)
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
     values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
@@ -164,7 +159,7 @@ def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
     [('rate:=abc', "bag_player: rate: 'abc' is not a number"), ('respawn:=abc', "got 'abc'")],
 )
 def test_a_wrong_launch_argument_leaves_no_process(
-    make: Make, tiny_bag: Path, tmp_path: Path, argument: str, says: str
+    make, tiny_bag, tmp_path, argument, says
 ) -> None:
     """The launch ends by itself, and the nodes with it: another calibrator can have the folder."""
     ros2 = make(FAST)
@@ -181,13 +176,13 @@ def test_a_wrong_launch_argument_leaves_no_process(
     Archive(tmp_path / 'state', 'camera').close()
 
 
-def test_a_launch_without_a_parameter_file_names_what_to_set(make: Make) -> None:
+def test_a_launch_without_a_parameter_file_names_what_to_set(make) -> None:
     launch = make(FAST).start('launch', 'starcal', 'starcal.launch.py')
     launch.until_said('camera_info_url')
 
 
 def test_two_cameras_with_one_frame_are_named(
-    make: Make, client: Client, tiny_bag: Path, tiny_products: Path, tmp_path: Path
+    make, client, tiny_bag, tiny_products, tmp_path
 ) -> None:
     """In namespaces of their own, but with one transform; another name of the frame mends it."""
     ros2 = make(FAST)
@@ -215,11 +210,10 @@ def test_two_cameras_with_one_frame_are_named(
     row(FAST, 'tf2_msgs', 'two calibrators with one `camera_frame`', 'both name it')
 
 
-def test_lifecycle_and_parameters(ros2: RosTools, tiny_bag: Path, tmp_path: Path) -> None:
+def test_lifecycle_and_parameters(ros2, tiny_bag, tmp_path) -> None:
     """Each transition by its name; services answer while inactive; a dump can be read again."""
     node = ros2.start_node(
-        *('calibrator', '--params-file', tiny_bag / 'params.yaml'),
-        *('-p', 'autostart:=false'),
+        *('calibrator', '--params-file', tiny_bag / 'params.yaml'), *('-p', 'autostart:=false')
     )
     ros2.until('unconfigured', 'lifecycle', 'get', '/calibrator')
     for transition, state in (
@@ -272,7 +266,7 @@ OPERATOR = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def test_policies_are_enforced(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
+def test_policies_are_enforced(make, tiny_bag, tmp_path) -> None:
     """The nodes work; an outsider sees and calls nothing; a node in a wrong enclave is denied."""
     pytest.importorskip('lxml')
     pytest.importorskip('cryptography')
@@ -364,9 +358,7 @@ def as_no_database(folder: Path) -> None:
     ],
     ids=['mcap', 'sqlite', 'damaged', 'cut off', 'no database'],
 )
-def test_without_the_wheels_rosbag2_reads_bags(
-    write: Callable[[Path], object], line: str, make: Make, tmp_path: Path
-) -> None:
+def test_without_the_wheels_rosbag2_reads_bags(write, line, make, tmp_path) -> None:
     ros2 = make(FAST)
     if not has_rosbag2(ros2):
         pytest.skip('rosbag2 does not load here')

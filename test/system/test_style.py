@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 import re
+from xml.etree import ElementTree
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ('starcal_ros', 'starcal_ground', 'studies')
@@ -14,20 +15,17 @@ FILES = sorted(
     path for folder in (*PACKAGES, 'bench', 'tools', 'docs', 'examples')
     for path in (ROOT / folder).rglob('*.py')
 )  # fmt: skip
+EVERY_FILE = [
+    *FILES,
+    *(path for name in ('launch', 'test') for path in (ROOT / name).rglob('*.py')),
+]
+LICENCE = '# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0'
 # Without its docstring; no longer than the longest of today: a new one must earn more.
 LONGEST_FUNCTION_LINES = 77
 SUBJECTS = {  # tests of several modules together
-    *('awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills'),
-    *(
-        'lens_models',
-        'motion',
-        'nodes',
-        'object_store',
-        'onboard_alone',
-        'set_up_mistakes',
-        'star_trackers',
-    ),
-    *('trend', 'worlds'),
+    *('awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills', 'lens_models', 'motion'),
+    *('nodes', 'object_store', 'onboard_alone', 'set_up_mistakes', 'star_trackers', 'trend'),
+    'worlds',
 }
 
 
@@ -66,6 +64,20 @@ def test_docstrings_state_a_result_and_functions_are_short() -> None:
 
 def test_no_folder_of_one_machine_is_named() -> None:
     """Files from elsewhere are looked for beside this repository, in ``../shared``."""
-    files = [*FILES, *(ROOT / 'test').rglob('*.py')]
-    folders = {name for path in files for name in re.findall(r"Path\('(/\w+)", path.read_text())}
+    folders = {
+        name for path in EVERY_FILE for name in re.findall(r"Path\('(/\w+)", path.read_text())
+    }
     assert folders <= {'/dev', '/proc', '/usr'}
+
+
+def test_each_file_names_the_holder_and_the_licence_of_the_package() -> None:
+    package = ElementTree.parse(ROOT / 'package.xml')
+    assert f'Copyright 2026 {package.findtext("maintainer")}.' in LICENCE
+    assert LICENCE.endswith(f': {package.findtext("license")}')
+    lacking = [
+        path.relative_to(ROOT)
+        for path in EVERY_FILE
+        if '_build' not in path.parts and path.read_text().partition('\n')[0] != LICENCE
+    ]
+    assert len(EVERY_FILE) > 200
+    assert not lacking, f'put {LICENCE!r} on the first line of {lacking}'

@@ -31,7 +31,7 @@ def run(environment: dict[str, str], *words: str | Path) -> subprocess.Completed
 
 
 @pytest.mark.nodes
-def test_the_nodes_run_and_what_needs_more_costs_one_line(vehicle: dict[str, str]) -> None:
+def test_the_nodes_run_and_what_needs_more_costs_one_line(vehicle) -> None:
     pytest.importorskip('starcal.msg')
     source = """
 import sys
@@ -75,7 +75,7 @@ def test_the_debian_package_has_the_dependencies_of_package_xml() -> None:
     assert version == package.findtext('version')
 
 
-def test_without_ros_the_debian_build_says_where_it_stops(tmp_path: Path) -> None:
+def test_without_ros_the_debian_build_says_where_it_stops(tmp_path) -> None:
     if not shutil.which('dh'):
         pytest.skip('no debhelper')
     for name in ('debian', 'CMakeLists.txt', 'package.xml'):

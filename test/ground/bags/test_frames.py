@@ -91,9 +91,7 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(typestore, '_CHUNK_BYTES', 600)
 
 
-def test_attitudes_in_a_file_of_their_own_are_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_attitudes_in_a_file_of_their_own_are_found(tmp_path, monkeypatch) -> None:
     """Few images wait: the fourth starts a pass over the telemetry."""
     monkeypatch.setattr(frames_module, '_WAITING_BYTES', 100)
     images = [item for item in recording() if item[0] == 'image']
@@ -103,9 +101,7 @@ def test_attitudes_in_a_file_of_their_own_are_found(
 
 
 @pytest.mark.parametrize(('hole', 'beside'), [((22, 48), 1), ((-10, 12), 0), ((75, 120), 0)])
-def test_a_gap_filled_at_the_end_of_the_recording(
-    tmp_path: Path, hole: tuple[int, int], beside: int
-) -> None:
+def test_a_gap_filled_at_the_end_of_the_recording(tmp_path, hole, beside) -> None:
     """
     A spacecraft sends what was lost after everything else; the gap is over 2 s long.
 
@@ -121,9 +117,7 @@ def test_a_gap_filled_at_the_end_of_the_recording(
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(data=st.data())
-def test_no_order_of_recording_changes_a_frame_unreported(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_no_order_of_recording_changes_a_frame_unreported(tmp_path_factory, data) -> None:
     """Messages that are delayed by under a second change nothing; others are counted."""
     most_tenths = data.draw(st.sampled_from([9, 40, 200]))
     messages = recording()
@@ -142,9 +136,7 @@ def test_no_order_of_recording_changes_a_frame_unreported(
 
 @pytest.mark.parametrize('order', ['last', 'first', 'alone'])
 @pytest.mark.parametrize('speed_m_s', [np.nan, np.inf, 3e8])
-def test_bad_velocities_are_left_out_and_reported_once(
-    tmp_path: Path, order: str, speed_m_s: float
-) -> None:
+def test_bad_velocities_are_left_out_and_reported_once(tmp_path, order, speed_m_s) -> None:
     """NaN, inf or light speed in a bag ended in a traceback of the images."""
     with BagWriter(tmp_path / 'bag') as writer:
         for second in range(10):
@@ -163,7 +155,7 @@ def test_bad_velocities_are_left_out_and_reported_once(
         assert velocity_m_s is not None and velocity_m_s[1] == 7.0
 
 
-def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, small_chunks: None) -> None:
+def test_a_damaged_chunk_costs_what_is_in_it(tmp_path, small_chunks) -> None:
     """The frames of a damaged bag are its images, and the loss is reported as by `read_images`."""
     bag = write(tmp_path / 'bag', recording())
     (file,) = bag.glob('*.mcap')
@@ -180,7 +172,7 @@ def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, small_chunks: None)
     assert of_images and set(of_images) <= set(said)
 
 
-def test_the_reading_thread_ends_with_its_reader(tmp_path: Path) -> None:
+def test_the_reading_thread_ends_with_its_reader(tmp_path) -> None:
     frames = read_frames([write(tmp_path / 'bag', recording(), size=64)], TOPICS, OPTIONS)
     next(frames)
     assert any(thread.name.startswith('read-ahead') for thread in threading.enumerate())
@@ -204,7 +196,7 @@ print(k, peak() - early)
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='ru_maxrss is in kB on Linux')
 @pytest.mark.slow
-def test_memory_is_flat(tmp_path: Path) -> None:
+def test_memory_is_flat(tmp_path) -> None:
     """Fifty images need no more memory than fifteen, with an attitude after each only."""
     messages = [item for k in range(50) for item in (('attitude', 20 * k - 1), ('image', 20 * k))]
     path = write(tmp_path / 'long', [*messages, ('attitude', 1001)], size=1000)
@@ -247,12 +239,7 @@ def rewritten(source: Path, path: Path, order: str, outside: str, is_logged_anew
 @pytest.mark.parametrize('order', ORDERS)
 @pytest.mark.usefixtures('small_chunks')
 def test_an_image_is_read_wherever_it_is_in_the_file(
-    tmp_path: Path,
-    small_chunks: None,
-    order: str,
-    outside: str,
-    is_logged_anew: bool,
-    is_cut: bool,
+    tmp_path, small_chunks, order, outside, is_logged_anew, is_cut
 ) -> None:
     """Each with its telemetry and pixels, in stamps that go back once at most."""
     source = write(tmp_path / 'bag', recording())

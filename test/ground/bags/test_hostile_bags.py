@@ -83,7 +83,7 @@ DEFINITIONS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize('name', DEFINITIONS)
-def test_huge_recursive_or_false_definitions(name: str, tmp_path: Path) -> None:
+def test_huge_recursive_or_false_definitions(name, tmp_path) -> None:
     path = tmp_path / 'bag.mcap'
     for data in (HEAD + b'\1' * 400, HEAD + b'\xff' * 4):
         write_bag(path, DEFINITIONS[name], data=data)
@@ -98,13 +98,13 @@ def test_huge_recursive_or_false_definitions(name: str, tmp_path: Path) -> None:
         ('float64[4294967295] x\n', {'type_name': 'sensor_msgs/msg/Image'}),
     ],
 )
-def test_channels_of_another_kind(definition: str, how: dict, tmp_path: Path) -> None:
+def test_channels_of_another_kind(definition, how, tmp_path) -> None:
     path = tmp_path / 'bag.mcap'
     write_bag(path, definition, **how)
     diagnose(path)
 
 
-def test_changed_definitions(tmp_path: Path) -> None:
+def test_changed_definitions(tmp_path) -> None:
     """The definition of this version with lines changed, over random bytes."""
     path = tmp_path / 'bag.mcap'
     draw = random.Random(16)
@@ -132,9 +132,7 @@ def test_changed_definitions(tmp_path: Path) -> None:
         'x' * 10_000,
     ],
 )  # fmt: skip
-def test_names_that_act_on_a_terminal_are_escaped(
-    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_that_act_on_a_terminal_are_escaped(text, tmp_path, capsys) -> None:
     path = tmp_path / 'bag.mcap'
     for type_name, topic in (
         (f'a/msg/{text}', '/t'),

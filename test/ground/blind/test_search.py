@@ -33,14 +33,7 @@ from starcal_ground.blind.search import (
     mirrored_camera,
     SkyMatch,
 )
-from starcal_ground.blind.sky_fit import (
-    _chance_of_order,
-    FOUND,
-    mutual,
-    Ranges,
-    SourceImage,
-    STATED,
-)
+from starcal_ground.blind.sky_fit import _chance_of_order, FOUND, mutual, SourceImage, STATED
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
@@ -57,7 +50,7 @@ def frame(request: pytest.FixtureRequest, catalog: StarCatalog) -> Frame:
     return next(frames(catalog, request.param, 20, 10, 1.0, 1))
 
 
-def test_stars_are_those_drawn(frame: Frame, catalog: StarCatalog) -> None:
+def test_stars_are_those_drawn(frame, catalog) -> None:
     found = find_sky(frame.xy_px, frame.prior, catalog)
     assert isinstance(found, SkyMatch) and not found.mirrored
     drawn = {tuple(xy): star for xy, star in zip(frame.xy_px.tolist(), frame.star, strict=True)}
@@ -79,7 +72,7 @@ def test_stars_are_those_drawn(frame: Frame, catalog: StarCatalog) -> None:
 
 
 @pytest.mark.slow
-def test_a_mirror_image_is_found_as_such(frame: Frame, catalog: StarCatalog) -> None:
+def test_a_mirror_image_is_found_as_such(frame, catalog) -> None:
     flipped = mirror(frame.xy_px, frame.prior.width)
     assert find_sky(flipped, frame.prior, catalog) is None
     found = find_sky(flipped, frame.prior, catalog, try_mirrored=True)
@@ -87,9 +80,7 @@ def test_a_mirror_image_is_found_as_such(frame: Frame, catalog: StarCatalog) -> 
     assert {tuple(xy) for xy in found.xy_px.tolist()} <= {tuple(xy) for xy in flipped.tolist()}
 
 
-def test_the_selection_of_sources_that_shows_stars_is_found(
-    frame: Frame, catalog: StarCatalog
-) -> None:
+def test_the_selection_of_sources_that_shows_stars_is_found(frame, catalog) -> None:
     points = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
     found, row = find_in_any([points[:4], points, frame.xy_px], [frame.prior], catalog)
     assert isinstance(found, SkyMatch) and row == 2
@@ -99,13 +90,13 @@ def test_the_selection_of_sources_that_shows_stars_is_found(
 
 
 @pytest.mark.slow
-def test_random_points_are_no_stars(catalog: StarCatalog) -> None:
+def test_random_points_are_no_stars(catalog) -> None:
     points = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
     found = find_sky(points, camera(25), catalog)
     assert found is None
 
 
-def test_four_sources_are_too_few(catalog: StarCatalog) -> None:
+def test_four_sources_are_too_few(catalog) -> None:
     found = find_sky(np.array([[1.0, 1], [50, 9], [700, 40], [99, 300]]), camera(25), catalog)
     assert found is None
 
@@ -188,9 +179,7 @@ def test_shapes_outside_the_grid_equal_none() -> None:
 
 
 @pytest.mark.parametrize('scale', [1, 7])
-def test_the_index_has_all_patterns_of_the_brightest_stars_of_each_disc(
-    catalog: StarCatalog, scale: int
-) -> None:
+def test_the_index_has_all_patterns_of_the_brightest_stars_of_each_disc(catalog, scale) -> None:
     index = pattern_index(catalog, scale)
     patterns = index.grid.patterns
     quads = index.stars(np.arange(len(patterns)))
@@ -262,7 +251,7 @@ def test_points_cover_the_sphere() -> None:
 
 
 @pytest.mark.parametrize('width_deg', [15, 55])
-def test_a_rotation_known_roughly_is_confirmed(catalog: StarCatalog, width_deg: float) -> None:
+def test_a_rotation_known_roughly_is_confirmed(catalog, width_deg) -> None:
     frame = next(
         frames(catalog, width_deg, 20, 10, 0.0, 1)
     )  # a confirmation needs the focal length
@@ -284,7 +273,7 @@ def test_a_rotation_known_roughly_is_confirmed(catalog: StarCatalog, width_deg: 
     (STATED, 1.1, True),
 ])  # fmt: skip
 def test_a_camera_that_identified_another_image_is_searched_near_its_focal_length(
-    catalog: StarCatalog, width_deg: float, ranges: Ranges, growth: float, is_found: bool
+    catalog, width_deg, ranges, growth, is_found
 ) -> None:
     frame = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
     fx = growth * float(frame.prior.parameters[0])
@@ -297,9 +286,7 @@ def test_a_camera_that_identified_another_image_is_searched_near_its_focal_lengt
 
 
 @pytest.mark.parametrize('mirrored', [False, True])
-def test_a_better_camera_matches_the_stars_that_one_image_left_out(
-    catalog: StarCatalog, mirrored: bool
-) -> None:
+def test_a_better_camera_matches_the_stars_that_one_image_left_out(catalog, mirrored) -> None:
     frame = next(frames(catalog, 25, 40, 10, 0.0, 1))
     xy_px = mirror(frame.xy_px, frame.prior.width) if mirrored else frame.xy_px
     sky = find_sky(xy_px, frame.prior, catalog, try_mirrored=True)
@@ -312,7 +299,7 @@ def test_a_better_camera_matches_the_stars_that_one_image_left_out(
     assert again.camera is frame.prior and again.mirrored == mirrored
 
 
-def test_bright_false_sources_do_not_hide_the_stars(catalog: StarCatalog) -> None:
+def test_bright_false_sources_do_not_hide_the_stars(catalog) -> None:
     """As in a corona: at large radii of matching, most stars are near a source by chance."""
     confirmed = 0
     for frame in frames(catalog, 55, 60, 100, 0.0, 10):
@@ -327,7 +314,7 @@ def test_bright_false_sources_do_not_hide_the_stars(catalog: StarCatalog) -> Non
     assert confirmed >= 6
 
 
-def test_a_catalog_too_small_for_a_pattern_identifies_nothing(catalog: StarCatalog) -> None:
+def test_a_catalog_too_small_for_a_pattern_identifies_nothing(catalog) -> None:
     frame = next(frames(catalog, 20, 20, 10, 0.0, 1))
     few = catalog.select(np.arange(49))
     assert find_sky(frame.xy_px, frame.prior, few, try_mirrored=True) is None
@@ -343,9 +330,7 @@ def test_a_catalog_too_small_for_a_pattern_identifies_nothing(catalog: StarCatal
         ('equidistant', [280.0, 0.0, 280.0, 399.5, 319.5, 0.0, 0.0, 0.0, 0.0], 80.0),
     ],
 )
-def test_half_of_the_diagonal_is_that_of_the_lens(
-    model: str, parameters: list[float], half_deg: float
-) -> None:
+def test_half_of_the_diagonal_is_that_of_the_lens(model, parameters, half_deg) -> None:
     image = SourceImage(np.empty((0, 2)), CameraModel(800, 640, np.array(parameters), model))
     # The corners of the first lens are 58 degrees off by its series, to half a degree.
     assert math.degrees(image.half_diagonal_rad) == pytest.approx(half_deg, abs=0.6)

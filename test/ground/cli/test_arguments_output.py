@@ -18,27 +18,14 @@ import signal
 import subprocess
 import sys
 
-from attacks import BAG, digests, many, write_product_folder  # type: ignore[import-not-found]
-from mission_files import write_frames, write_lsk, write_sclk  # type: ignore[import-not-found]
-import numpy as np
+from attacks import BAG, digests, many  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.sky.catalog import load_catalog
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope='module')
-def campaign(tmp_path_factory: pytest.TempPathFactory, few_images: Path) -> Path:
-    """A bag with its files, and the products of an earlier calibration in ``out/``."""
-    folder = tmp_path_factory.mktemp('campaign')
-    shutil.copytree(few_images, folder / 'bag')
-    write_product_folder(folder / 'out')
-    (folder / 'out/report.html').write_text('a page')
-    return folder
 
 
 def _prior_in_out(here: Path) -> None:
@@ -62,11 +49,6 @@ def _picture(folder: Path) -> Path:
     folder.mkdir(parents=True)
     (folder / 'image_0001.jpg').write_text('mine')
     return folder
-
-
-def _frames(here: Path) -> Path:
-    write_frames(here / 'frames')
-    return here / 'frames'
 
 
 _OWN = '--params HERE/bag/params.yaml -o'
@@ -122,14 +104,14 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         'simulate --scenario tiny -o HERE/night',
     ),
     'import over its attitudes': (
-        lambda here: _frames(here).joinpath('attitude.csv').rename(here / 'frames/import.json'),
+        lambda here: (here / 'frames/attitude.csv').rename(here / 'frames/import.json'),
         f'{_IMPORT} HERE/frames/import.json -o HERE/frames',
     ),
     'straight image over its original': (
-        _frames, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
+        _nothing, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
     ),
     'straight images of one name': (
-        lambda here: shutil.copytree(_frames(here), here / 'others'),
+        lambda here: shutil.copytree(here / 'frames', here / 'others'),
         'undistort HERE/out HERE/frames/0.png HERE/others/0.png -o HERE/straight',
     ),
     'simulation beside a damaged truth': (
@@ -140,9 +122,7 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize('name', PLACES)
-def test_an_output_that_names_an_input_is_refused(
-    name: str, campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_that_names_an_input_is_refused(name, campaign, tmp_path, capsys) -> None:
     """-o names an input, its folder, or a file of another origin: nothing is changed."""
     prepare, command = PLACES[name]
     here = tmp_path / 'campaign'
@@ -155,7 +135,7 @@ def test_an_output_that_names_an_input_is_refused(
 
 
 _OF_BAG = 'HERE/bag --params HERE/bag/params.yaml'
-_CK = '--kernels HERE/bag/naif0012.tls HERE/bag/clock.tsc'
+_CK = '--kernels HERE/naif.tls HERE/clock.tsc'
 WRITING: dict[str, str] = {
     f'calibrate {_OF_BAG} -o HERE/o': (
         'calibration.json camera_info.yaml observations.mcap residuals.npz report.html'
@@ -191,9 +171,7 @@ WRITING: dict[str, str] = {
     f'export HERE/out --to ck --spacecraft-id -999 -o HERE/o {_CK}': 'camera.bc',
 }
 """Commands that write, and the files that they write in ``o/``."""
-WITH_NODES = {
-    'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json',
-}
+WITH_NODES = {'demo -o HERE/o': 'demo_params.yaml calibrator.log report.html calibration.json'}
 
 
 def _foreign(path: Path) -> None:
@@ -215,23 +193,6 @@ OF_OTHERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.fixture(scope='module')
-def inputs(campaign: Path) -> Path:
-    """The campaign with a frame, its time and attitudes, a table of Gaia, and kernels."""
-    write_frames(campaign / 'frames')
-    stars = load_catalog(None, 3.0)
-    stars = stars.select(stars.id > 0)
-    places = np.degrees([stars.ra_rad, stars.dec_rad])
-    columns = zip(stars.id, *places, stars.magnitude, strict=True)
-    rows = [','.join(map(str, row)) for row in columns]
-    header = 'source_id,ra,dec,phot_g_mean_mag'
-    (campaign / 'gaia.csv').write_text('\n'.join([header, *rows, '']))
-    (campaign / 'places.csv').write_text('ra_deg,dec_deg\n1,2\n')
-    write_lsk(campaign / 'bag/naif0012.tls')
-    write_sclk(campaign / 'bag/clock.tsc')
-    return campaign
-
-
 def test_each_command_that_writes_is_in_the_table() -> None:
     """One without an option -o that writes is `report`."""
     actions = main.parser()._actions
@@ -249,19 +210,16 @@ def test_each_command_that_writes_is_in_the_table() -> None:
 
 
 @pytest.mark.parametrize('command', [*WRITING, *WITH_NODES])
-def test_what_starcal_did_not_write_is_not_replaced(
-    command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_starcal_did_not_write_is_not_replaced(command, campaign, tmp_path, capsys) -> None:
     """A file of others, or its own that was changed: nothing is written. Its own is replaced."""
     if command.startswith('demo'):
         pytest.importorskip('rclpy')
     here = tmp_path / 'campaign'
-    shutil.copytree(inputs, here)
+    shutil.copytree(campaign, here)
     names = (WRITING | WITH_NODES)[command].split()
     line = [word.replace('HERE', str(here)) for word in command.split()]
     if command.startswith('report'):
-        shutil.copytree(inputs / 'out', here / 'o')
-        (here / 'o/report.html').unlink()
+        shutil.copytree(campaign / 'out', here / 'o')
     for name in names:
         (here / 'o' / name).parent.mkdir(parents=True, exist_ok=True)
         for make in OF_OTHERS.values():
@@ -286,7 +244,7 @@ def test_what_starcal_did_not_write_is_not_replaced(
     'ends', ['>&-', '2>&-', '>&- 2>&-', '<&- >&- 2>&-', '>/dev/full', '| true', '2>&1 | true']
 )
 @pytest.mark.parametrize('bag', [BAG, '/none'])
-def test_standard_streams_that_are_closed_full_or_abandoned(bag: object, ends: str) -> None:
+def test_standard_streams_that_are_closed_full_or_abandoned(bag, ends) -> None:
     line = f'diagnose {bag} --params {BAG}/params.yaml'  # without, it is a search for the camera
     command = f'{sys.executable} -m starcal_ground.cli.main {line} {ends}'
     done = subprocess.run(['bash', '-c', command], capture_output=True, text=True)

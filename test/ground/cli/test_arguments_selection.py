@@ -25,6 +25,6 @@ def test_between_two_times() -> None:
 
 
 @pytest.mark.parametrize(('text', 'words'), [('noon', 'is not a time: give'), ('nan', 'finite')])
-def test_texts_that_are_no_time(text: str, words: str) -> None:
+def test_texts_that_are_no_time(text, words) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match=words):
         parse_time(text)

@@ -94,13 +94,12 @@ def _before_operation(event: str, arguments: tuple[object, ...]) -> None:
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, few_images: Path) -> Path:
     """A folder with the inputs in ``in/``: a bag, its images, a calibration of it."""
     folder = tmp_path_factory.mktemp('kills')
     sys.addaudithook(_before_operation)
     # With three images a run has fewer thumbnails than with ten, and the same other files.
-    few = dataclasses.replace(scenario('tiny'), image_count=3)
-    simulated_bag.write_bag(few, folder / 'in/bag')
+    shutil.copytree(few_images, folder / 'in/bag')
     write_frames(folder / 'in/frames', 2)
     files = ['--params', str(folder / 'in/bag/params.yaml'), '-o', str(folder / 'in/a')]
     with contextlib.redirect_stdout(io.StringIO()):
@@ -145,7 +144,7 @@ def _cut_in_run(
 
 
 @pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.name)
-def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder: Path) -> None:
+def test_outputs_are_old_or_whole_before_each_operation(command, folder) -> None:
     old, expected, operations = _whole_run(command, folder)
     assert operations > 1
     assert not _cut_in_run(command, folder, old, expected)
@@ -155,7 +154,7 @@ def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder
 
 @pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.name)
 def test_an_interrupt_is_one_line_and_leaves_inputs_and_outputs_sound(
-    command: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+    command, folder, capsys
 ) -> None:
     """Runs that replace the products of an earlier one."""
     old, expected, operations = _whole_run(command, folder)

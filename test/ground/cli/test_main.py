@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 import importlib.util
-import json
 import os
 from pathlib import Path
 import re
@@ -19,7 +18,7 @@ import sys
 from mission_files import params_with, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.child_process import module_command
@@ -32,109 +31,14 @@ from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import Image
 
 
-def test_no_command_prints_the_help(starcal: Starcal) -> None:
+def test_no_command_prints_the_help(starcal) -> None:
     status, out, err = starcal()
     assert (status, err) == (0, '')
     assert out == parser().format_help()
 
 
-def test_version(starcal: Starcal) -> None:
+def test_version(starcal) -> None:
     assert starcal('--version') == (0, f'starcal {software_version()}\n', '')
-
-
-def test_help_is_there_at_once() -> None:
-    done = subprocess.run(
-        [sys.executable, '-X', 'importtime', '-m', 'starcal_ground.cli.main', '--help'],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    for command in ('demo', 'diagnose', 'calibrate', 'compare', 'play', 'simulate', 'trend'):
-        assert command in done.stdout
-    # Half a second of imports would be felt at each press of the tab key.
-    numbers = ('numpy', 'scipy', 'cv2', 'mcap', 'rosbags')
-    for heavy in (*numbers, 'rclpy', 'rich', 'argcomplete'):
-        assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
-
-
-def test_a_command_line_imports_its_command_alone() -> None:
-    show = 'import sys; from starcal_ground.cli.main import parser; parser(["lookup", "plan"])'
-    show += '; print(*sys.modules)'
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
-    assert re.findall(r'starcal_ground\.cli\.commands\.(\w+)', done.stdout) == ['lookup']
-    assert 'numpy' not in done.stdout.split()
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (['fly'], ["'fly'"]),
-        (['calibrat'], ["'calibrat'", 'calibrate']),
-        (['diagnose', 'a.mcap', '--image-topick=/a'], ['--image-topick=/a', 'diagnose --help']),
-        (['diagnose', 'none.mcap'], ['none.mcap', 'no such file or folder']),
-        (['diagnose', ''], ['empty path']),
-        (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
-        (
-            ['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'],
-            ['larger than'],
-        ),
-        (
-            ['calibrate', str(TINY.parent), '--params', str(TINY / 'params.yaml'), '-o', 'x'],
-            ['did you mean', str(TINY)],
-        ),
-        (['compare', 'none'], ['B']),
-        (['compare', 'none', 'none'], ['none', 'No such file']),
-        (['compare', str(TINY), str(TINY)], [str(TINY), 'no calibration.json']),
-        (['compare', *2 * [str(TINY / 'truth.json')]], ['truth.json', 'not a calibration']),
-        (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
-        (['import', '--channel', 'grene'], ["'grene'", 'green']),
-        (['calibrate'], ['BAG']),
-        (['simulate', '-o', 'x'], ['--scenario']),
-        (['simulate', '-o', 'x', '--scenario', 'huge'], ["'huge'", 'tiny', 'small', 'paper']),
-        (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', '-1'], ['--seed', '-1']),
-        (['simulate', '-o', 'x', '--scenario', 'tiny', '--seed', 'one'], ['--seed', 'one']),
-        (
-            ['simulate', '-o', 'x', '--scenario', 'tiny', '--clock-error', '-0.5'],
-            ['--clock-error: -0.5 s changes no result'],
-        ),
-        (['play'], ['BAG']),
-        (['play', 'none.mcap'], ['none.mcap', 'no such file or folder']),
-        (['play', 'a.mcap', '--observer=ground'], ['--observer=ground (see starcal play --help)']),
-        (['play', str(TINY), '--rate', 'fast'], ['--rate', 'fast']),
-        (['calibrate', 'a', '-o', 'x', '--from', 'noon'], ['--from', 'is not a time: give 2026']),
-        (['play', str(TINY), '--rate', '-1'], ['--rate', '-1']),
-        (['play', str(TINY), '--rate', 'nan'], ['--rate', 'nan']),
-        (['play', str(TINY), '--remap', 'image'], ['--remap', "'image'"]),
-        (['monitor'], ['--once', 'not a terminal']),
-        (['monitor', '--once', 'nan'], ['--once', 'nan']),
-    ],
-)
-def test_bad_arguments(
-    starcal: Starcal,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    words: list[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert_refused(starcal(*arguments), *words)
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ('text', 'words'),
-    [
-        ('camera_info_url: a.yaml\n', ['write /**: and ros__parameters: above']),
-        ('ros__parameters: {camera_info_url: a.yaml}\n', ['write /**: above']),
-        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
-        ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
-        ('/**:\n  ros__parameters: {min_images: few}\n', ['min_images', 'bad.yaml']),
-    ],
-)
-def test_bad_parameter_files(
-    starcal: Starcal, tmp_path: Path, text: str, words: list[str]
-) -> None:
-    file = tmp_path / 'bad.yaml'
-    file.write_text(text)
-    assert_refused(starcal('calibrate', TINY, '--params', file, '-o', tmp_path / 'out'), *words)
 
 
 @pytest.fixture(scope='module')
@@ -146,7 +50,7 @@ def lookup_columns() -> list[str]:
 
 
 def test_lookup_writes_the_columns_of_the_interface_document(
-    starcal: Starcal, tmp_path: Path, tiny_products: Path, lookup_columns: list[str]
+    starcal, tmp_path, tiny_products, lookup_columns
 ) -> None:
     file = tmp_path / 'table.csv'
     status, out, err = starcal('lookup', tiny_products, '-o', file)
@@ -169,42 +73,10 @@ def test_lookup_writes_the_columns_of_the_interface_document(
         assert sorted(set(archive['v_px'])) == [0, 255.5, 511]
 
 
-@pytest.mark.parametrize(
-    ('file', 'options', 'words'),
-    [
-        ('a.csv', ('--points', '1'), ['--points', '1 is not within 2 to 2000']),
-        ('a', (), ['.csv', '.npz']),
-        ('none/a.csv', (), ['none', 'cannot be written']),
-    ],
-)
-def test_bad_lookups(
-    starcal: Starcal,
-    tmp_path: Path,
-    tiny_products: Path,
-    file: str,
-    options: tuple[str, ...],
-    words: list[str],
-) -> None:
-    assert_refused(starcal('lookup', tiny_products, '-o', tmp_path / file, *options), *words)
-    assert not (tmp_path / file).exists()
-    assert_refused(starcal('lookup', tmp_path, '-o', tmp_path / 'a.csv'), 'no calibration.json')
-
-
-def test_outputs_that_cannot_be_written(starcal: Starcal, tmp_path: Path) -> None:
-    file = tmp_path / 'file'
-    file.write_text('in the way')
-    assert_refused(
-        starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', file), str(file)
-    )
-    result = starcal('simulate', '--scenario', 'tiny', '-o', file / 'bag')
-    assert_refused(result, str(file))
-    assert file.read_text() == 'in the way'
-
-
 BLANK = np.full((512, 640), 33, np.uint16)
 
 
-def test_a_temperature_topic_must_be_there(starcal: Starcal, tmp_path: Path) -> None:
+def test_a_temperature_topic_must_be_there(starcal, tmp_path) -> None:
     files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     result = starcal('calibrate', TINY, *files, '--temperature-topic', '/box')
     assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
@@ -219,22 +91,6 @@ def test_a_temperature_topic_must_be_there(starcal: Starcal, tmp_path: Path) -> 
     asks = params_with(tmp_path, focal_temperature_order=1)
     result = starcal('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
     assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
-
-
-@pytest.mark.slow
-def test_simulate_writes_bag_truth_and_parameters(starcal: Starcal, tmp_path: Path) -> None:
-    made = ('--scenario', 'tiny', '--seed', '5', '--images', '4')
-    status, out, err = starcal('simulate', '-o', tmp_path / 'bag', *made)
-    assert (status, err) == (0, '')
-    truth = json.loads((tmp_path / 'bag' / 'truth.json').read_text())
-    assert (truth['seed'], truth['images'], truth['scenario']) == (5, 4, 'tiny')
-    assert (tmp_path / 'bag' / truth['bag']).is_file()
-    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
-    assert 'truth.json' in out and 'params.yaml' in out
-    assert starcal('simulate', '-o', tmp_path / 'b.mcap', *made)[0] == 0
-    same = (tmp_path / 'bag' / truth['bag']).read_bytes()
-    assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
-    assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}
 
 
 def examples() -> list[tuple[str, list[str]]]:
@@ -265,9 +121,7 @@ def test_each_command_has_examples_that_it_takes() -> None:
 
 @pytest.mark.packaging
 @pytest.mark.slow
-def test_the_first_steps_run_in_an_empty_folder(
-    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_steps_run_in_an_empty_folder(starcal, tmp_path, monkeypatch) -> None:
     """As after `pip install`, where there is neither ROS nor the bag of the repository."""
     monkeypatch.chdir(tmp_path)
     *steps, demo_step = [words[1:] for name, words in examples() if not name]
@@ -281,9 +135,7 @@ def test_the_first_steps_run_in_an_empty_folder(
     'line', ['demo -o {t}/out', 'play {b}', 'monitor --once 1'], ids=lambda line: line.split()[0]
 )
 @pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
-def test_what_needs_ros_names_it(
-    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
-) -> None:
+def test_what_needs_ros_names_it(starcal, tmp_path, monkeypatch, line, missing) -> None:
     for name in [name for name in sys.modules if name.partition('.')[0] == missing]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)  # cannot be imported
@@ -304,7 +156,7 @@ def test_what_needs_ros_names_it(
         (f'starcal diagnose {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],
 )
-def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:
+def test_a_shell_completes(line, expected, tmp_path) -> None:
     """What argcomplete's function in the shell asks the tool, and what it is told."""
     told = tmp_path / 'told'
     asked = {
@@ -339,9 +191,7 @@ def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> No
         ),
     ],
 )
-def test_a_command_becomes_its_node(
-    starcal: Starcal, monkeypatch: pytest.MonkeyPatch, line: str, module: str, arguments: str
-) -> None:
+def test_a_command_becomes_its_node(starcal, monkeypatch, line, module, arguments) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
     starcal(*line.split())
@@ -351,7 +201,7 @@ def test_a_command_becomes_its_node(
 
 
 def test_no_report_is_written_where_none_is_wanted(
-    starcal: Starcal, tmp_path: Path, tiny_bag: Path, tiny_products: Path
+    starcal, tmp_path, tiny_bag, tiny_products
 ) -> None:
     write_atomically(tmp_path / 'report.html', 'of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
@@ -361,16 +211,7 @@ def test_no_report_is_written_where_none_is_wanted(
     assert not (tmp_path / 'report.html').exists()
 
 
-@pytest.mark.slow
-def test_parameters_of_the_nodes_are_known_to_the_tool(starcal: Starcal, tmp_path: Path) -> None:
-    shared = params_with(
-        tmp_path, autostart=True, attitude_timeout_s=2.0, use_sim_time=True, max_change_px=1e-6
-    )
-    status, _, err = starcal('calibrate', TINY, '--params', shared, '-o', tmp_path / 'out')
-    assert (status, err) == (3, '')
-
-
-def test_demo_takes_the_bag_of_the_repository(tmp_path: Path) -> None:
+def test_demo_takes_the_bag_of_the_repository(tmp_path) -> None:
     bag = demo.tiny_bag(tmp_path)
     assert bag.bag == TINY
     assert bag.image_count == 10
@@ -378,9 +219,7 @@ def test_demo_takes_the_bag_of_the_repository(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_demo_makes_the_bag_where_there_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_makes_the_bag_where_there_is_none(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(demo, '__file__', str(tmp_path / 'package' / 'demo.py'))
     monkeypatch.setenv('AMENT_PREFIX_PATH', '')
     bag = demo.tiny_bag(tmp_path)
@@ -389,9 +228,7 @@ def test_demo_makes_the_bag_where_there_is_none(
 
 
 @pytest.mark.slow
-def test_demo_says_which_node_failed(
-    starcal: Starcal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo_says_which_node_failed(starcal, tmp_path, monkeypatch) -> None:
     failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
     waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
     monkeypatch.setattr(
@@ -402,7 +239,7 @@ def test_demo_says_which_node_failed(
     assert_refused(starcal('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
 
-def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_error_of_an_import_stays(monkeypatch) -> None:
     def broken(_args: object) -> int:
         raise ImportError('libfreetype is not there')
 

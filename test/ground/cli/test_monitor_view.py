@@ -47,9 +47,7 @@ def test_nothing_received_is_said() -> None:
         ('', ['calibrator', 'sat1/other'], ''),
     ],
 )
-def test_nodes_in_another_namespace_are_named(
-    namespace: str, nodes: list[str], remedy: str
-) -> None:
+def test_nodes_in_another_namespace_are_named(namespace, nodes, remedy) -> None:
     health = dict.fromkeys(nodes, (0, 'ok'))
     text = shown(Received(namespace=namespace, health=health))
     asked = f'nothing of calibrator in /{namespace}: try {remedy} '
@@ -114,7 +112,7 @@ def test_a_refused_candidate_shows_the_failed_check_first() -> None:
         (1.0, 0.0, 'max_x', 0.0),
     ],
 )
-def test_the_share_of_a_limit(found: float, limit: float, option: str, share: float) -> None:
+def test_the_share_of_a_limit(found, limit, option, share) -> None:
     assert share_of_limit(check(found, limit, option)) == share
 
 
@@ -123,7 +121,7 @@ def test_coverage_is_a_picture_of_the_detector() -> None:
     assert text == ['most in a cell: 4', '··░░', '▓▓██']
 
 
-def test_health_and_gate_come_first_on_a_terminal_of_24_lines() -> None:
+def test_health_and_gate_come_first_on_a_terminal_of_24_lines_and_80_columns() -> None:
     gate = tuple(
         dataclasses.replace(check(k / 10, 1.0, passed=k < 8), name=f'quantity {k} of the camera')
         for k in range(9)
@@ -137,20 +135,14 @@ def test_health_and_gate_come_first_on_a_terminal_of_24_lines() -> None:
         candidate=refused,
         health=health,
     )
-    first = shown(received).splitlines()[:24]
+    lines = shown(received, 80).splitlines()
+    assert max(map(len, lines)) <= 80
     where = [
-        next(k for k, line in enumerate(first) if words in line)
+        next(k for k, line in enumerate(lines[:24]) if words in line)
         for words in ('star_observer: warning', 'calibrator: ok', 'refused: over', 'quantity 8',
                       'quantity 7', 'quantity 4', '─ images')
     ]  # fmt: skip
     assert where == sorted(where)
-
-
-def test_it_fits_a_terminal_of_80_columns() -> None:
-    received = Received(
-        last=observations(), status=status(), active=calibration(), candidate=calibration()
-    )
-    assert max(map(len, shown(received).splitlines())) <= 80
 
 
 def hostile(value: Any) -> Any:

@@ -9,8 +9,6 @@ import re
 import subprocess
 import sys
 
-import pytest
-
 from starcal_ground.cli.terminal import print_table, print_verdict, progress_bar, table_lines
 
 SHOW = """
@@ -63,7 +61,7 @@ def test_no_color_is_obeyed() -> None:
     assert 'refused' in said and not COLOUR.search(said)
 
 
-def test_a_pipe_shows_plain_lines_and_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pipe_shows_plain_lines_and_no_bar(capsys) -> None:
     with progress_bar(2, 'images') as advance:
         advance()
         advance()

@@ -9,10 +9,8 @@ from pathlib import Path
 import resource
 import shutil
 
-from attacks import BAG, write_product_folder  # type: ignore[import-not-found]
-from mission_files import write_frames, write_lsk, write_sclk  # type: ignore[import-not-found]
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 pytestmark = pytest.mark.usefixtures('forked_readers')
 _MOST_BYTES = 1 << 30  # that a file adds to the memory
@@ -83,23 +81,9 @@ PLACES = {
 MAY_LACK = ('file of a bag', 'residuals.npz', 'observations.mcap', '--params of trend')
 
 
-@pytest.fixture(scope='module')
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag, a product folder, a frame to import, and kernels."""
-    folder = tmp_path_factory.mktemp('campaign')
-    shutil.copytree(BAG, folder / 'bag')
-    write_product_folder(folder / 'out')
-    write_frames(folder / 'frames')
-    write_lsk(folder / 'naif.tls')
-    write_sclk(folder / 'clock.tsc')
-    return folder
-
-
 @pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('name', FILES)
-def test_a_file_that_is_none_costs_one_line(
-    name: str, kind: str, campaign: Path, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_file_that_is_none_costs_one_line(name, kind, campaign, tmp_path, starcal) -> None:
     here = tmp_path / 'campaign'
     shutil.copytree(campaign, here)
     file = here / PLACES.get(name, 'file')

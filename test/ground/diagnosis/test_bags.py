@@ -33,7 +33,7 @@ def test_two_images_are_too_few_for_an_alignment() -> None:
 
 
 @pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
-def test_the_valid_attitudes_are_looked_at_as_they_were_received(direction: str) -> None:
+def test_the_valid_attitudes_are_looked_at_as_they_were_received(direction) -> None:
     history = AttitudeHistory()
     assert wire_attitudes(history, direction).quaternion.shape == (0, 4)
     sent = {30: [0.6, 0, 0, 0.8], 20: [0, 0, 0, 0.5], 15: [np.nan] * 4, 10: [1.0, 0, 0, 0]}
@@ -45,9 +45,7 @@ def test_the_valid_attitudes_are_looked_at_as_they_were_received(direction: str)
 
 
 @pytest.mark.slow
-def test_a_process_of_its_own(
-    unaligned: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_of_its_own(unaligned, tmp_path, monkeypatch) -> None:
     # In the folder of an untrusted bag: nothing that lies there is imported.
     (tmp_path / 'cv2.py').write_text('raise SystemExit(9)')
     monkeypatch.chdir(tmp_path)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass
 import functools
@@ -47,8 +47,10 @@ class Night:
     refused: str = ''
 
 
-def set_up(geometry: CameraGeometry) -> Setup:
-    return load_setup({}, prior=geometry)
+def night_of(scenario: synthetic.Scenario, stamps_ns: Any, sent: Any) -> Night:
+    """The images of a scenario, with the attitudes that are sent."""
+    setup = load_setup({}, prior=scenario.prior)
+    return Night(tuple(rendering.images(scenario)), WireAttitudes(stamps_ns, sent), setup)
 
 
 @functools.cache
@@ -81,16 +83,11 @@ def slewing_night() -> Night:
         cadence_s=step_s,
         start_ns=START_NS + 3_000000000,
     )
-    camera_from_tracker = Rotation.from_quat(scenario.truth.star_tracker_from_camera_xyzw).inv()
+    camera_from_tracker = scenario.truth.star_tracker_from_camera.inv()
     reported_s = np.arange(-around_s, (count - 1) * step_s + around_s, 0.5)
     stamps_ns = START_NS + np.rint(reported_s * 1e9).astype(np.int64)
     sent = (path(reported_s) * camera_from_tracker).as_quat()
-    prior = scenario.prior
-    return Night(
-        tuple(rendering.images(scenario)),
-        WireAttitudes(stamps_ns, sent),
-        set_up(prior),
-    )
+    return night_of(scenario, stamps_ns, sent)
 
 
 @functools.cache
@@ -113,7 +110,7 @@ def granasat_night() -> Night:
     return Night(
         tuple(images[2:6]),  # the first two carry an attitude of something else
         WireAttitudes(stamps_ns[order], quaternions),
-        set_up(CameraGeometry(camera, np.array(prior['align_prior_xyzw']))),
+        load_setup({}, prior=CameraGeometry(camera, np.array(prior['align_prior_xyzw']))),
     )
 
 
@@ -127,29 +124,39 @@ def catalog() -> StarCatalog:
     return load_catalog(None, 9.0)
 
 
-def with_quaternions(night: Night, change: Callable[[Any], Any]) -> Night:
-    attitudes = WireAttitudes(night.attitudes.time_ns, change(night.attitudes.quaternion))
-    return dataclasses.replace(night, attitudes=attitudes)
+Change = Callable[[Night], Night]
 
 
-def with_pixels(night: Night, change: Callable[[Any], Any]) -> Night:
-    images = tuple(Image(i.time_ns, np.ascontiguousarray(change(i.pixels))) for i in night.images)
-    return dataclasses.replace(night, images=images)
+def of_quaternions(change: Callable[[Any], Any]) -> Change:
+    return lambda night: dataclasses.replace(
+        night, attitudes=WireAttitudes(night.attitudes.time_ns, change(night.attitudes.quaternion))
+    )
 
 
-def with_alignment(night: Night, turn: Rotation) -> Night:
-    turned = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw) * turn
-    prior = CameraGeometry(night.setup.prior.camera, turned.as_quat())
-    return with_setup(night, prior=prior)
+def of_images(change: Callable[[Image], Image]) -> Change:
+    return lambda night: dataclasses.replace(night, images=tuple(map(change, night.images)))
 
 
-def with_stamps(night: Night, late_s: float) -> Night:
-    images = tuple(Image(i.time_ns + round(late_s * 1e9), i.pixels) for i in night.images)
-    return dataclasses.replace(night, images=images)
+def of_pixels(change: Callable[[Any], Any]) -> Change:
+    return of_images(lambda i: Image(i.time_ns, np.ascontiguousarray(change(i.pixels))))
+
+
+def late(seconds: float) -> Change:
+    return of_images(lambda i: Image(i.time_ns + round(seconds * 1e9), i.pixels))
 
 
 def with_setup(night: Night, **changes: Any) -> Night:
     return dataclasses.replace(night, setup=dataclasses.replace(night.setup, **changes))
+
+
+def with_alignment(night: Night, star_tracker_from_camera: Rotation) -> Night:
+    prior = CameraGeometry(night.setup.prior.camera, star_tracker_from_camera.as_quat())
+    return with_setup(night, prior=prior)
+
+
+def turned(turn: Rotation) -> Change:
+    """State an alignment that is turned by a rotation of the camera."""
+    return lambda n: with_alignment(n, n.setup.prior.star_tracker_from_camera * turn)
 
 
 def found_in(night: Night, catalog: StarCatalog) -> Diagnosis:
@@ -162,8 +169,8 @@ def found_in(night: Night, catalog: StarCatalog) -> Diagnosis:
 DATE_JD = (2440587.5, START_NS / 86400e9)
 
 
-def sent_as(order: list[int], signs: tuple[int, ...] = (1, 1, 1, 1)) -> Callable[[Night], Night]:
-    return lambda night: with_quaternions(night, lambda q: (q * np.array(signs))[:, order])
+def sent_as(order: list[int], signs: tuple[int, ...] = (1, 1, 1, 1)) -> Change:
+    return of_quaternions(lambda q: (q * np.array(signs))[:, order])
 
 
 w_first = sent_as([3, 0, 1, 2])
@@ -174,31 +181,25 @@ def unaligned(night: Night) -> Night:
     return with_setup(night, is_aligned=False)
 
 
-def with_direction(direction: str) -> Callable[[Night], Night]:
+def with_direction(direction: str) -> Change:
     options = AttitudeOptions(attitude_direction=direction)
     return lambda night: with_setup(night, attitude=options)
 
 
-def off(degrees: float) -> Callable[[Night], Night]:
-    turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, -0.64, 0.48]))
-    return lambda night: with_alignment(night, turn)
+def off(degrees: float) -> Change:
+    return turned(Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, -0.64, 0.48])))
 
 
-def rolled(degrees: float) -> Callable[[Night], Night]:
-    turn = Rotation.from_euler('z', degrees, degrees=True)
-    return lambda night: with_alignment(night, turn)
+def rolled(degrees: float) -> Change:
+    return turned(Rotation.from_euler('z', degrees, degrees=True))
 
 
 half_turned = rolled(180.0)
 
 
-def of_pixels(change: Callable[[Any], Any]) -> Callable[[Night], Night]:
-    return lambda night: with_pixels(night, change)
-
-
-def dark(night: Night) -> Night:
-    rng = np.random.default_rng(1)
-    return with_pixels(night, lambda p: rng.poisson(50, p.shape).astype(p.dtype))
+@of_pixels
+def dark(pixels: Any) -> Any:
+    return np.random.default_rng(1).poisson(50, pixels.shape).astype(pixels.dtype)
 
 
 def capped_at_first(night: Night) -> Night:
@@ -209,12 +210,13 @@ def capped_at_first(night: Night) -> Night:
     return dataclasses.replace(night, images=cap_on + night.images)
 
 
+@of_pixels
 def curved(pixels: Any) -> Any:
     light = np.maximum(pixels.astype(float) - np.median(pixels), 0.0) / pixels.max()
     return (10 + 0.8 * pixels.max() * light ** (1 / 2.2)).astype(pixels.dtype)
 
 
-def smeared(length: int) -> Callable[[Night], Night]:
+def smeared(length: int) -> Change:
     def change(pixels: Any) -> Any:
         level = np.median(pixels)
         light = np.stack([np.roll(pixels, k, axis=1) for k in range(length)]).astype(float)
@@ -225,80 +227,81 @@ def smeared(length: int) -> Callable[[Night], Night]:
     return of_pixels(change)
 
 
-def with_focal_length(share: float) -> Callable[[Night], Night]:
-    def change(night: Night) -> Night:
-        camera = night.setup.prior.camera
-        fx, _, fy = camera.intrinsics[:3]
-        return with_camera(night, camera.replace(fx=share * float(fx), fy=share * float(fy)))
+def with_camera(change: Callable[[Night, CameraModel], CameraModel]) -> Change:
+    """State another camera matrix, or another size."""
 
-    return change
+    def changed(night: Night) -> Night:
+        prior = night.setup.prior
+        camera = change(night, prior.camera)
+        return with_setup(night, prior=dataclasses.replace(prior, camera=camera))
 
-
-def of_something_else(night: Night) -> Night:
-    rng = np.random.default_rng(3)
-    return with_quaternions(night, lambda q: Rotation.random(len(q), random_state=rng).as_quat())
+    return changed
 
 
-def in_axes(matrix: Any) -> Callable[[Night], Night]:
-    turn = Rotation.from_matrix(matrix)
-    return lambda night: with_quaternions(
-        night, lambda q: (turn * Rotation.from_quat(q)).as_quat()
+def with_focal_length(share: float) -> Change:
+    return with_camera(
+        lambda _, camera: camera.replace(
+            fx=share * float(camera.parameters[0]), fy=share * float(camera.parameters[2])
+        )
     )
 
 
-def frozen(night: Night) -> Night:
-    return with_quaternions(night, lambda q: np.tile(q[:1], (len(q), 1)))
+@of_quaternions
+def of_something_else(quaternions: Any) -> Any:
+    return Rotation.random(len(quaternions), random_state=np.random.default_rng(3)).as_quat()
 
 
-def with_camera(night: Night, camera: CameraModel) -> Night:
-    return with_setup(night, prior=dataclasses.replace(night.setup.prior, camera=camera))
+def in_axes(matrix: Any) -> Change:
+    turn = Rotation.from_matrix(matrix)
+    return of_quaternions(lambda q: (turn * Rotation.from_quat(q)).as_quat())
 
 
-def with_centre(right: float, down: float) -> Callable[[Night], Night]:
+@of_quaternions
+def frozen(quaternions: Any) -> Any:
+    return np.tile(quaternions[:1], (len(quaternions), 1))
+
+
+def with_centre(right: float, down: float) -> Change:
     """State a principal point that is off by parts of the width."""
+    return with_camera(
+        lambda _, camera: camera.replace(
+            cx=float(camera.parameters[3]) + right * camera.width,
+            cy=float(camera.parameters[4]) + down * camera.width,
+        )
+    )
 
-    def change(night: Night) -> Night:
-        camera = night.setup.prior.camera
-        cx, cy = camera.parameters[3:5] + np.array([right, down]) * camera.width
-        return with_camera(night, camera.replace(cx=float(cx), cy=float(cy)))
 
-    return change
-
-
-def with_size(night: Night) -> Night:
+@with_camera
+def with_size(night: Night, camera: CameraModel) -> CameraModel:
     """State the size of the images in the camera file, which has another camera matrix."""
     height, width = night.images[0].pixels.shape
-    camera = dataclasses.replace(night.setup.prior.camera, width=width, height=height)
-    return with_camera(night, camera)
+    return dataclasses.replace(camera, width=width, height=height)
 
 
-def region(left: float, right: float, top: float, bottom: float) -> Callable[[Night], Night]:
+def region(left: float, right: float, top: float, bottom: float) -> Change:
     def cut(pixels: Any) -> Any:
         height, width = pixels.shape
         rows = slice(int(top * height), int(bottom * height))
         return pixels[rows, int(left * width) : int(right * width)]
 
-    return lambda night: with_pixels(night, cut)
+    return of_pixels(cut)
 
 
-def binned(night: Night) -> Night:
-    def mean(pixels: Any) -> Any:
-        height, width = pixels.shape
-        bins = pixels.reshape(height // 2, 2, width // 2, 2)
-        return bins.mean(axis=(1, 3)).astype(pixels.dtype)
-
-    return with_pixels(night, mean)
+@of_pixels
+def binned(pixels: Any) -> Any:
+    height, width = pixels.shape
+    bins = pixels.reshape(height // 2, 2, width // 2, 2)
+    return bins.mean(axis=(1, 3)).astype(pixels.dtype)
 
 
 def inverse_alignment(night: Night) -> Night:
-    inverse = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw).inv()
-    return with_setup(night, prior=CameraGeometry(night.setup.prior.camera, inverse.as_quat()))
+    return with_alignment(night, night.setup.prior.star_tracker_from_camera.inv())
 
 
 def of_camera(night: Night) -> Night:
     """Send the attitudes of the camera, and state the alignment of the star tracker."""
-    alignment = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw)
-    return with_quaternions(night, lambda q: (Rotation.from_quat(q) * alignment).as_quat())
+    alignment = night.setup.prior.star_tracker_from_camera
+    return of_quaternions(lambda q: (Rotation.from_quat(q) * alignment).as_quat())(night)
 
 
 def without_tracker(night: Night) -> Night:
@@ -322,7 +325,7 @@ def blurred(light: Callable[[Any, Any], Any], refused: str = 'too_few_stars') ->
         return made.clip(0, 65535).astype(pixels.dtype)
 
     def change(night: Night) -> Night:
-        return dataclasses.replace(with_pixels(night, spread), refused=refused)
+        return dataclasses.replace(of_pixels(spread)(night), refused=refused)
 
     return change
 
@@ -342,7 +345,7 @@ def comet(u: Any, v: Any) -> Any:
     return np.exp(-0.5 * across**2 - along / 6.0) * (u < 12)
 
 
-def together(*changes: Callable[[Night], Night]) -> Callable[[Night], Night]:
+def together(*changes: Change) -> Change:
     return lambda night: functools.reduce(lambda made, change: change(made), changes, night)
 
 
@@ -353,18 +356,15 @@ def with_the_earth(night: Night) -> Night:
         for day in night.attitudes.time_ns / 86400e9
     ]
     turns = Rotation.from_matrix(np.array(earth_from_icrf))
-    return with_quaternions(night, lambda q: (turns * Rotation.from_quat(q)).as_quat())
+    return of_quaternions(lambda q: (turns * Rotation.from_quat(q)).as_quat())(night)
 
 
+@of_pixels
 def expanded(pixels: Any) -> Any:
     """Undo the curve of sRGB in linear pixels of 8 bits, with stars that stand out."""
     light = np.clip((pixels.astype(float) - np.median(pixels)) / pixels.max(), 0.0, 1.0)
     noise = np.random.default_rng(0).normal(100.0, 2.0, pixels.shape)
     return (noise + 60000.0 * light**2.2).clip(0, 65535).astype(np.uint16)
-
-
-def late(seconds: float) -> Callable[[Night], Night]:
-    return lambda night: with_stamps(night, seconds)
 
 
 @pytest.mark.parametrize(
@@ -389,7 +389,7 @@ def late(seconds: float) -> Callable[[Night], Night]:
         # Up to 10 px they are measured; one longer than the window of 13 px is cut.
         ([smeared(12)], ['smear'], pytest.approx(12, abs=2), 'about'),
         ([smeared(40)], ['smear'], pytest.approx(13, abs=2), 'at least'),
-        ([of_pixels(curved)], ['not_linear'], None, ''),
+        ([curved], ['not_linear'], None, ''),
         ([of_something_else], ['unknown'], None, ''),
         # Two mistakes.
         ([conjugated, off(40)], ['attitude_direction', 'prior_alignment'], None, ''),
@@ -410,7 +410,7 @@ def late(seconds: float) -> Callable[[Night], Night]:
     ],
 )
 def test_mistakes_of_a_rendered_and_of_a_real_night(
-    night: Night, catalog: StarCatalog, changes: Any, causes: list[str], value: Any, words: str
+    night, catalog, changes, causes, value, words
 ) -> None:
     found = found_in(together(*changes)(night), catalog)
     assert [found.cause, *found.also] == causes
@@ -421,10 +421,10 @@ def test_mistakes_of_a_rendered_and_of_a_real_night(
 
 
 @pytest.mark.parametrize('missing', [False, True])
-def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
-    right = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw)
-    tilted = with_alignment(night, Rotation.from_euler('x', 10.0, degrees=True))
-    found = found_in(unaligned(night) if missing else tilted, catalog)
+def test_alignment(night, catalog, missing) -> None:
+    right = night.setup.prior.star_tracker_from_camera
+    tilted = turned(Rotation.from_euler('x', 10.0, degrees=True))
+    found = found_in((unaligned if missing else tilted)(night), catalog)
     assert found.cause == 'prior_alignment'
     # The prior of the rendered night is off by 150 arcsec an axis; a lost principal point of 1 px
     # would be 100 arcsec. Within the degree and a half that is searched, it will do.
@@ -433,7 +433,7 @@ def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
     assert (Rotation.from_quat(found.found).inv() * right).magnitude() < math.radians(1.2)
 
 
-def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog) -> None:
+def test_alignment_by_stars_among_the_structure_of_a_corona(catalog) -> None:
     """Eighty wide spots, most of them brighter than the stars: the compact sources are known."""
     rng = np.random.default_rng(5)
 
@@ -446,8 +446,8 @@ def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog
             light += 10 ** rng.uniform(1.5, 2.3) * spread
         return np.minimum(pixels + light, 4095.0).astype(pixels.dtype)
 
-    night = with_pixels(slewing_night(), with_corona)
-    found = found_in(with_alignment(night, Rotation.from_rotvec([0.4, 0.3, 1.0])), catalog)
+    change = together(of_pixels(with_corona), turned(Rotation.from_rotvec([0.4, 0.3, 1.0])))
+    found = found_in(change(slewing_night()), catalog)
     assert (found.cause, found.images) == ('prior_alignment', 3)
 
 
@@ -458,8 +458,8 @@ def test_alignment_by_stars_among_the_structure_of_a_corona(catalog: StarCatalog
         *[(granasat_night, late_s) for late_s in (-41.0, 33.0)],
     ],
 )
-def test_clock(catalog: StarCatalog, night_of: Callable[[], Night], late_s: float) -> None:
-    found = found_in(with_stamps(night_of(), late_s), catalog)
+def test_clock(catalog, night_of, late_s) -> None:
+    found = found_in(late(late_s)(night_of()), catalog)
     assert found.cause == 'clock'
     # A tenth of a second of 2 degrees a second is what the star tracker's mounting would hide.
     # At rest, the attitudes are known for half a second before and after each image: the middle.
@@ -476,16 +476,11 @@ def at_rest(count: int) -> Night:
     samples = [s for k in range(count) for s in synthetic.attitude_samples(scenario, k)]
     stamps_ns = np.array([sample.time_ns for sample in samples])
     sent = np.array([sample.icrf_from_star_tracker_xyzw for sample in samples])
-    prior = scenario.prior
-    return Night(
-        tuple(rendering.images(scenario)),
-        WireAttitudes(stamps_ns, sent),
-        set_up(prior),
-    )
+    return night_of(scenario, stamps_ns, sent)
 
 
 @pytest.mark.parametrize('count', [1, 4])
-def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
+def test_images_that_do_not_turn(catalog, count) -> None:
     resting = at_rest(count)
     assert found_in(resting, catalog).cause == 'none'
     assert found_in(conjugated(resting), catalog).cause == 'attitude_direction'
@@ -558,22 +553,14 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
             ['principal_point'],
             'a camera matrix of the whole detector with the size of a region looks so',
         ),
-        (
-            [region(0.25, 0.95, 0.1, 0.8)],
-            ['wrong_size'],
-            'a region of the detector (roi of',
-        ),
+        ([region(0.25, 0.95, 0.1, 0.8)], ['wrong_size'], 'a region of the detector (roi of'),
         # Half as wide and high, but no bins: the stars tell.
-        (
-            [region(0.4, 0.9, 0.1, 0.6)],
-            ['wrong_size'],
-            'a region of the detector (roi of',
-        ),
+        ([region(0.4, 0.9, 0.1, 0.6)], ['wrong_size'], 'a region of the detector (roi of'),
         ([binned], ['wrong_size'], 'binned 2 x 2 (binning_x, binning_y of CameraInfo)'),
         ([binned, with_size], ['focal_length'], 'is of pixels before 2 x 2 binning'),
         ([binned, off(40)], ['wrong_size', 'prior_alignment'], 'prior_alignment points'),
         ([of_pixels(lambda p: p.T)], ['mirrored', 'rotated'], 'sides are those'),
-        ([of_pixels(expanded)], ['not_linear'], 'a tone curve that they never had'),
+        ([expanded], ['not_linear'], 'a tone curve that they never had'),
         # One shape of all stars: discs and rings of a lens out of focus, comets, and as wide that
         # the images are identified in bins of pixels only. None where they are measured.
         ([blurred(disc(4.0, 2.0))], ['one_shape'], 'All stars are wide discs or rings alike'),
@@ -592,12 +579,7 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
         ),
     ],
 )
-def test_a_mistake_is_named_and_nothing_else(
-    changes: Sequence[Callable[[Night], Night]],
-    causes: list[str],
-    words: str,
-    catalog: StarCatalog,
-) -> None:
+def test_a_mistake_is_named_and_nothing_else(changes, causes, words, catalog) -> None:
     found = found_in(together(*changes)(slewing_night()), catalog)
     assert [found.cause, *found.also] == (causes or ['none'])
     assert words in ' '.join([found.sentence, *found.evidence, *found.mend])
@@ -605,7 +587,7 @@ def test_a_mistake_is_named_and_nothing_else(
     assert not {'unknown', 'none'} & {*found.also}
 
 
-def test_the_numbers_of_a_camera_matrix(catalog: StarCatalog) -> None:
+def test_the_numbers_of_a_camera_matrix(catalog) -> None:
     """Those that go into the camera file are right."""
     night = slewing_night()
     fx, cx, cy = (float(night.setup.prior.camera.parameters[k]) for k in (0, 3, 4))
@@ -634,7 +616,7 @@ def test_the_numbers_of_a_camera_matrix(catalog: StarCatalog) -> None:
         (-12600.0, '3.5 h is the difference of two time zones'),
     ],
 )
-def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: StarCatalog) -> None:
+def test_a_clock_of_another_scale_or_zone(late_s, words, catalog) -> None:
     """Attitudes of a whole day, in which the images are somewhere."""
     night = slewing_night()
     steady = np.arange(-50_000, 50_000, 10, dtype=np.int64) * 1_000_000_000 + START_NS
@@ -644,7 +626,7 @@ def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: St
     order = np.argsort(time_ns)
     quaternions = np.concatenate([night.attitudes.quaternion, turns])[order]
     of_a_day = dataclasses.replace(night, attitudes=WireAttitudes(time_ns[order], quaternions))
-    found = found_in(with_stamps(of_a_day, late_s), catalog)
+    found = found_in(late(late_s)(of_a_day), catalog)
     assert found.cause == 'clock' and words in ' '.join(found.evidence)
     assert found.found == pytest.approx(-late_s, abs=0.1)  # as in `test_clock`
 
@@ -658,7 +640,7 @@ def test_a_clock_of_another_scale_or_zone(late_s: float, words: str, catalog: St
     ],
 )
 def test_a_size_without_known_stars_has_the_remedies_of_all_that_it_can_be(
-    shape: tuple[int, int], remedies: list[str]
+    shape, remedies
 ) -> None:
     setup = read_setup(Path(__file__).parents[3] / 'bags' / 'tiny' / 'params.yaml')
     pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)

@@ -72,9 +72,7 @@ def words_on(frames: list[Pixels]) -> dict[int, str]:
 @pytest.mark.parametrize('shift_px', [0.0, 0.5])
 @pytest.mark.parametrize('pattern', [0.0, 5.0])
 @pytest.mark.parametrize(('psf_px', 'faint'), [(0.5, 2500), (1.3, 2500), (1.0, 0)])
-def test_exposures_of_one_field_and_camera_are_no_copies(
-    psf_px: float, faint: int, pattern: float, shift_px: float
-) -> None:
+def test_exposures_of_one_field_and_camera_are_no_copies(psf_px, faint, pattern, shift_px) -> None:
     light = sky(1, psf_px, faint)
     assert not words_on([exposed(light, k, shift_px, pattern) for k in range(5)])
 
@@ -92,7 +90,7 @@ COPIES: dict[str, Callable[[Pixels], Pixels]] = {
 
 @pytest.mark.parametrize('pattern', [0.0, 3.0])
 @pytest.mark.parametrize('name', COPIES)
-def test_an_exposure_encoded_again_is_a_copy(name: str, pattern: float) -> None:
+def test_an_exposure_encoded_again_is_a_copy(name, pattern) -> None:
     frames = [exposed(sky(k), k, pattern=pattern) for k in range(4)]
     again = COPIES[name](frames[0])
     (number, words), *others = words_on([*frames, again]).items()
@@ -112,7 +110,7 @@ def test_equal_pixels_are_a_copy_wherever_it_stands() -> None:
 
 
 @pytest.mark.parametrize('name', ['microobs', 'polaris', 'lco_kb82'])
-def test_real_exposures_are_no_copies(name: str) -> None:
+def test_real_exposures_are_no_copies(name) -> None:
     """Microobs: faint stars on the same pixels, for minutes."""
     files = sorted(path for path in (REAL_SKY / name).glob('*.*') if path.suffix != '.csv')
     if not files:

@@ -6,20 +6,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import re
-import shutil
 
-from mission_files import attitudes, frames_of, images, TINY, write_encoded, write_pngs, write_tiny  # type: ignore[import-not-found]
+from mission_files import attitudes, frames_of, images, TINY, write_pngs, write_tiny  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
-from starcal_ground.bag_writer import BagWriter
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline.setup import read_setup
 
 TRUTH = json.loads((TINY / 'truth.json').read_text())
-IMAGES = '/opnav/image_raw'
 ATTITUDES = '/star_tracker/attitude'
 ALIGNMENT_DEG = 0.1  # noise of the star tracker in the bag: 0.011; a prior must be within 1.5
 COLUMNS = 80
@@ -35,9 +32,7 @@ def with_attitudes(path: Path, sign: int = 1, shift_s: int = 0) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
-def test_a_bag_of_which_nothing_is_stated(
-    tmp_path: Path, direction: str, starcal: Starcal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bag_of_which_nothing_is_stated(tmp_path, direction, starcal, monkeypatch) -> None:
     monkeypatch.setenv('COLUMNS', str(COLUMNS))
     is_plain = direction == 'st_to_inertial'
     bag = TINY if is_plain else with_attitudes(tmp_path / 'b.mcap', -1)
@@ -80,7 +75,7 @@ def test_a_bag_of_which_nothing_is_stated(
 
 
 @pytest.mark.slow
-def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path: Path, starcal: Starcal) -> None:
+def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path, starcal) -> None:
     bag = with_attitudes(tmp_path / 'b.mcap', shift_s=5)
     assert_refused(
         starcal('calibrate', bag, *LENS, '-o', tmp_path / 'out', '--quiet'),
@@ -93,7 +88,7 @@ def test_attitudes_that_do_not_fit_are_diagnosed(tmp_path: Path, starcal: Starca
 
 
 @pytest.mark.slow
-def test_streaks_that_are_measured_are_identified_too(tmp_path: Path, starcal: Starcal) -> None:
+def test_streaks_that_are_measured_are_identified_too(tmp_path, starcal) -> None:
     """Twice as long as wide, but their middles make the patterns of points."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
     line = ['simulate', '-o', bag, '--scenario', 'tiny', '--smear', 8, '--images', 5]
@@ -107,7 +102,7 @@ def test_streaks_that_are_measured_are_identified_too(tmp_path: Path, starcal: S
 
 
 @pytest.mark.slow
-def test_photographs_of_which_nothing_is_stated(tmp_path: Path, starcal: Starcal) -> None:
+def test_photographs_of_which_nothing_is_stated(tmp_path, starcal) -> None:
     night, out = write_pngs(tmp_path / 'night', frames_of(3)), tmp_path / 'out'
     command = ['calibrate', night, '-o', out, '--no-report']
     status, text, notes = starcal(*command, '--focal-length-mm', 50, '--pixel-size-um', 10)
@@ -126,7 +121,7 @@ def test_photographs_of_which_nothing_is_stated(tmp_path: Path, starcal: Starcal
 
 @pytest.mark.slow
 def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air(
-    tmp_path: Path, starcal: Starcal
+    tmp_path, starcal
 ) -> None:
     """A bag in space: its stars contradict the ground, and the sigma holds half of the air."""
     given = [TINY, '--params', TINY / 'params.yaml', '--set', 'observer=ground']
@@ -134,16 +129,14 @@ def test_a_bag_on_the_ground_without_a_site_shows_what_its_stars_tell_of_the_air
         status, _, notes = starcal(*command, *given)
         assert status == 0 and 'observer: ground: the stars do not show its air' in notes
     calibration = read_calibration(tmp_path / 'calibration.json')
-    truth = json.loads((TINY / 'truth.json').read_text())['k_true'][0]
+    truth = TRUTH['k_true'][0]
     focal_px, sigma_px = calibration.geometry.camera.parameters[0], calibration.sigma[0]
     # Half of 52 arcsec is 1.3e-4 of the focal length; one draw, as above.
     assert abs(focal_px - truth) < 4 * sigma_px < 4 * 1.5e-4 * focal_px
 
 
 @pytest.mark.slow
-def test_a_requirement_is_answered_for_people_and_programs(
-    tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_requirement_is_answered_for_people_and_programs(tmp_path, starcal) -> None:
     command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '--no-report', '--json']
     command += ['-o', tmp_path, '--set', 'star_tracker_slow_arcsec=5']
     status, out, _ = starcal(*command, '--require', 'line_of_sight=20arcsec@98%')
@@ -161,79 +154,3 @@ def test_a_requirement_is_answered_for_people_and_programs(
     assert re.match(words, check['note']) and check['found'] < 0.07
     (reason,) = answer['reasons']
     assert reason.endswith(f'over the limit of 0.055 px (requirements); {check["note"]}')
-
-
-STATED = f'--params {TINY}/params.yaml -o out'
-WRONG = [
-    ('calibrate {bag}', ['-o/--output DIR: not given', 'e.g. -o out']),
-    ('calibrate {bag} --params camera.yaml -o out',
-     ['camera.yaml: a camera file', '--set camera_info_url=camera.yaml']),
-    ('calibrate {bag} -o out --set camera_info_url=none.yaml',
-     ['--set camera_info_url: none.yaml: no such file']),
-    ('calibrate {bag} -o out --set observer=grond', ['--set observer', 'did you mean ground?']),
-    ('calibrate {bag} -o out --set obsrver=ground', ['--set obsrver', 'did you mean observer?']),
-    ('calibrate {bag} -o out --set observer', ['--set', 'not of the form NAME=VALUE']),
-    ('calibrate {bag} -o out --require line=5arcsec', ['requirements: line is not']),
-    ('calibrate {bag} -o out --require map=5', ['unit', 'write map=5arcsec or map=5px']),
-    ('calibrate {bag} -o out --require map=5px@150%', ['the share at most 100 %']),
-    ('calibrate {bag} -o out --observer ground',
-     ['did you mean --set observer=VALUE?', 'starcal calibrate --help']),
-    ('calibrate {bag} -o out --set camera_info_url=params.yaml',
-     ['params.yaml: a parameter file, not a camera file: give it as --params']),
-    ('calibrate night {bag} -o out', [': a bag, and the other paths hold images']),
-    ('calibrate nothing -o out', ['nothing: no .mcap files in the folder, nor images']),
-    ('calibrate nothing/notes.txt -o out', ['notes.txt: not an MCAP bag, nor images']),
-    ('plan nothing', ['nothing: no .mcap files in the folder, nor images']),
-    ('plan night --set star_tracker_slow_arcsec=5', ['--camera-alone']),
-    ('calibrate {bag} -o out --focal-length-mm 50', ['--pixel-size-um: bags need both']),
-    ('calibrate {bag} {stated} --focal-length-mm 50', ['a camera_info_url has them already']),
-    ('calibrate {bag} -o out --json --quiet', ['--quiet: not allowed with argument --json']),
-    ('calibrate night -o out --set star_tracker_slow_arcsec=5',
-     ['star_tracker_slow_arcsec: stated, but image files have no attitudes', '--camera-alone']),
-    ('diagnose night --set star_tracker_slow_arcsec=5', ['--camera-alone']),
-    ('calibrate night.mcap -o out --set star_tracker_slow_arcsec=5', ['--camera-alone']),
-    ('calibrate observations.mcap -o out', ['shows no camera: give the parameter file']),
-    ('calibrate colour.mcap -o out', ['set image_channel, e.g. to green']),
-    ('calibrate colour.mcap {stated}', ['set image_channel, e.g. to green']),
-    ('calibrate {bag} -o out --jsn', ['unrecognized arguments: --jsn', 'calibrate --help']),
-    ('import --images night/0.png --attitude none.csv -o bag --camera none.yaml', ['none.yaml']),
-]  # fmt: skip
-
-
-@pytest.fixture(scope='module')
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the inputs of the table."""
-    folder = tmp_path_factory.mktemp('inputs')
-    for name in ('params.yaml', 'camera.yaml'):
-        shutil.copy(TINY / name, folder)
-    write_pngs(folder / 'night', frames_of(3))
-    (folder / 'nothing').mkdir()
-    (folder / 'nothing' / 'notes.txt').write_text('notes')
-    with BagWriter(folder / 'night.mcap') as writer:
-        for image in images()[:3]:
-            writer.write_image(IMAGES, image, 'camera')
-    with BagWriter(folder / 'colour.mcap') as writer:
-        for image in images()[:3]:
-            colour = np.repeat((image.pixels >> 4).astype(np.uint8).reshape(-1), 3)
-            write_encoded(writer, IMAGES, image, 'rgb8', colour)
-            writer.write_attitude(ATTITUDES, image.time_ns, np.array([0, 0, 0, 1.0]), 'icrf')
-    with BagWriter(folder / 'observations.mcap') as writer:
-        from starcal_ros.records import refused_image
-
-        writer.write_observations('/observations', refused_image(1, 8, 8, 'blank', ''), 'camera')
-    return folder
-
-
-@pytest.mark.parametrize(('line', 'words'), WRONG, ids=[line for line, _ in WRONG])
-def test_a_wrong_input_ends_in_one_line(
-    line: str,
-    words: list[str],
-    inputs: Path,
-    starcal: Starcal,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(inputs)
-    answer = starcal(*line.format(bag=TINY, stated=STATED).split())
-    assert_refused(answer, *words)
-    assert not answer.out
-    assert answer.err.lower().count('one channel') == 0  # no second remedy for colour

@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image, TiffImagePlugin
 import pytest
 
-from starcal_ground.images.image_series import FileFacts
+from starcal_ground.images.image_series import (
+    common_scale,
+    FileFacts,
+    ImageOptions,
+    look,
+    pixels_of,
+)
 from starcal_ground.images.photographs import (
     by_camera,
     image_paths,
@@ -50,13 +56,13 @@ def jpeg(
     return path
 
 
-def test_focal_length_of_35_mm_film_is_by_the_diagonal(tmp_path: Path) -> None:
+def test_focal_length_of_35_mm_film_is_by_the_diagonal(tmp_path) -> None:
     one = look_at(jpeg(tmp_path / 'a.jpg', CANON, {0xA405: 24}))
     assert one.focal_px == pytest.approx(24 / math.hypot(36, 24) * math.hypot(60, 40), rel=1e-4)
     assert math.isnan(look_at(jpeg(tmp_path / 'b.jpg', CANON, {0xA405: 0})).focal_px)
 
 
-def test_focal_length_by_the_pixels_of_the_sensor_goes_before_it(tmp_path: Path) -> None:
+def test_focal_length_by_the_pixels_of_the_sensor_goes_before_it(tmp_path) -> None:
     # 6000 pixels at 2540 a centimetre, in inches; this image is at a hundredth of that.
     tags: dict[int, object] = {0x920A: 50.0, 0xA20E: 6451.6, 0xA210: 2, 0xA002: 6000, 0xA405: 80}
     one = look_at(jpeg(tmp_path / 'a.jpg', CANON, tags))
@@ -71,7 +77,7 @@ def test_focal_length_by_the_pixels_of_the_sensor_goes_before_it(tmp_path: Path)
     assert given.focal_px == pytest.approx(5000.0)
 
 
-def test_the_stamp_is_the_middle_of_the_exposure_in_utc(tmp_path: Path) -> None:
+def test_the_stamp_is_the_middle_of_the_exposure_in_utc(tmp_path) -> None:
     one = look_at(jpeg(tmp_path / 'a.jpg', CANON, DATE))
     assert (one.time_ns, one.dated, one.utc) == (TIME_S * 10**9, True, True)
     local = look_at(jpeg(tmp_path / 'b.jpg', CANON, {**DATE, 0x9011: ''}))
@@ -82,7 +88,7 @@ def test_the_stamp_is_the_middle_of_the_exposure_in_utc(tmp_path: Path) -> None:
     assert not look_at(never_set).dated
 
 
-def test_a_stated_time_and_flip_replace_those_of_a_file(tmp_path: Path) -> None:
+def test_a_stated_time_and_flip_replace_those_of_a_file(tmp_path) -> None:
     facts = FileFacts({'c.jpg': TIME_S * 10**9}, 'top-bottom')
     for path in (
         jpeg(tmp_path / 'c.jpg', CANON, {}),
@@ -95,7 +101,7 @@ def test_a_stated_time_and_flip_replace_those_of_a_file(tmp_path: Path) -> None:
         look_at(jpeg(tmp_path / 'd.jpg', CANON, DATE), facts=facts)
 
 
-def test_gps_tags_are_the_site(tmp_path: Path) -> None:
+def test_gps_tags_are_the_site(tmp_path) -> None:
     gps: dict[int, object] = {
         1: 'S', 2: (33.0, 27.0, 30.0), 3: 'W', 4: (70.0, 40.0, 12.0), 5: b'\0', 6: 520.0,
     }  # fmt: skip
@@ -106,7 +112,7 @@ def test_gps_tags_are_the_site(tmp_path: Path) -> None:
     )
 
 
-def test_portrait_is_the_image_of_the_sensor_and_cameras_are_told_apart(tmp_path: Path) -> None:
+def test_portrait_is_the_image_of_the_sensor_and_cameras_are_told_apart(tmp_path) -> None:
     flat = look_at(jpeg(tmp_path / 'a.jpg', CANON, {0x920A: 50.0}))
     upright = look_at(jpeg(tmp_path / 'b.jpg', {**CANON, 0x0112: 6}, {0x920A: 50.0}))
     zoomed = look_at(jpeg(tmp_path / 'c.jpg', CANON, {0x920A: 35.0}))
@@ -120,7 +126,7 @@ def test_portrait_is_the_image_of_the_sensor_and_cameras_are_told_apart(tmp_path
     assert pixels_of_photograph(upright.path).shape == (40, 60)
 
 
-def test_green_light_of_a_colour_image_without_the_curve(tmp_path: Path) -> None:
+def test_green_light_of_a_colour_image_without_the_curve(tmp_path) -> None:
     cv2.imwrite(str(tmp_path / 'a.png'), np.full((4, 5, 3), (0, 188, 255), np.uint8))
     pixels = pixels_of_photograph(tmp_path / 'a.png')
     # 188 of sRGB is half of the light of white, to 1 %.
@@ -128,7 +134,7 @@ def test_green_light_of_a_colour_image_without_the_curve(tmp_path: Path) -> None
     assert pixels[0, 0] / 65535 == pytest.approx(0.5, abs=0.005)
 
 
-def test_files_with_one_time_of_exposure_are_all_kept_the_largest_first(tmp_path: Path) -> None:
+def test_files_with_one_time_of_exposure_are_all_kept_the_largest_first(tmp_path) -> None:
     """Eight fields may be exposed in a second; pixels show copies, of which the first is kept."""
     for k in range(8):
         exif = Image.Exif()
@@ -167,9 +173,7 @@ def dng(path: Path, mosaic: NDArray[np.uint16]) -> Path:
 
 
 @pytest.mark.parametrize('zone', ['UTC', 'America/New_York'])
-def test_camera_raw_has_the_facts_of_its_tags(
-    tmp_path: Path, zone: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_camera_raw_has_the_facts_of_its_tags(tmp_path, zone, monkeypatch) -> None:
     """The clock of the camera has no zone, and that of this machine does not count."""
     pytest.importorskip('rawpy')
     monkeypatch.setenv('TZ', zone)
@@ -183,7 +187,7 @@ def test_camera_raw_has_the_facts_of_its_tags(
     assert one.dated and not one.utc
 
 
-def test_green_of_camera_raw_is_linear_in_light(tmp_path: Path) -> None:
+def test_green_of_camera_raw_is_linear_in_light(tmp_path) -> None:
     pytest.importorskip('rawpy')
     mosaic = np.full((80, 120), 612, np.uint16)
     mosaic[::2, ::2] = mosaic[1::2, 1::2] = 9000  # red and blue
@@ -196,7 +200,7 @@ def test_green_of_camera_raw_is_linear_in_light(tmp_path: Path) -> None:
     assert light[40, 62] == pytest.approx((3 * 100 + 4100) / 4 * unit, abs=2 * unit)
 
 
-def test_a_damaged_raw_file_is_one_line(tmp_path: Path) -> None:
+def test_a_damaged_raw_file_is_one_line(tmp_path) -> None:
     pytest.importorskip('rawpy')
     path = tmp_path / 'a.nef'
     path.write_bytes(b'II*\0' + b'x' * 5000)
@@ -222,6 +226,12 @@ def read(path: Path) -> Photograph:
     return photograph
 
 
+def imported(path: Path) -> None:
+    """Read the facts and the pixels of a file as an import does."""
+    options = ImageOptions({path.name: 1})
+    pixels_of(path, options, common_scale([look(path, options)], options))
+
+
 def sparse(path: Path, start: bytes, size: int) -> None:
     with path.open('wb') as file:
         file.write(start)
@@ -230,6 +240,16 @@ def sparse(path: Path, start: bytes, size: int) -> None:
 
 def content(data: bytes) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(data)
+
+
+def encoded_fits() -> bytes:
+    stream = io.BytesIO()
+    fits.PrimaryHDU(PIXELS[:, :, 0]).writeto(stream)
+    return stream.getvalue()
+
+
+def write_table(path: Path) -> None:
+    fits.BinTableHDU.from_columns([fits.Column('x', 'D', array=[1.0])]).writeto(path)
 
 
 HUGE = encoded('.png')[:16] + struct.pack('>II', 60000, 60000) + encoded('.png')[24:]
@@ -257,13 +277,15 @@ BAD: Mapping[str, tuple[Callable[[Path], object], str]] = {
     'renamed.jpg': (content(HEIC), 'no image that is read'),
     'cube.fits': (lambda path: fits.PrimaryHDU(np.zeros((8, 9, 10))).writeto(path), 'each image'),
     'pages.tif': (lambda path: cv2.imwritemulti(str(path), [PIXELS, PIXELS]), 'each image'),
+    'cut.fits': (content(encoded_fits()[:4000]), 'not readable as FITS|damaged'),
+    'table.fits': (write_table, 'no image'),
     'bag.mcap': (content(b'\x89MCAP0\r\n' + bytes(40)), 'an MCAP bag: calibrate it by itself'),
 }
 
 
 @pytest.mark.parametrize('name', BAD)
 def test_a_file_that_is_no_sound_photograph_is_refused_with_its_reason(
-    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    name, tmp_path, capfd
 ) -> None:
     make, reason = BAD[name]
     path = tmp_path / name
@@ -273,6 +295,9 @@ def test_a_file_that_is_no_sound_photograph_is_refused_with_its_reason(
     assert str(error.value).startswith(f'{path}: ') and '\n' not in str(error.value)
     # Nor do the libraries print a line for each file.
     assert ''.join(capfd.readouterr()) == ''
+    with pytest.raises(IngestError) as error:
+        imported(path)
+    assert str(error.value).startswith(f'{path}: ') and '\n' not in str(error.value)
 
 
 def test_files_left_out_are_counted_by_reason_with_a_few_names() -> None:
@@ -287,7 +312,7 @@ def test_files_left_out_are_counted_by_reason_with_a_few_names() -> None:
     assert lines[-1].startswith('left out: 93 files (') and len(lines) == 9
 
 
-def test_a_folder_is_read_by_content_and_nothing_in_it_is_skipped(tmp_path: Path) -> None:
+def test_a_folder_is_read_by_content_and_nothing_in_it_is_skipped(tmp_path) -> None:
     for name in ('a.jpg', 'b.HEIC', 'c.dat', 'd.txt'):
         (tmp_path / name).write_bytes(HEIC if name == 'b.HEIC' else encoded('.jpg'))
     (tmp_path / 'd.txt').write_text('clouds')
@@ -301,13 +326,9 @@ def test_a_folder_is_read_by_content_and_nothing_in_it_is_skipped(tmp_path: Path
 
 
 @pytest.mark.parametrize(('name', 'pack'), [('a.fits', bytes), ('a.fits.bz2', bz2.compress)])
-def test_fits_is_read_compressed_and_by_any_name(
-    tmp_path: Path, name: str, pack: Callable[[bytes], bytes]
-) -> None:
-    stream = io.BytesIO()
-    fits.PrimaryHDU(PIXELS[:, :, 0]).writeto(stream)
+def test_fits_is_read_compressed_and_by_any_name(tmp_path, name, pack) -> None:
     for path in (tmp_path / name, tmp_path / 'renamed'):
-        path.write_bytes(pack(stream.getvalue()))
+        path.write_bytes(pack(encoded_fits()))
         assert (pixels_of_photograph(path) == PIXELS[:, :, 0]).all()
 
 
@@ -323,7 +344,7 @@ STRANGE: Mapping[str, tuple[Mapping[int, object], Mapping[int, object]]] = {
 
 
 @pytest.mark.parametrize('case', STRANGE)
-def test_strange_facts_are_facts_that_are_not_known(case: str, tmp_path: Path) -> None:
+def test_strange_facts_are_facts_that_are_not_known(case, tmp_path) -> None:
     photograph = read(jpeg(tmp_path / 'a.jpg', CANON, *STRANGE[case]))
     assert 631152000 <= photograph.time_ns / 1e9 < 2**31
     assert np.isnan(photograph.focal_px)
@@ -331,7 +352,7 @@ def test_strange_facts_are_facts_that_are_not_known(case: str, tmp_path: Path) -
     assert photograph.camera.startswith('Canon EOS')
 
 
-def test_a_focal_length_that_no_camera_has_is_an_error_where_it_is_given(tmp_path: Path) -> None:
+def test_a_focal_length_that_no_camera_has_is_an_error_where_it_is_given(tmp_path) -> None:
     (tmp_path / 'a.jpg').write_bytes(encoded('.jpg'))
     with pytest.raises(
         IngestError, match='--focal-length-mm and --pixel-size-um give .* 2e-07 px'
@@ -339,7 +360,7 @@ def test_a_focal_length_that_no_camera_has_is_an_error_where_it_is_given(tmp_pat
         look_at(tmp_path / 'a.jpg', focal_length_mm=1e-9, pixel_um=5.0)
 
 
-def test_a_time_of_a_file_outside_of_the_calendar_is_a_time(tmp_path: Path) -> None:
+def test_a_time_of_a_file_outside_of_the_calendar_is_a_time(tmp_path) -> None:
     (tmp_path / 'a.jpg').write_bytes(encoded('.jpg'))
     for seconds in (-(10**9), 2**33):
         os.utime(tmp_path / 'a.jpg', (seconds, seconds))

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import dataclasses
 import functools
 import math
-from pathlib import Path
 
 import erfa
 import numpy as np
@@ -165,7 +164,7 @@ def unmoved(pixels: Floats) -> Floats:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('wrong_clock', [False, True])
-def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock: bool) -> None:
+def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock) -> None:
     errors = []
     for seed in range(4):
         images, text = with_air(seen_from(SITE, seed, wrong_clock), CAMERA)
@@ -203,19 +202,13 @@ def test_on_a_stated_ground_the_likeliest_zenith_is_taken_with_an_honest_sigma()
     assert np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
-def test_a_ground_that_the_stars_contradict_is_doubted() -> None:
-    images, text = with_air(seen_from(SiteOptions(), 2), CAMERA, is_ground=True)
-    assert text.startswith('observer: ground: the stars do not show its air')
-    assert honesty(GIVEN, estimate(images), unmoved)[0] < 2.0
-
-
 def test_air_that_is_recorded_is_not_applied_again() -> None:
     once, _ = with_air(seen_from(SITE, 3), CAMERA)
     assert with_air(once, CAMERA, is_ground=True) == (once, '')
 
 
 @pytest.mark.slow
-def test_a_camera_with_attitudes_on_the_ground_needs_no_site(tmp_path: Path) -> None:
+def test_a_camera_with_attitudes_on_the_ground_needs_no_site(tmp_path) -> None:
     """Recorded with a wrong clock; the prior camera is off by 2 % and 20 px."""
     prior = CameraGeometry(CAMERA.replace(fx=2040.0, fy=2040.0, cx=591.0), np.eye(4)[3])
     values = {'observer': 'ground', 'star_tracker_sigma_arcsec': [10.0, 10.0, 10.0]}
@@ -290,10 +283,7 @@ def test_derivatives_of_refraction_are_those_of_differences() -> None:
     e /= np.linalg.norm(e, axis=1, keepdims=True)
     image, axes = np.ones(50, np.int64), np.tile(np.eye(3), (2, 1, 1))
     turns = air.by_site(axes, np.empty((2, 50)), e.T, image)
-    for row, other in (
-        (0, zenith_of(0.7 + 1e-3, times)),
-        (2, zenith_of(0.7, times + 1e-3)),
-    ):
+    for row, other in ((0, zenith_of(0.7 + 1e-3, times)), (2, zenith_of(0.7, times + 1e-3))):
         before = refracted(e, zenith[1], 54.0)
         moved = (refracted(e, other[1], 54.0) - before) / 1e-3
         by_turn = -np.cross(turns[:, row].T, e)

@@ -68,9 +68,7 @@ def test_a_pointing_is_the_attitude_of_the_simulation() -> None:
     np.testing.assert_allclose(by_plan, camera_from_icrf(base, 0), atol=1e-12)  # rounding
 
 
-def test_the_images_then_give_the_sigma_that_was_expected(
-    setup: Setup, ensemble: Ensemble, planned: Plan
-) -> None:
+def test_the_images_then_give_the_sigma_that_was_expected(setup, ensemble, planned) -> None:
     taken = _taken(ensemble, planned)
     for step, image in zip(planned.steps, taken.images[-4:], strict=True):
         # Stars near the limit of the detection are found or not.
@@ -86,9 +84,7 @@ def test_the_images_then_give_the_sigma_that_was_expected(
 
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ['map', 'line_of_sight', 'fx'])
-def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
-    setup: Setup, ensemble: Ensemble, name: str
-) -> None:
+def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(setup, ensemble, name) -> None:
     """No draw decides: a sigma rises with no image, and equal images have equal effects."""
     here, there = Pointing(10.0, 40.0, 5.0), Pointing(200.0, -20.0, 70.0)
 
@@ -103,18 +99,14 @@ def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(
     assert pair == pytest.approx(back, rel=1e-9)
 
 
-def test_a_pointing_comes_back_only_where_no_other_helps_as_much(
-    setup: Setup, ensemble: Ensemble
-) -> None:
+def test_a_pointing_comes_back_only_where_no_other_helps_as_much(setup, ensemble) -> None:
     """Noise of the star tracker falls with any image; its slow error asks for other attitudes."""
     places = [step.pointing for step in plan_pointings(ensemble, setup, Request(6)).steps]
     assert len(set(places)) == 6
 
 
 @pytest.mark.slow
-def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(
-    setup: Setup, ensemble: Ensemble
-) -> None:
+def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(setup, ensemble) -> None:
     allowed = tuple(Pointing(10.0 * k, 20.0, 5.0) for k in range(12))
     avoid = (Cone(0.0, 20.0, 15.0),)
     request = Request(12, 'fx', allowed, avoid=avoid, largest_slew_deg=30.0)
@@ -127,7 +119,7 @@ def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(
 
 
 @pytest.mark.slow
-def test_pointings_within_a_cone(setup: Setup, ensemble: Ensemble) -> None:
+def test_pointings_within_a_cone(setup, ensemble) -> None:
     request = Request(2, 'map', within=Cone(200.0, 50.0, 25.0))
     axis = Pointing(200.0, 50.0).icrf_from_camera.apply([0.0, 0.0, 1.0])
     for step in plan_pointings(ensemble, setup, request).steps:
@@ -136,7 +128,7 @@ def test_pointings_within_a_cone(setup: Setup, ensemble: Ensemble) -> None:
 
 
 @pytest.mark.slow
-def test_a_plan_says_when_more_images_stop_helping(setup: Setup, ensemble: Ensemble) -> None:
+def test_a_plan_says_when_more_images_stop_helping(setup, ensemble) -> None:
     """Of one star-poor field only, whose images repeat what is known."""
     request = Request(40, 'k1', within=Cone(200.0, 50.0, 1.0))
     found = plan_pointings(ensemble, setup, request)
@@ -151,12 +143,12 @@ def test_a_plan_says_when_more_images_stop_helping(setup: Setup, ensemble: Ensem
         ({'within': Cone(0.0, 0.0, 200.0)}, 'the radius is not within'),
     ],
 )
-def test_a_request_without_a_meaning(changed: dict[str, object], text: str) -> None:
+def test_a_request_without_a_meaning(changed, text) -> None:
     with pytest.raises(OptionError, match=text):
-        Request(**{'images': 1, **changed})  # type: ignore[arg-type]
+        Request(**{'images': 1, **changed})
 
 
-def test_no_pointing_left_and_no_estimate(setup: Setup, ensemble: Ensemble) -> None:
+def test_no_pointing_left_and_no_estimate(setup, ensemble) -> None:
     nowhere = Request(1, 'map', avoid=(Cone(0.0, 0.0, 180.0),))
     with pytest.raises(OptionError, match='no pointing that is allowed shows a star'):
         plan_pointings(ensemble, setup, nowhere)
@@ -177,7 +169,7 @@ def first(ensemble: Ensemble) -> Estimate:
     return _estimate(dataclasses.replace(ensemble, images=ensemble.images[:8]))
 
 
-def test_the_turn_of_a_camera_without_rates_stays_in_the_sigma(ensemble: Ensemble) -> None:
+def test_the_turn_of_a_camera_without_rates_stays_in_the_sigma(ensemble) -> None:
     """All images share it: more of them do not take it away, as was promised before."""
     nowhere = np.full(3, np.nan)
     images = tuple(
@@ -191,9 +183,7 @@ def test_the_turn_of_a_camera_without_rates_stays_in_the_sigma(ensemble: Ensembl
     assert expected == pytest.approx(reported, rel=0.15)  # as above
 
 
-def test_the_best_candidate_is_the_one_whose_variance_is_least(
-    ensemble: Ensemble, first: Estimate
-) -> None:
+def test_the_best_candidate_is_the_one_whose_variance_is_least(ensemble, first) -> None:
     found = prospect(first, ensemble.images, _OPTIONS)
     wanted = target(first, MAP)
     every = np.ones(10, bool)
@@ -205,7 +195,7 @@ def test_the_best_candidate_is_the_one_whose_variance_is_least(
     assert found.best([], without, wanted.squares) == int(np.argsort(each)[1])
 
 
-def test_sigmas_have_the_names_and_units_of_requirements(first: Estimate) -> None:
+def test_sigmas_have_the_names_and_units_of_requirements(first) -> None:
     """The map has a smaller one than lines of sight, which have the alignment."""
     covariance = first.posterior.covariance
 
@@ -230,7 +220,7 @@ def test_sigmas_have_the_names_and_units_of_requirements(first: Estimate) -> Non
         target(first, 'k9')
 
 
-def test_expected_noise_is_that_of_stars_of_about_the_magnitude(first: Estimate) -> None:
+def test_expected_noise_is_that_of_stars_of_about_the_magnitude(first) -> None:
     table = first.table
     expected = expected_noise_px2(first, table.magnitude.astype(float))
     real = first.covariance_px2[:, [0, 2]].mean(axis=1)

@@ -17,7 +17,7 @@ CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, -0.05, 0
 
 
 @pytest.mark.parametrize(('width', 'height'), [(640, 512), (2592, 2048), (400, 1600), (2000, 200)])
-def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
+def test_arrows_have_a_scale_inside_the_canvas(width, height) -> None:
     camera = CameraModel(
         width, height, np.array([1800.0, 0, 1800, width / 2, height / 2, -0.05, 0, 0, 0, 0])
     )

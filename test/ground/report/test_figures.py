@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 import re
 
 import numpy as np
@@ -23,7 +22,7 @@ def test_means_in_bins_and_their_errors() -> None:
     assert error.tolist() == pytest.approx([0.1, 0.0])
 
 
-def test_the_three_axes_of_a_star_tracker_share_the_axis_of_time(tiny_products: Path) -> None:
+def test_the_three_axes_of_a_star_tracker_share_the_axis_of_time(tiny_products) -> None:
     given = read_residuals(tiny_products / RESIDUALS_FILE)
     spread = np.random.default_rng(1).normal(size=given.attitude_error_arcsec.shape)
     found = dataclasses.replace(given, attitude_error_arcsec=spread * (2.0, 9.0, 90.0))

@@ -19,7 +19,7 @@ from hypothesis import given
 from markupsafe import Markup
 import numpy as np
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from starcal_ground import products
 from starcal_ground.bags.reader import read_observations
@@ -41,21 +41,8 @@ from starcal_ros.ros.archive import Archive
 from starcal_ros.text import significant
 
 FIGURES = (
-    'cells',
-    'vectors',
-    'change',
-    'sky',
-    'before',
-    'images',
-    'histogram',
-    'lens_field',
-    'field',
-    'magnitude',
-    'colour',
-    'phase',
-    'budget',
-    'line_of_sight',
-    'shape',
+    *('cells', 'vectors', 'change', 'sky', 'before', 'images', 'histogram', 'lens_field'),
+    *('field', 'magnitude', 'colour', 'phase', 'budget', 'line_of_sight', 'shape'),
     'alignment',
 )
 
@@ -85,9 +72,7 @@ def page_of(calibration: Calibration, folder: Path, **changes: Any) -> str:
     return report.write_report(folder).read_text()
 
 
-def test_of_a_state_folder_the_last_calibration_and_its_images(
-    tiny_products: Path, tmp_path: Path
-) -> None:
+def test_of_a_state_folder_the_last_calibration_and_its_images(tiny_products, tmp_path) -> None:
     calibration = read_calibration(tiny_products / CALIBRATION_FILE)
     images = tuple(read_observations([tiny_products / 'observations.mcap'], '/observations'))
     later = dataclasses.replace(images[-1], time_ns=images[-1].time_ns + 10**9)
@@ -102,7 +87,7 @@ def test_of_a_state_folder_the_last_calibration_and_its_images(
     assert '<svg' in page and 'no residuals of single stars (residuals.npz)' in page
 
 
-def test_the_page_shows_what_the_calibration_holds(calibration: Calibration, page: str) -> None:
+def test_the_page_shows_what_the_calibration_holds(calibration, page) -> None:
     assert '✓ Accepted' in page and '″, at most 300″ required: met.' in page  # one sign
     fx, sigma = calibration.geometry.camera.parameters[0], calibration.sigma[0]
     assert f'<td>{fx:.3f}</td>' in page  # to a hundredth of the sigma of 0.05 px
@@ -127,7 +112,7 @@ def test_the_page_shows_what_the_calibration_holds(calibration: Calibration, pag
         assert f'<th scope="row">{one.name}</th><td>{significant(one.value, 2)}</td>' in page
 
 
-def test_the_page_needs_nothing_else(page: str) -> None:
+def test_the_page_needs_nothing_else(page) -> None:
     links = re.findall(r'(?:src|href)="((?!data:|#)[^"]*)"', page)
     products = ['calibration.json', 'camera_info.yaml', 'residuals.npz', 'observations.mcap']
     assert links == products  # beside the page; it shows itself without them
@@ -138,22 +123,20 @@ def test_the_page_needs_nothing_else(page: str) -> None:
     assert len(page) < 2_000_000
 
 
-def test_report_rebuilds_the_same_page(folder: Path, page: str) -> None:
+def test_report_rebuilds_the_same_page(folder, page) -> None:
     """`starcal calibrate` draws what it holds, `starcal report` what it reads."""
     assert main.main(['report', str(folder)]) == EXIT_ACCEPTED
     assert (folder / REPORT_FILE).read_text() == page
 
 
-def test_a_folder_with_a_calibration_alone_says_what_is_missing(
-    calibration: Calibration, tmp_path: Path
-) -> None:
+def test_a_folder_with_a_calibration_alone_says_what_is_missing(calibration, tmp_path) -> None:
     text = page_of(calibration, tmp_path)
     assert 'no residuals of single stars (residuals.npz)' in text
     assert 'without access to the images' in text
     assert 'id="figure-vectors"' in text and 'id="figure-images"' not in text
 
 
-def test_a_refused_calibration_says_why(calibration: Calibration, tmp_path: Path) -> None:
+def test_a_refused_calibration_says_why(calibration, tmp_path) -> None:
     reasons = ('residual 2 px & more is over the limit',)
     text = page_of(calibration, tmp_path, accepted=False, reasons=reasons)
     assert '✕ Refused' in text and '✓ Accepted' not in text
@@ -161,7 +144,7 @@ def test_a_refused_calibration_says_why(calibration: Calibration, tmp_path: Path
 
 
 def test_of_the_camera_alone_nothing_is_said_of_an_alignment(
-    folder: Path, calibration: Calibration, tmp_path: Path
+    folder, calibration, tmp_path
 ) -> None:
     times = 'of the file: 10 of 10 images state none'
     provenance = {**calibration.provenance, TIMES: times}
@@ -174,9 +157,7 @@ def test_of_the_camera_alone_nothing_is_said_of_an_alignment(
     assert text.count(times) == 2  # of the header and of the table to sign
 
 
-def test_the_gate_is_shown_as_the_calibration_holds_it(
-    calibration: Calibration, tmp_path: Path
-) -> None:
+def test_the_gate_is_shown_as_the_calibration_holds_it(calibration, tmp_path) -> None:
     assert len(calibration.gate) >= 15  # nine limits, and each unknown with a prior
     checks = {check.option: check for check in calibration.gate}
     failed = dataclasses.replace(checks['max_rejected_fraction'], found=8.125, passed=False)
@@ -199,17 +180,13 @@ def test_the_gate_is_shown_as_the_calibration_holds_it(
     ]
 
 
-def test_a_calibration_of_before_the_gate_told_says_so(
-    calibration: Calibration, tmp_path: Path
-) -> None:
+def test_a_calibration_of_before_the_gate_told_says_so(calibration, tmp_path) -> None:
     text = page_of(calibration, tmp_path, gate=())
     assert 'does not record the gate checks' in text
     assert 'The gate checks are not recorded' in text
 
 
-def test_names_are_text_and_never_markup(
-    folder: Path, calibration: Calibration, tmp_path: Path
-) -> None:
+def test_names_are_text_and_never_markup(folder, calibration, tmp_path) -> None:
     evil = '</script><script>alert(1)</script><img src=x onerror=alert(1)>'
     shutil.copy(folder / products.RESIDUALS_FILE, tmp_path)
     text = page_of(
@@ -224,9 +201,7 @@ def test_names_are_text_and_never_markup(
     assert '<th scope="col">prior</th>' not in text  # not known: no empty columns
 
 
-def test_numbers_that_are_none_do_no_harm(
-    folder: Path, calibration: Calibration, tmp_path: Path
-) -> None:
+def test_numbers_that_are_none_do_no_harm(folder, calibration, tmp_path) -> None:
     """A calibration with nothing finite in it, and residuals of which none was used."""
     left = products.read_residuals(folder / products.RESIDUALS_FILE)
     nothing = dataclasses.replace(
@@ -244,7 +219,7 @@ def test_numbers_that_are_none_do_no_harm(
 @pytest.mark.slow
 @drawn(5)
 @given(CHANGES)
-def test_a_report_of_an_odd_calibration(folder: Path, changes: list[tuple[int, object]]) -> None:
+def test_a_report_of_an_odd_calibration(folder, changes) -> None:
     content = json.loads((folder / CALIBRATION_FILE).read_text())
     changed = folder.with_name('changed')
     shutil.copytree(folder, changed, dirs_exist_ok=True)
@@ -253,9 +228,7 @@ def test_a_report_of_an_odd_calibration(folder: Path, changes: list[tuple[int, o
 
 
 @pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])
-def test_damaged_files_are_named_in_one_line(
-    folder: Path, tmp_path: Path, starcal: Starcal, damage: str
-) -> None:
+def test_damaged_files_are_named_in_one_line(folder, tmp_path, starcal, damage) -> None:
     broken = tmp_path / 'broken'
     shutil.copytree(folder, broken)
     (broken / damage).write_bytes(b'no such thing')
@@ -329,7 +302,7 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
 @pytest.mark.parametrize(('width', 'dark'), [(400, False), (1280, False), (1600, True)])
-def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -> None:
+def test_a_browser_shows_it(page, tmp_path, width, dark) -> None:
     measured, console = shown(page, tmp_path, width, dark)
     assert console == ''
     assert measured['wrong'] == []
@@ -346,7 +319,7 @@ def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -
     assert measured['contents'] == 'sticky' and measured['rows'] == (3 if width == 400 else 1)
 
 
-def test_a_remedy_is_a_sentence_and_only_a_parameter_is_code(tmp_path: Path) -> None:
+def test_a_remedy_is_a_sentence_and_only_a_parameter_is_code(tmp_path) -> None:
     mend = ('# no parameter mends this: record RAW images', 'search_radius_px: 40')
     record = NotCalibrated('no image matched', ('bag',), {'no_match': 3}, mend=mend)
     text = write_failure_page(record, tmp_path).read_text()
@@ -354,7 +327,7 @@ def test_a_remedy_is_a_sentence_and_only_a_parameter_is_code(tmp_path: Path) -> 
     assert '<li><code>search_radius_px: 40</code></li>' in text
 
 
-def test_colours_are_those_of_the_light_palette(tiny_products: Path, tmp_path: Path) -> None:
+def test_colours_are_those_of_the_light_palette(tiny_products, tmp_path) -> None:
     shutil.copytree(tiny_products, tmp_path / 'out')
     text = light(write_report(tmp_path / 'out').read_text())
     assert 'stroke="#0b62a8"' in text and '"var(--' not in text

@@ -22,14 +22,14 @@ def panel() -> Panel:
 
 
 @given(least=st.floats(1e-9, 1e9))
-def test_steps_are_one_two_or_five_times_a_power_of_ten(least: float) -> None:
+def test_steps_are_one_two_or_five_times_a_power_of_ten(least) -> None:
     step = round_step(least)
     assert least * (1 - 1e-9) <= step <= 2.5 * least * (1 + 1e-9)
     assert f'{step:.0e}'[0] in '125'
 
 
 @given(low=st.floats(-1e6, 1e6), width=st.floats(1e-3, 1e6), most=st.integers(3, 9))
-def test_ticks_are_inside_and_not_too_many(low: float, width: float, most: int) -> None:
+def test_ticks_are_inside_and_not_too_many(low, width, most) -> None:
     ticks = Scale(low, low + width, 0, 1).ticks(most)
     assert 1 <= len(ticks) <= most + 1
     slack = 1e-6 * (width + abs(low))
@@ -98,7 +98,7 @@ def places(drawn: svg.Drawing) -> np.ndarray:
     values=st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=9),
     log=st.sampled_from(['', 'y', 'xy']),
 )
-def test_the_axes_hold_all_values_below_the_legend(values: list[float], log: str) -> None:
+def test_the_axes_hold_all_values_below_the_legend(values, log) -> None:
     x = np.arange(1.0, len(values) + 1)
     drawn = plot([Curve(x, values, name='a', mark='circle')], 'x', 'y', log=log)
     # The last mark is that of the legend, whose text ends at 26.

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -87,7 +86,7 @@ def test_a_large_image_is_reduced_before_it_is_drawn() -> None:
     np.testing.assert_allclose(coloured.mean(axis=0), [94.5, 359.9], atol=2.0)
 
 
-def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path: Path) -> None:
+def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path) -> None:
     folder = tmp_path / 'thumbnails'
     write_thumbnails(album_of(40, refused_every=10).thumbnails(), folder)
     (folder / 'notes.txt').write_text('mine')
@@ -100,7 +99,7 @@ def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path: Path) -> No
     assert read_thumbnails(tmp_path / 'nowhere') == ()
 
 
-def test_only_pictures_of_the_folder_are_read(tmp_path: Path) -> None:
+def test_only_pictures_of_the_folder_are_read(tmp_path) -> None:
     """No link, FIFO, huge file or other content: it would be in the report."""
     secret, folder = tmp_path / 'secret', tmp_path / 'thumbnails'
     secret.write_bytes(b'\xff\xd8\xff secret')

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ def test_failed_checks_come_first_and_sigmas_have_one_name() -> None:
     assert rows[-1][1:] == ('passed', '0.0 sigma', 'at most 5 sigma', '')
 
 
-def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
+def test_the_precision_is_that_of_map_and_budget(tiny_products) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
     assert calibration.maps is not None
     sigma = np.full((10, 10), 0.2)
@@ -80,7 +79,7 @@ MEND = 'Do not use it for navigation. Mend the causes of the failed checks and c
     ],
 )
 def test_the_next_step_is_the_remedy_of_the_requirement_that_is_missed(
-    tiny_products: Path, failed: tuple[str, ...], note: str, step: str
+    tiny_products, failed, note, step
 ) -> None:
     """A sound calibration gets the statement that lowers a sigma most, or nothing."""
     calibration = read_calibration(tiny_products / 'calibration.json')
@@ -107,7 +106,7 @@ def test_the_next_step_is_the_remedy_of_the_requirement_that_is_missed(
     ],
 )
 def test_a_length_that_no_image_shows_has_no_digits(
-    tiny_products: Path, worst_px: float, variation_px: float, field: str, varies: str
+    tiny_products, worst_px, variation_px, field, varies
 ) -> None:
     calibration = read_calibration(tiny_products / 'calibration.json')
     assert calibration.model_checks is not None
@@ -142,15 +141,3 @@ def test_the_summary_is_a_line() -> None:
     assert verdict.thermal_summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'
     both = TemperatureTerms(20.0, (4e-5, 2e-6), (1e-6, 1e-7))
     assert '; a2 +0.00000200 (0.0000001) /degC^2;' in verdict.thermal_summary(both)
-
-
-def test_only_parts_that_matter_are_printed() -> None:
-    budget_of = [
-        SigmaPart('total', 1.0, 10.0, ''),
-        SigmaPart('stars', 0.2, 0.1, 'a'),
-        SigmaPart('velocity', 0.6, 0.1, 'b'),
-        SigmaPart('star tracker noise', 0.0, 9.9, 'c'),
-    ]
-    found = [part.cause for part in verdict.parts_that_matter(budget_of)]
-    assert found == ['total', 'star tracker noise', 'velocity']
-    assert verdict.parts_that_matter([]) == []

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import erfa
 import numpy as np
@@ -36,7 +35,7 @@ def test_a_disc_is_even() -> None:
 
 
 @pytest.mark.slow
-def test_the_table_of_a_scenario_gives_its_sky(tmp_path: Path) -> None:
+def test_the_table_of_a_scenario_gives_its_sky(tmp_path) -> None:
     narrow = scenario('narrow')
     assert narrow.sky is not None and narrow.table is not None
     (tmp_path / 'gaia.csv').write_text(narrow.table)

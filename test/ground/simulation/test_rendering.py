@@ -22,7 +22,7 @@ from starcal_ros.camera import project
 
 
 @pytest.mark.parametrize('sigma_px', [0.6, 0.95, 1.5])
-def test_a_star_has_its_flux_at_its_place(sigma_px: float) -> None:
+def test_a_star_has_its_flux_at_its_place(sigma_px) -> None:
     pixels = np.array([[20.0, 21.0], [41.3, 20.8], [19.5, 44.5], [45.02, 47.77]])
     flux = np.array([1e4, 2e4, 3e4, 4e4])
     image = star_electrons(pixels, flux, sigma_px, (64, 70))
@@ -67,7 +67,7 @@ def test_noise_has_the_mean_and_variance_of_its_sources() -> None:
 
 
 @pytest.mark.parametrize(('bits', 'dtype'), [(8, np.uint8), (12, np.uint16), (16, np.uint16)])
-def test_the_converter_saturates(bits: int, dtype: type) -> None:
+def test_the_converter_saturates(bits, dtype) -> None:
     detector = dataclasses.replace(QUIET, bits=bits)
     counts = expose(np.array([[1e7, 0.0]]), detector, np.random.default_rng(5))
     assert counts.dtype == dtype

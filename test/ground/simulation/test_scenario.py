@@ -1,9 +1,11 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Simulated scenarios and scenes against analytic truth."""
+"""Simulated scenarios, scenes and drifts against analytic truth, and as a trend finds them."""
 
 from __future__ import annotations
 
 import dataclasses
+from datetime import datetime, timezone
+import json
 import math
 
 import erfa
@@ -11,7 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.cli.main import main
+from starcal_ground.mission.trend.series import series_of
+from starcal_ground.mission.trend.trend_table import Table
 from starcal_ground.simulation.scenario import (
+    at_date,
     attitude_samples,
     camera_from_icrf,
     Inertial,
@@ -19,7 +25,7 @@ from starcal_ground.simulation.scenario import (
     SCENARIOS,
     scene,
 )
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SECONDS_PER_YEAR
 
 
 def test_the_seed_draws_the_truth_but_not_the_prior() -> None:
@@ -115,3 +121,52 @@ def test_samples_may_have_errors_of_their_own() -> None:
     assert np.abs(np.corrcoef(sigma[:-1].ravel(), sigma[1:].ravel())[0, 1]) < 0.1
     expected = 20.0 / math.sqrt(2.0)
     assert np.std(at_image) / ARCSECOND_RAD == pytest.approx(expected, rel=0.35)  # of 72
+
+
+YEAR_NS = round(SECONDS_PER_YEAR) * NANOSECONDS_PER_SECOND
+CAMPAIGNS = 6  # the fewest that a trend tests
+FOCAL_PPM, TURN_ARCSEC = 200.0, 30.0  # a year
+
+
+def test_a_drift_is_linear_from_the_date_of_the_scenario() -> None:
+    made = scenario('tiny')
+    assert at_date(made, made.start_ns, FOCAL_PPM, TURN_ARCSEC).time_ns(3) == made.time_ns(3)
+    for years in (-1, 0, 3):
+        later = at_date(made, made.start_ns + years * YEAR_NS, FOCAL_PPM, TURN_ARCSEC)
+        before, after = made.truth, later.truth
+        grown = after.camera.parameters[[0, 2]] / before.camera.parameters[[0, 2]] - 1.0
+        # Roundings of a focal length of 1800 px, which is about 1.
+        np.testing.assert_allclose(grown, 1e-6 * FOCAL_PPM * years, rtol=0, atol=1e-15)
+        turn = before.star_tracker_from_camera.inv() * after.star_tracker_from_camera
+        expected = [TURN_ARCSEC * ARCSECOND_RAD * years, 0.0, 0.0]
+        np.testing.assert_allclose(turn.as_rotvec(), expected, rtol=0, atol=1e-15)  # rounding
+        assert later.prior is made.prior
+
+
+@pytest.mark.slow
+def test_a_trend_finds_the_drift_of_simulated_bags(tmp_path, capsys) -> None:
+    for k in range(CAMPAIGNS):
+        bag, out = tmp_path / 'bags' / str(k), tmp_path / 'mission' / str(k)
+        camera = ['--scenario', 'tiny', '--images', '4', '--seed', str(k), '--camera-seed', '1']
+        drifts = ['--focal-drift', str(FOCAL_PPM), '--alignment-drift', str(TURN_ARCSEC)]
+        date = ['--date', f'{2026 + k}-05-15T07:20:00']
+        assert main(['simulate', '-o', str(bag), *camera, *drifts, *date]) == 0
+        truth = json.loads((bag / 'truth.json').read_text())
+        assert (truth['seed'], truth['images']) == (k, 4)
+        start = datetime.fromtimestamp(truth['t0'], timezone.utc)
+        assert f'{start:%Y-%m-%dT%H:%M}' == f'{2026 + k}-05-15T07:20'
+        params = ['--params', str(bag / 'params.yaml'), '--no-report', '--quiet']
+        assert main(['calibrate', str(bag), '-o', str(out), *params]) in (0, 3)
+    capsys.readouterr()
+    assert main(['trend', str(tmp_path / 'mission'), '-o', str(tmp_path / 'trend')]) == 0
+    said = ' '.join(capsys.readouterr().out.split())
+    assert 'drifting' in said and 'Found: drifts of fx, fy, boresight about x.' in said
+    (rows,) = Table(tmp_path / 'trend').cameras()
+    found = {one.name: term for one in series_of(rows) for term in one.trend.terms}
+    focal_px = scenario('tiny').truth.camera.parameters[0]
+    for name, per_year in (
+        ('fx', 1e-6 * FOCAL_PPM * focal_px),
+        ('boresight about x', TURN_ARCSEC),
+    ):
+        off = (abs(found[name].size) - per_year) / found[name].sigma
+        assert abs(off) < 4.0  # one in 16,000 good ones is beyond

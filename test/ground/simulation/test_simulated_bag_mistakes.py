@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
-from starcal_tool import Starcal  # type: ignore[import-not-found]
 from tiny_campaign import image  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.simulated_bag import Mistakes, NO_MISTAKES
@@ -33,10 +31,10 @@ pytestmark = pytest.mark.slow
         (['--gamma', '2.2'], 'not_linear'),
     ],
 )
-def test_each_is_named(options: list[str], cause: str, tmp_path: Path, starcal: Starcal) -> None:
+def test_each_is_named(options, cause, tmp_path, starcal) -> None:
     bag = tmp_path / 'bag'
     made = starcal('simulate', '-o', bag, '--scenario', 'tiny', '--images', 4, *options)
-    assert made.status == 0
+    assert made.status == 0 and 'truth.json' in made.out and 'params.yaml' in made.out
     assert json.loads((bag / 'truth.json').read_text())['images'] == 4
     status, out, _ = starcal('diagnose', bag, '--params', bag / 'params.yaml', '--json')
     found = json.loads(out)

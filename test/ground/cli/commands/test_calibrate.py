@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 import re
 import shutil
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from sample_records import calibration, without_field  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.reader import read_observations
@@ -31,9 +30,7 @@ from starcal_ros.records import FOUND, refused_image, SigmaPart
 
 
 @pytest.mark.slow
-def test_a_failure_replaces_an_older_calibration(
-    tiny_products: Path, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_a_failure_replaces_an_older_calibration(tiny_products, tmp_path, starcal) -> None:
     out = tmp_path / 'out'
     shutil.copytree(tiny_products, out)
     assert 'Accepted' in (out / 'report.html').read_text()
@@ -59,9 +56,7 @@ def test_a_failure_replaces_an_older_calibration(
 
 
 @pytest.mark.slow
-def test_the_reason_of_each_refusal_is_said(
-    tiny_products: Path, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_the_reason_of_each_refusal_is_said(tiny_products, tmp_path, starcal) -> None:
     images = list(read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC))
     one, two, *others = images
     refused = [
@@ -84,14 +79,12 @@ def broken(*_: object) -> None:
 @pytest.mark.parametrize(
     ('place', 'missing'),
     [
-        ('starcal_ground.report.page._context', 'report'),
         ('starcal_ground.report.page.page_template', 'report'),
         ('starcal_ground.report.thumbnails.annotate_reduced', 'pictures of images'),
-        ('starcal_ground.report.thumbnails._reduced', 'pictures of images'),
     ],
 )
 def test_a_drawing_that_fails_costs_the_drawing_only(
-    few_images: Path, tmp_path: Path, starcal: Starcal, monkeypatch, place: str, missing: str
+    few_images, tmp_path, starcal, monkeypatch, place, missing
 ) -> None:
     out = tmp_path / 'out'
     out.mkdir()
@@ -107,9 +100,7 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
 
 
 @pytest.mark.slow
-def test_a_failure_page_that_fails_hides_no_failure(
-    tmp_path: Path, starcal: Starcal, monkeypatch
-) -> None:
+def test_a_failure_page_that_fails_hides_no_failure(tmp_path, starcal, monkeypatch) -> None:
     monkeypatch.setattr('starcal_ground.report.page.write_failure_page', broken)
     monkeypatch.setattr('starcal_ground.report.thumbnails._expected_picture', broken)
     params = params_with(tmp_path, attitude_direction='inertial_to_st')
@@ -123,7 +114,7 @@ def test_a_failure_page_that_fails_hides_no_failure(
 
 
 @pytest.mark.slow
-def test_alignment_and_tracker_sigma_are_found_and_said(tmp_path: Path, starcal: Starcal) -> None:
+def test_alignment_and_tracker_sigma_are_found_and_said(tmp_path, starcal) -> None:
     params = params_with(tmp_path, prior_alignment=None, star_tracker_sigma_arcsec=None)
     out = tmp_path / 'out'
     said = starcal('calibrate', TINY, '--params', params, '-o', out)
@@ -142,9 +133,7 @@ def test_alignment_and_tracker_sigma_are_found_and_said(tmp_path: Path, starcal:
 
 
 @pytest.mark.parametrize('rate', [0.0, np.nan])
-def test_rates_that_no_image_has_are_said(
-    rate: float, tmp_path: Path, tiny_products: Path, starcal: Starcal
-) -> None:
+def test_rates_that_no_image_has_are_said(rate, tmp_path, tiny_products, starcal) -> None:
     recorded = read_observations([tiny_products / OBSERVATIONS_FILE], OBSERVATIONS_TOPIC)
     rates = np.full(3, rate)
     images = [dataclasses.replace(image, star_tracker_rate_rad_s=rates) for image in recorded]
@@ -157,16 +146,16 @@ def test_rates_that_no_image_has_are_said(
 
 
 @pytest.mark.slow
-def test_a_part_of_a_bag(tmp_path: Path, starcal: Starcal) -> None:
+def test_a_part_of_a_bag(tmp_path, starcal) -> None:
     command = ['calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
     # Six may be too few for the gate.
     assert 'images      6 used' in starcal(*command, '--to', '+20').out
 
 
-def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_causes_that_matter_follow_the_result(capsys) -> None:
     budget = (
         *calibration().sigma_budget,
-        SigmaPart('stamps', 0.01, 0.02, '5 ms assumed'),
+        SigmaPart('stamps', 0.14, 0.02, '5 ms assumed'),  # a fifth of all
         SigmaPart('star tracker noise', 0.0, 12.0, 'estimated: 20, 20, 20″ about x, y, z'),
     )
     record = dataclasses.replace(calibration(), sigma_budget=budget)
@@ -178,19 +167,11 @@ def test_the_causes_that_matter_follow_the_result(capsys: pytest.CaptureFixture[
     ]  # fmt: skip
     assert lines[first + 3].split() == ['velocity', '0.6″', '0.75″']
     assert 'stamps' not in '\n'.join(lines) and max(map(len, lines)) <= 80
-
-
-def test_a_calibration_without_a_budget_has_no_table_of_it(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    record = dataclasses.replace(calibration(), sigma_budget=())
-    print_calibration(record, record.geometry)
+    print_calibration(dataclasses.replace(record, sigma_budget=()), record.geometry)
     assert '1-sigma of lines' not in capsys.readouterr().out
 
 
-def test_an_alignment_that_the_images_gave_is_not_compared_with_itself(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_alignment_that_the_images_gave_is_not_compared_with_itself(capsys) -> None:
     record = calibration()
     moved = record.geometry.star_tracker_from_camera * Rotation.from_rotvec([1e-4, 0.0, 0.0])
     prior = dataclasses.replace(record.geometry, star_tracker_from_camera_xyzw=moved.as_quat())
@@ -202,9 +183,7 @@ def test_an_alignment_that_the_images_gave_is_not_compared_with_itself(
     assert len(rows[0]) == 6 and rows[1] == rows[0][:4]
 
 
-def test_a_lens_that_the_prior_did_not_have_has_no_changes(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_lens_that_the_prior_did_not_have_has_no_changes(capsys) -> None:
     """With ``lens_model: auto``."""
     prior = calibration().geometry
     camera, _ = convert(prior.camera, 'rational_polynomial')

@@ -9,7 +9,6 @@ from pathlib import Path
 from export_calibrations import calibration  # type: ignore[import-not-found]
 import pytest
 import spiceypy
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ros.formats.products.product_files import write_calibration
 
@@ -21,7 +20,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / 'out'
 
 
-def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, starcal: Starcal) -> None:
+def test_export_writes_kernels_that_load(folder, tmp_path, starcal) -> None:
     kernels = tmp_path / 'deep/kernels'
     line = (
         f'export {folder} --to spice -o {kernels} --spacecraft-id -999 --star-tracker-id -999100'
@@ -35,34 +34,16 @@ def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, starcal: 
     spiceypy.kclear()
 
 
-def test_export_states_the_cost_of_each_part(folder, tmp_path: Path, starcal: Starcal) -> None:
+def test_export_states_the_cost_of_each_part(folder, tmp_path, starcal) -> None:
     lines = starcal('export', folder, '--to', 'opencv', '-o', tmp_path).out.splitlines()
     assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')
 
 
-@pytest.mark.parametrize(
-    ('line', 'words'),
-    [
-        ('--to spice', '--spacecraft-id'),
-        ('--to matlab', "'matlab' is not one of spice, ck, wcs, isd, c, giant"),
-        ('--to opencvv', 'did you mean opencv'),
-        ('--to spice --spacecraft-id 5', 'not a negative NAIF ID'),
-    ],
-)
-def test_export_refuses_in_one_line(folder, tmp_path, starcal, line: str, words: str) -> None:
-    assert_refused(starcal('export', folder, '-o', tmp_path, *line.split()), words)
-
-
 @pytest.mark.parametrize('accepted', [True, False])
-def test_export_warns_of_a_refused_calibration(folder, tmp_path, starcal, accepted: bool) -> None:
+def test_export_warns_of_a_refused_calibration(folder, tmp_path, starcal, accepted) -> None:
     reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
     judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
     write_calibration(judged, folder / 'calibration.json')
     answer = starcal('export', folder, '--to', 'opencv', '-o', tmp_path)
     expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
     assert (answer.status, answer.err.splitlines()) == (0, expected)
-
-
-def test_export_needs_a_calibration(tmp_path: Path, starcal: Starcal) -> None:
-    answer = starcal('export', tmp_path, '--to', 'opencv', '-o', tmp_path)
-    assert_refused(answer, 'holds no calibration.json')

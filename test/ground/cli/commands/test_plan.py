@@ -8,11 +8,9 @@ import json
 from pathlib import Path
 
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 TINY = Path(__file__).parents[4] / 'bags' / 'tiny'
 _PARAMS = ['--params', str(TINY / 'params.yaml')]
-_BAG = [str(TINY), *_PARAMS]
 
 
 @pytest.fixture
@@ -23,9 +21,7 @@ def allowed(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_table_and_the_file_say_the_same(
-    allowed: Path, tiny_products: Path, tmp_path: Path, starcal: Starcal
-) -> None:
+def test_the_table_and_the_file_say_the_same(allowed, tiny_products, tmp_path, starcal) -> None:
     output = tmp_path / 'plan.csv'
     observed = [str(tiny_products / 'observations.mcap'), *_PARAMS]
     given = ['--pointings', str(allowed), '--images', '5', '--minimise', 'map']
@@ -38,19 +34,3 @@ def test_the_table_and_the_file_say_the_same(
     assert 'no other pointing can be reached after image 3' in shown
     content = json.loads(starcal('plan', *observed, *given[:2], '--images', 1, '--json').out)
     assert content['name'] == 'line_of_sight_arcsec' and len(content['steps']) == 1
-
-
-@pytest.mark.parametrize(
-    ('text', 'why'),
-    [
-        ('ra,dec\n1,2\n', 'no column ra_deg and dec_deg'),
-        ('ra_deg,dec_deg\n1,north\n', "line 2: could not convert string to float: 'north'"),
-        ('ra_deg,dec_deg\n', 'no pointings'),
-        ('ra_deg,dec_deg\n1,95\n', 'not a direction'),
-    ],
-)
-def test_a_file_of_pointings_with_a_mistake(
-    text: str, why: str, allowed: Path, starcal: Starcal
-) -> None:
-    allowed.write_text(text)
-    assert_refused(starcal('plan', *_BAG, '--pointings', allowed), why)

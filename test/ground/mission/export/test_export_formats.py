@@ -139,7 +139,7 @@ def parts(done: Content) -> list[str]:
     [(kind, model) for kind, row in READERS.items() for model in (*row[1], *row[2])],
 )
 def test_a_reader_sees_stars_as_far_off_as_the_export_states(
-    tmp_path: Path, kind: str, model: str, skew: float, with_field: bool
+    tmp_path, kind, model, skew, with_field
 ) -> None:
     seen_by, exact, _, has_skew = READERS[kind]
     made = calibration(model, skew, with_field)
@@ -154,7 +154,7 @@ def test_a_reader_sees_stars_as_far_off_as_the_export_states(
     assert any('field' in part for part in parts(done)) == with_field
 
 
-def test_other_facts_of_a_camera_are_in_the_files_of_their_readers(tmp_path: Path) -> None:
+def test_other_facts_of_a_camera_are_in_the_files_of_their_readers(tmp_path) -> None:
     """Size, alignment, stated error and change of the focal length, where a format has them."""
     made = calibration(temperature=True)
     quaternion = made.geometry.star_tracker_from_camera_xyzw
@@ -187,7 +187,7 @@ def test_other_facts_of_a_camera_are_in_the_files_of_their_readers(tmp_path: Pat
     assert content['extrinsics'][3:] == [0.0, 0.0, 0.0]
 
 
-def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path: Path) -> None:
+def test_a_change_with_temperature_costs_pixels_per_degree(tmp_path) -> None:
     done = export(calibration(skew=0.0, temperature=True), 'opencv', tmp_path, Request())
     cost = {loss.part: loss.cost_px for loss in done.losses}
     # 4e-5 per degree at the corner farthest from the principal point (651.25, 505.75).
@@ -208,7 +208,7 @@ PARSERS: dict[str, Callable[[str], object]] = {
 
 
 @pytest.mark.parametrize('kind', [row.name for row in FORMATS if not row.needs_observations])
-def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> None:
+def test_hostile_names_leave_every_format_valid(tmp_path, kind) -> None:
     made = dataclasses.replace(
         calibration('plumb_bob'),
         parent_frame=f'tracker {HOSTILE}',
@@ -231,9 +231,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path: Path, kind: str) -> No
         subprocess.run(command, cwd=tmp_path, check=True)
 
 
-def test_a_format_is_added_by_a_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_format_is_added_by_a_row(tmp_path, monkeypatch, capsys) -> None:
     """As CONTRIBUTING.md says, from outside of the package."""
 
     def focal_lengths(made: Calibration, _: Request) -> Content:
@@ -255,7 +253,7 @@ def test_a_format_is_added_by_a_row(
 
 
 @pytest.mark.parametrize('kind', ['ros', 'spice'])
-def test_a_camera_without_alignment_is_not_exported_with_one(kind: str, tmp_path: Path) -> None:
+def test_a_camera_without_alignment_is_not_exported_with_one(kind, tmp_path) -> None:
     alone = dataclasses.replace(calibration('plumb_bob'), parent_frame='')
     with pytest.raises(OptionError, match=f'--to {kind}: the calibration is of the camera alone'):
         export(alone, kind, tmp_path, Request())
@@ -269,9 +267,7 @@ ROTATIONS = {
 
 
 @pytest.mark.parametrize('kind', ROTATIONS)
-def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(
-    kind: str, tmp_path: Path
-) -> None:
+def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(kind, tmp_path) -> None:
     for rotation, frame in (([-0.1, 0.0, 0.0], 'star_tracker'), ([0.0, 0.0, 0.0], '')):
         made = calibration('plumb_bob')
         turned = dataclasses.replace(
@@ -289,7 +285,7 @@ CENTER = ('BORESIGHT_SAMPLE', 'BORESIGHT_LINE')
 @pytest.mark.parametrize('with_field', [False, True])
 @pytest.mark.parametrize('model', ['plumb_bob', 'thin_prism', 'equidistant'])
 def test_isis_keywords_have_the_error_they_state(
-    tmp_path: Path, model: str, with_field: bool, pixel_size_um: float
+    tmp_path, model, with_field, pixel_size_um
 ) -> None:
     made = calibration(model, with_field=with_field)
     names = SpiceNames(-999, pixel_size_um=pixel_size_um)
@@ -320,9 +316,7 @@ def test_isis_keywords_have_the_error_they_state(
 
 @pytest.mark.parametrize('form', ['opencv', 'ros'])
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
-def test_an_exported_camera_is_read_as_a_prior_camera(
-    tmp_path: Path, form: str, model: str
-) -> None:
+def test_an_exported_camera_is_read_as_a_prior_camera(tmp_path, form, model) -> None:
     made = export(calibration(model, 0.0, False), form, tmp_path, Request())
     camera = read_camera_info(tmp_path / next(iter(made.files)))
     pixels, directions = grid_of(calibration(model, 0.0, False))

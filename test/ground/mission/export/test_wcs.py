@@ -40,9 +40,7 @@ def images(tiny_products: Path) -> tuple[StarObservations, ...]:
 
 
 @pytest.mark.filterwarnings('ignore::astropy.wcs.FITSFixedWarning')
-def test_astropy_reprojects_the_stars_within_the_stated_residual(
-    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
+def test_astropy_reprojects_the_stars_within_the_stated_residual(made, images, tmp_path) -> None:
     done = export(made, 'wcs', tmp_path, Request(observations=images))
     assert done.worst_px < 5e-3
     catalog = load_catalog()
@@ -77,9 +75,7 @@ def test_astropy_reprojects_the_stars_within_the_stated_residual(
         assert u @ u[0] == pytest.approx(of_camera @ of_camera[0], abs=2e-4)
 
 
-def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
-    made: Calibration, images: tuple[StarObservations, ...]
-) -> None:
+def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(made, images) -> None:
     errors = []
     for index, image in enumerate(images):
         truth = scene(scenario('tiny'), index)
@@ -95,9 +91,7 @@ def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
         directions_icrf(made, images[0].select(np.arange(len(images[0])) < 2), [[0.0, 0.0]])
 
 
-def test_an_image_of_unknown_temperature_has_the_camera_of_the_calibration(
-    made: Calibration, images: tuple[StarObservations, ...]
-) -> None:
+def test_an_image_of_unknown_temperature_has_the_camera_of_the_calibration(made, images) -> None:
     thermal = TemperatureTerms(
         reference_degc=20.0, focal_per_degc=(1e-5,), focal_per_degc_sigma=(1e-6,)
     )
@@ -107,9 +101,7 @@ def test_an_image_of_unknown_temperature_has_the_camera_of_the_calibration(
     assert towards.tolist() == directions_icrf(made, unknown, [[320.0, 256.0]])[0].tolist()
 
 
-def test_a_field_beyond_a_gnomonic_projection_is_named(
-    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
+def test_a_field_beyond_a_gnomonic_projection_is_named(made, images, tmp_path) -> None:
     wide = straight_camera(made.geometry.camera).replace(
         fx=25.0, fy=25.0
     )  # 87 degrees in a corner
@@ -120,9 +112,7 @@ def test_a_field_beyond_a_gnomonic_projection_is_named(
         export(dataclasses.replace(made, geometry=geometry), 'wcs', tmp_path, asked)
 
 
-def test_stars_of_another_catalog_are_named(
-    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
+def test_stars_of_another_catalog_are_named(made, images, tmp_path) -> None:
     strange = dataclasses.replace(images[0], catalog_id=-images[0].catalog_id - 10**7)
     with pytest.raises(ProductError, match=r'lacks \d+ of \d+ stars .* --catalog'):
         export(made, 'wcs', tmp_path, Request(observations=[strange]))
@@ -133,9 +123,7 @@ def test_stars_of_another_catalog_are_named(
         export(made, 'wcs', tmp_path, asked)
 
 
-def test_images_without_a_time_have_no_date(
-    made: Calibration, images: tuple[StarObservations, ...], tmp_path: Path
-) -> None:
+def test_images_without_a_time_have_no_date(made, images, tmp_path) -> None:
     undated = dataclasses.replace(made, provenance={**made.provenance, TIMES: 'of the file'})
     dates = []
     for one, folder in ((made, tmp_path / 'a'), (undated, tmp_path / 'b')):

@@ -136,20 +136,20 @@ def written(folder: Path, name: str, text: str) -> Path:
 
 
 @pytest.mark.parametrize('text', ATTITUDES.values(), ids=ATTITUDES)
-def test_an_aem_that_is_valid_is_read(tmp_path: Path, text: str) -> None:
+def test_an_aem_that_is_valid_is_read(tmp_path, text) -> None:
     found = sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
     assert found.time_ns.tolist() == [from_text(time, 'UTC') for time in T]
     np.testing.assert_allclose(found.icrf_from_star_tracker_xyzw, [XYZW, XYZW], atol=1e-15)
 
 
 @pytest.mark.parametrize(('text', 'why'), REFUSED_ATTITUDES.values(), ids=REFUSED_ATTITUDES)
-def test_an_aem_that_is_ambiguous_is_refused(tmp_path: Path, text: str, why: str) -> None:
+def test_an_aem_that_is_ambiguous_is_refused(tmp_path, text, why) -> None:
     with pytest.raises(IngestError, match=why) as error:
         sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
     assert 'a.aem' in str(error.value) and '\n' not in str(error.value)
 
 
-def test_an_aem_cut_at_any_byte_is_refused_or_whole(tmp_path: Path) -> None:
+def test_an_aem_cut_at_any_byte_is_refused_or_whole(tmp_path) -> None:
     text = aem('1.0', {})
     for count in range(len('CCSDS_AEM_VERS ='), len(text) - 1):
         with pytest.raises(IngestError) as error:
@@ -157,7 +157,7 @@ def test_an_aem_cut_at_any_byte_is_refused_or_whole(tmp_path: Path) -> None:
         assert '\n' not in str(error.value)
 
 
-def test_attitudes_outside_the_useable_span_are_left_out(tmp_path: Path) -> None:
+def test_attitudes_outside_the_useable_span_are_left_out(tmp_path) -> None:
     text = aem('2.0', {'USEABLE_STOP_TIME': '2026-05-15T07:20:05'})
     found = sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
     assert found.time_ns.tolist() == [from_text(T[0], 'UTC')]
@@ -216,14 +216,14 @@ REFUSED_VELOCITIES = {
 
 
 @pytest.mark.parametrize('text', VELOCITIES.values(), ids=VELOCITIES)
-def test_an_oem_that_is_valid_is_read(tmp_path: Path, text: str) -> None:
+def test_an_oem_that_is_valid_is_read(tmp_path, text) -> None:
     found = sources.velocities([written(tmp_path, 'a.oem', text)], '', AT_NS)
     # Positions of 1.5e8 km have a resolution of 3e-8 km, over 10 s 3e-6 m/s.
     np.testing.assert_allclose(found.velocity_m_s, [np.multiply(VELOCITY_KM_S, 1e3)], atol=2e-5)
 
 
 @pytest.mark.parametrize(('text', 'why'), REFUSED_VELOCITIES.values(), ids=REFUSED_VELOCITIES)
-def test_an_oem_that_is_invalid_is_refused(tmp_path: Path, text: str, why: str) -> None:
+def test_an_oem_that_is_invalid_is_refused(tmp_path, text, why) -> None:
     with pytest.raises(IngestError, match=why) as error:
         sources.velocities([written(tmp_path, 'a.oem', text)], '', AT_NS)
     assert 'a.oem' in str(error.value) and '\n' not in str(error.value)

@@ -15,7 +15,7 @@ from astropy.table import MaskedColumn, Table
 import erfa
 import numpy as np
 import pytest
-from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 from starcal_ground.mission.ingest.deep_catalog import (
     deep_catalog,
@@ -141,7 +141,7 @@ def write_index(given: Table, path: Path) -> None:
 
 @pytest.mark.parametrize(('title', 'names', 'epoch', 'motion_source'), SOURCES)
 def test_a_table_of_each_source_is_added_to_the_bundled_catalog(
-    tmp_path: Path, title: str, names: dict[str, str], epoch: float, motion_source: MotionSource
+    tmp_path, title, names, epoch, motion_source
 ) -> None:
     path, true = tmp_path / 'table.fits', truth()
     (write_index if 'net' in title else write)(table(names, epoch), path)
@@ -170,7 +170,7 @@ def test_a_table_of_each_source_is_added_to_the_bundled_catalog(
 
 
 @pytest.mark.parametrize('ending', ['vot', 'csv', 'fits'])
-def test_a_table_of_each_kind_is_read(tmp_path: Path, ending: str) -> None:
+def test_a_table_of_each_kind_is_read(tmp_path, ending) -> None:
     given, path = table(), tmp_path / f'gaia.{ending}'
     given['pmra'].mask = np.arange(len(given)) == len(given) - 1
     write(given, path)
@@ -191,7 +191,7 @@ def test_a_table_of_each_kind_is_read(tmp_path: Path, ending: str) -> None:
     ],
 )
 def test_places_of_another_epoch_or_frame_are_refused(
-    tmp_path: Path, epoch: float, stated: float, turn_arcsec: float, words: str
+    tmp_path, epoch, stated, turn_arcsec, words
 ) -> None:
     given = table(ARCHIVE, epoch, stated)
     given['ra'] += turn_arcsec / 3600.0
@@ -209,7 +209,7 @@ def test_places_of_another_epoch_or_frame_are_refused(
     ],
     ids=['B1950', 'galactic', 'ecliptic'],
 )
-def test_places_of_other_coordinates_are_refused(tmp_path: Path, from_icrs: Any) -> None:
+def test_places_of_other_coordinates_are_refused(tmp_path, from_icrs) -> None:
     given = table(SOURCES[5][1], 2000.0)  # without numbers of Gaia
     place = from_icrs(*np.radians([given['RAmdeg'], given['DEmdeg']]))
     given['RAmdeg'], given['DEmdeg'] = np.degrees(place)
@@ -228,7 +228,7 @@ def test_the_document_names_the_columns_of_each_source() -> None:
         assert ours <= {name.strip('`') for name in rows[title].split(', ')}, title
 
 
-def test_a_field_without_bright_stars_is_taken_unchecked(tmp_path: Path) -> None:
+def test_a_field_without_bright_stars_is_taken_unchecked(tmp_path) -> None:
     given = table()[-FAINT:]
     for name, middle in (('ra', 200.0), ('dec', 30.0)):  # half a degree from all stars to V = 9
         given[name] = middle + 0.02 * (given[name] - middle)
@@ -255,9 +255,7 @@ OUTSIDE = [
 ]
 
 
-def test_rows_outside_the_range_of_a_column_are_counted_and_left_out(
-    tmp_path: Path, starcal: Starcal
-) -> None:
+def test_rows_outside_the_range_of_a_column_are_counted_and_left_out(tmp_path, starcal) -> None:
     given = table()
     expected: Counter[str] = Counter()
     for row, (name, value, words) in enumerate(OUTSIDE, start=-FAINT + 1):  # faint stars
@@ -298,9 +296,7 @@ def test_ranges_of_columns_fit_the_file() -> None:
         ({'source_id': 0}, 'no star in'),
     ],
 )
-def test_a_table_without_the_bright_stars_of_its_field_is_refused(
-    tmp_path: Path, change: dict[str, float], words: str
-) -> None:
+def test_a_table_without_the_bright_stars_of_its_field_is_refused(tmp_path, change, words) -> None:
     given = table()
     given['source_id'] = 10**18 + np.arange(len(given))  # no number of the bundled catalog
     for name, factor in change.items():
@@ -310,7 +306,7 @@ def test_a_table_without_the_bright_stars_of_its_field_is_refused(
         deep_catalog(tmp_path / 'a.fits')
 
 
-def test_bright_stars_are_known_by_their_places(tmp_path: Path) -> None:
+def test_bright_stars_are_known_by_their_places(tmp_path) -> None:
     given = table()
     given['source_id'] = 10**18 + np.arange(len(given))
     given.write(tmp_path / 'a.fits')
@@ -334,9 +330,7 @@ HEADER = 'source_id,ra,dec,phot_g_mean_mag\n'
         ('wide.csv', ','.join(map(str, range(200_000))), 'more than 1000 columns'),
     ],
 )
-def test_bad_tables_are_one_line(
-    tmp_path: Path, starcal: Starcal, name: str, content: str, words: str
-) -> None:
+def test_bad_tables_are_one_line(tmp_path, starcal, name, content, words) -> None:
     (tmp_path / name).write_text(content)
     assert_refused(starcal('catalog', tmp_path / name, '-o', tmp_path / 'deep'), words)
     assert not (tmp_path / 'deep.npz').exists()

@@ -49,6 +49,11 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def aem(tmp_path: Path) -> Path:
+    return Path(write_aem(tmp_path / 'a.aem'))
+
+
 def digests_of_originals(made: starcal_ground.Calibration) -> dict[str, str]:
     start = 'original '
     known = made.provenance.items()
@@ -69,9 +74,7 @@ def run(starcal: Starcal) -> Starcal:
 
 
 @pytest.mark.slow
-def test_the_imported_bag_gives_the_calibration_of_the_original(
-    night: Path, tmp_path: Path, run: Starcal
-) -> None:
+def test_the_imported_bag_gives_the_calibration_of_the_original(night, tmp_path, run) -> None:
     aem, bag = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag'
     velocities = ['--velocity', write_velocities(tmp_path / 'velocity.csv')]
     prior = ['--camera', TINY / 'camera.yaml', '--alignment', *ALIGNMENT]
@@ -95,7 +98,7 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
     assert record['scale'] == {'offset': 0.0, 'step': 1.0, 'dtype': images()[0].pixels.dtype.name}
 
 
-def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_a_ck_has_an_attitude_at_each_image(night, tmp_path, run) -> None:
     kernels = write_ck(tmp_path)
     bag = tmp_path / 'bag.mcap'
     attitude = ['--attitude', *kernels, '--star-tracker', FRAME_ID]
@@ -108,8 +111,7 @@ def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, run: St
 
 
 @pytest.mark.slow
-def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, run: Starcal) -> None:
-    aem = write_aem(tmp_path / 'a.aem')
+def test_several_star_trackers_of_one_aem(night, aem, tmp_path, run) -> None:
     start = aem.read_text().index('META_START')
     second = aem.read_text()[start:].replace('STARTRACKER_1', 'ST-2')
     aem.write_text(aem.read_text() + second)
@@ -131,8 +133,7 @@ def test_several_star_trackers_of_one_aem(night: Path, tmp_path: Path, run: Star
     assert values['more_alignments'] == list(ALIGNMENT)
 
 
-def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, run: Starcal) -> None:
-    aem = write_aem(tmp_path / 'a.aem')
+def test_images_without_attitudes_are_named(night, aem, run) -> None:
     lines = aem.read_text().splitlines()
     start = lines.index('DATA_START') + 1
     count = len(attitudes())
@@ -143,8 +144,7 @@ def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, run: St
     assert 'images are in gaps of up to' in out and 'have no attitude about them' in out
 
 
-def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, run: Starcal) -> None:
-    aem = write_aem(tmp_path / 'a.aem')
+def test_attitudes_of_another_day_are_refused(night, aem, run) -> None:
     aem.write_text(aem.read_text().replace('2026-05-15T07:', '2027-05-15T07:'))
     spans = [
         f'{utc_text(times[0])} to {utc_text(times[-1])}'
@@ -157,42 +157,18 @@ def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, run: 
     )
 
 
-@pytest.mark.parametrize(
-    ('line', 'found'),
-    [
-        ('{night}/*.nothing', 'no file matches'),
-        ('{night}/0.fits --attitude {night}/none.aem', 'cannot be read'),
-        ('{night}/0.fits --attitude {aem} {night}/0.fits', 'one file, unless all are SPICE'),
-        ('{night}/0.fits --camera {aem}', 'a.aem'),
-        ('{night}/0.fits --star-tracker ST7', 'choose one with'),
-        ('{night}/0.fits --value-range 5 1', 'is empty'),
-        (
-            '{night}/0.fits --camera {camera} --more-star-trackers ST-2',
-            '--alignment: 0 numbers, 8 are needed: x y z w for each star tracker; only that of a ',
-        ),
-    ],
-)
-def test_bad_input_is_one_line(
-    night: Path, tmp_path: Path, run: Starcal, line: str, found: str
-) -> None:
-    aem = write_aem(tmp_path / 'a.aem')
-    given = line.format(night=night, aem=aem, camera=TINY / 'camera.yaml').split()
-    assert_refused(run(aem, Path(given[0]), more=given[1:]), found)
-
-
 def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
-    night: Path, tmp_path: Path, run: Starcal
+    night, aem, tmp_path, run
 ) -> None:
     (tmp_path / 'bag').mkdir()
     camera = shutil.copy(TINY / 'camera.yaml', tmp_path / 'bag/camera.yaml')
     for images_of in ('[0-3].fits', '*.fits'):
-        aem = write_aem(tmp_path / 'a.aem')
         answer = run(aem, night / images_of, more=['--camera', camera])
         assert answer.status == 0, answer
     assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
 
 
-def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, run: Starcal) -> None:
+def test_a_hostile_file_costs_one_line(night, aem, tmp_path, run) -> None:
     (tmp_path / 'cut.fits').write_bytes(b'nothing')
     with (tmp_path / 'huge.fits').open('wb') as file:
         file.write(fits.PrimaryHDU(np.zeros((2, 2))).header.tostring().encode())
@@ -200,7 +176,6 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, run: Starcal
         for axis in (1, 2):
             file.write(f'NAXIS{axis}  = {11000:20}'.ljust(80).encode())
         file.truncate(2880 * (2 + 11000 * 11000 * 8 // 2880))
-    aem = write_aem(tmp_path / 'a.aem')
     answer = run(aem, night / '0.fits', tmp_path / '*.fits')
     assert answer.status == 2 and not (tmp_path / 'bag').exists()
     first, second = answer.err.splitlines()
@@ -208,12 +183,11 @@ def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, run: Starcal
     assert 'huge.fits: needs more than 1 GB of memory to be read' in second
 
 
-def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, run: Starcal) -> None:
+def test_the_pixels_of_the_camera_are_in_the_record(aem, tmp_path, run) -> None:
     for number, image in enumerate(images()[:3]):
         upside_down = Image(image.time_ns, image.pixels[::-1].copy())
         header = {'DATE-AVG': date(image.time_ns), 'ROWORDER': 'BOTTOM-UP'}
         write_fits(tmp_path / f'{number}.fits', upside_down, **header)
-    aem = write_aem(tmp_path / 'a.aem')
     note = 'pixels of the images: rows last to first (ROWORDER)'
     assert note in run(aem, tmp_path / '*.fits').out
     assert note in json.loads((tmp_path / 'bag/import.json').read_text())['notes']
@@ -224,7 +198,7 @@ def test_the_pixels_of_the_camera_are_in_the_record(tmp_path: Path, run: Starcal
 
 @pytest.mark.slow
 def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_them(
-    night: Path, tmp_path: Path, run: Starcal
+    night, tmp_path, run
 ) -> None:
     """Of two bags with files of one name, and of the observations of their calibration."""
     aem, prior = write_aem(tmp_path / 'a.aem'), ['--camera', str(TINY / 'camera.yaml')]
@@ -245,9 +219,7 @@ def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_th
 
 
 @pytest.mark.slow
-def test_imports_and_simulations_do_not_replace_each_other(
-    night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
-) -> None:
+def test_imports_and_simulations_do_not_replace_each_other(night, tmp_path, run, starcal) -> None:
     """Each may be repeated: the files beside a bag would else be those of another one."""
     aem, imported, simulated = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'sim'
     for _ in range(2):
@@ -258,9 +230,7 @@ def test_imports_and_simulations_do_not_replace_each_other(
 
 
 @pytest.mark.slow
-def test_observations_carry_the_originals_of_their_bag(
-    night: Path, tmp_path: Path, run: Starcal, starcal: Starcal
-) -> None:
+def test_observations_carry_the_originals_of_their_bag(night, tmp_path, run, starcal) -> None:
     aem, bag, out = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag', tmp_path / 'out'
     assert run(aem, night / '*.fits').status == 0
     params = ['--params', str(TINY / 'params.yaml'), '--no-report', '--quiet']
@@ -274,9 +244,8 @@ def test_observations_carry_the_originals_of_their_bag(
     assert all(digest in page for digest in originals.values())
 
 
-def test_a_coarse_scale_is_named(tmp_path: Path, run: Starcal) -> None:
+def test_a_coarse_scale_is_named(aem, tmp_path, run) -> None:
     for number, image in enumerate(images()[:3]):
         write_fits(tmp_path / f'{number}.fits', image, 'float32')
-    aem = write_aem(tmp_path / 'a.aem')
     out = run(aem, tmp_path / '*.fits', more=['--value-range', 0, 2e6]).out
     assert 'a step of 16 bit is' in out and 'pixel values are 0 + 30.7692308 DN' in out

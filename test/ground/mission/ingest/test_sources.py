@@ -37,7 +37,7 @@ def worst_rad(found: Attitudes, expected: tuple) -> float:
 
 @pytest.mark.parametrize('version', ['1.0', '2.0'])
 @pytest.mark.parametrize('system', ['utc', 'tai', 'tdb', 'gps'])
-def test_an_aem_gives_the_attitudes_of_the_bag(tmp_path: Path, system: str, version: str) -> None:
+def test_an_aem_gives_the_attitudes_of_the_bag(tmp_path, system, version) -> None:
     path = write_aem(tmp_path / 'a.aem', system, version=version)
     found = sources.attitudes([path], '', AT_NS)
     stamps = np.array([time_ns for time_ns, _ in attitudes()])
@@ -47,13 +47,13 @@ def test_an_aem_gives_the_attitudes_of_the_bag(tmp_path: Path, system: str, vers
     assert (system == 'utc') == (not found.notes)
 
 
-def test_eme2000_is_taken_and_named(tmp_path: Path) -> None:
+def test_eme2000_is_taken_and_named(tmp_path) -> None:
     path = write_aem(tmp_path / 'a.aem', frame='EME2000')
     found = sources.attitudes([path], '', AT_NS)
     assert found.notes == (EME2000_NOTE,) and '20 mas' in EME2000_NOTE
 
 
-def test_the_direction_is_that_of_spice(tmp_path: Path) -> None:
+def test_the_direction_is_that_of_spice(tmp_path) -> None:
     """The matrix of CCSDS 504.0-B from Q1..QC is SPICE's C-matrix, inertial to body."""
     _, (q1, q2, q3, qc) = attitudes()[0]
     M = np.array([
@@ -67,7 +67,7 @@ def test_the_direction_is_that_of_spice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('frame', [str(FRAME_ID), 'ST1'])
-def test_a_ck_gives_the_attitudes_of_the_bag(tmp_path: Path, frame: str) -> None:
+def test_a_ck_gives_the_attitudes_of_the_bag(tmp_path, frame) -> None:
     kernels = write_ck(tmp_path)
     if frame == 'ST1':
         fk = tmp_path / 'mission.tf'
@@ -87,7 +87,7 @@ def test_a_ck_gives_the_attitudes_of_the_bag(tmp_path: Path, frame: str) -> None
     assert spiceypy.ktotal('ALL') == 0  # nothing stays loaded
 
 
-def test_an_spk_gives_the_velocity(tmp_path: Path) -> None:
+def test_an_spk_gives_the_velocity(tmp_path) -> None:
     lsk = write_lsk(tmp_path / 'leap.tls')
     spk = write_spk(tmp_path / 'orbit.bsp', lsk, [1.0, -28.0, 5.0])
     found = sources.velocities([spk, lsk], '-999', AT_NS)
@@ -113,7 +113,7 @@ def oem(path: Path, center: str, frame: str = 'ICRF') -> Path:
     return path
 
 
-def test_an_oem_is_interpolated_and_the_earth_added(tmp_path: Path) -> None:
+def test_an_oem_is_interpolated_and_the_earth_added(tmp_path) -> None:
     about_earth = sources.velocities([oem(tmp_path / 'a.oem', 'EARTH')], '', AT_NS)
     about_ssb = sources.velocities([oem(tmp_path / 'b.oem', 'SOLAR SYSTEM BARYCENTER')], '', AT_NS)
     earth = [earth_velocity_c(time_ns) * LIGHT_M_S for time_ns in AT_NS]
@@ -128,7 +128,7 @@ def test_an_oem_is_interpolated_and_the_earth_added(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('mark', [', ', ';', '\t', ' ; '])
 @pytest.mark.parametrize('header', ['time_tdb qx qy qz qw', 'Time_TDB QX QY QZ QW'])
-def test_tables_are_read(tmp_path: Path, mark: str, header: str) -> None:
+def test_tables_are_read(tmp_path, mark, header) -> None:
     lines = ['# from telemetry, or another program', mark.join(header.split())]
     lines += [mark.join([date(t, 'tdb'), *map(repr, q.tolist())]) for t, q in attitudes()]
     path = tmp_path / 'a.csv'
@@ -152,14 +152,14 @@ def test_tables_are_read(tmp_path: Path, mark: str, header: str) -> None:
         ('time_ns,qx,qy,qz,qw\n-5,0,0,0,1\n', 'before 1972'),
     ],
 )
-def test_a_bad_table_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_a_bad_table_is_one_line(tmp_path, text, words) -> None:
     path = tmp_path / 'a.csv'
     path.write_text(text)
     with pytest.raises(IngestError, match=words):
         sources.attitudes([path], '', AT_NS)
 
 
-def test_kernels_that_do_not_cover_the_images_are_named(tmp_path: Path) -> None:
+def test_kernels_that_do_not_cover_the_images_are_named(tmp_path) -> None:
     kernels = write_ck(tmp_path)
     later = [time_ns + 86400 * 10**9 for time_ns in AT_NS]
     with pytest.raises(IngestError, match='the CK does not cover the images'):

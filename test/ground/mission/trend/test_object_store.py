@@ -161,9 +161,7 @@ def trend(tmp_path: Path, starcal: Starcal) -> Starcal:
     return lambda *more, root=_FLEET: starcal('trend', root, *given, *more)
 
 
-def test_bags_are_fetched_by_workers_and_read_once(
-    store: Store, tmp_path: Path, trend: Starcal
-) -> None:
+def test_bags_are_fetched_by_workers_and_read_once(store, tmp_path, trend) -> None:
     assert '2 new, 0 known, 0 failed' in trend('--workers', 2).out
     assert sum('GET' in line and 'mcap' in line for line in store.requests) == 2
     paths = sorted(row.path for row in Table(tmp_path).rows())
@@ -184,9 +182,7 @@ PLACES = {  # faults of requests, root, what the one line names
 
 
 @pytest.mark.parametrize('case', PLACES)
-def test_a_store_that_cannot_be_listed_is_one_line(
-    store: Store, trend: Starcal, case: str
-) -> None:
+def test_a_store_that_cannot_be_listed_is_one_line(store, trend, case) -> None:
     store.faults, root, words = PLACES[case]
     assert_refused(trend(root=root), words)
 
@@ -202,9 +198,7 @@ FAULTS = {  # of requests of one bag, and the reason of its row
 
 
 @pytest.mark.parametrize('fault', FAULTS)
-def test_a_bag_that_cannot_be_fetched_fails_and_passes(
-    store: Store, tmp_path: Path, trend: Starcal, fault: str
-) -> None:
+def test_a_bag_that_cannot_be_fetched_fails_and_passes(store, tmp_path, trend, fault) -> None:
     store.faults, reason = FAULTS[fault]
     status, out, _ = trend()
     assert status == 0
@@ -216,9 +210,7 @@ def test_a_bag_that_cannot_be_fetched_fails_and_passes(
     assert [row.error for row in Table(tmp_path).rows()] == ['', '']
 
 
-def test_a_store_that_falls_silent_ends_the_run(
-    store: Store, tmp_path: Path, trend: Starcal, monkeypatch
-) -> None:
+def test_a_store_that_falls_silent_ends_the_run(store, tmp_path, trend, monkeypatch) -> None:
     """A file that a store does not give, where it gives others, holds up no run."""
     compute = fleet.compute
 

@@ -96,7 +96,7 @@ def test_noise_has_no_trend_but_rarely() -> None:
 
 
 @pytest.mark.parametrize('after', [1, 10, 30, 57])
-def test_a_step_is_found_at_its_place_and_size(after: int) -> None:
+def test_a_step_is_found_at_its_place_and_size(after) -> None:
     found = measured(3, 1.0 * (np.arange(N) > after))
     (term,) = found.terms
     assert (term.kind, term.after) == ('step', after)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 import re
 
 import numpy as np
@@ -29,7 +28,7 @@ def months(truth: Truth, count: int = MONTHS) -> list[Floats]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('seed', range(3))
-def test_of_200_cameras_those_that_changed_are_named(seed: int, tmp_path: Path) -> None:
+def test_of_200_cameras_those_that_changed_are_named(seed, tmp_path) -> None:
     rng = np.random.default_rng([30, seed])
     names = [f'sat{k:03d}' for k in range(200)]
     truths = {name: simulated_truth(rng) for name in names}
@@ -66,9 +65,7 @@ def found_in(page: str) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_300_cameras_take_5_kilobytes_each_the_largest_change_first(
-    tmp_path: Path,
-) -> None:
+def test_300_cameras_take_5_kilobytes_each_the_largest_change_first(tmp_path) -> None:
     rng = np.random.default_rng(31)
     truths = {f'sat{k:04d}': simulated_truth(rng) for k in range(300)}
     fleet = (simulated_rows(name, months(truth), rng) for name, truth in truths.items())
@@ -83,7 +80,7 @@ def test_300_cameras_take_5_kilobytes_each_the_largest_change_first(
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_a_drift_and_a_step_are_found_once_and_within_2_sigma(seed: int) -> None:
+def test_a_drift_and_a_step_are_found_once_and_within_2_sigma(seed) -> None:
     rng = np.random.default_rng([32, seed])
     truth = dataclasses.replace(
         simulated_truth(rng), drift_per_year=40.0 * ALIGNMENT_X, step=0.5 * FX, step_after=13

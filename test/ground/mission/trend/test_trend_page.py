@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 import re
 
 import pytest
@@ -26,7 +25,7 @@ VERDICTS: Mapping[str, tuple[Sequence[int], int | None, float, bool | None, str]
 
 
 @pytest.mark.parametrize('name', VERDICTS)
-def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
+def test_the_verdict_is_open_where_too_few_tell(name) -> None:
     days, place, turn_arcsec, expected, words = VERDICTS[name]
     turns = [(turn_arcsec * (day == days[-1]), 0.0, 0.0) for day in days]
     stamps = [int(k == place) * day * DAY_NS for k, day in enumerate(days)]
@@ -42,22 +41,20 @@ def test_the_verdict_is_open_where_too_few_tell(name: str) -> None:
 
 
 @pytest.mark.parametrize(('count', 'words'), [(5, 'Not tested: 5 of the 6'), (6, 'No change')])
-def test_a_series_that_is_too_short_is_not_tested(tmp_path: Path, count: int, words: str) -> None:
+def test_a_series_that_is_too_short_is_not_tested(tmp_path, count, words) -> None:
     write_page([[made(day) for day in range(1, count + 1)]], 1, tmp_path, 'fleet')
     captions = re.findall('<figcaption>(.*)</figcaption>', (tmp_path / 'trend.html').read_text())
     assert len(captions) > 10 and all(words in caption for caption in captions[1:])
 
 
-def test_an_activation_that_is_assumed_is_named(tmp_path: Path) -> None:
+def test_an_activation_that_is_assumed_is_named(tmp_path) -> None:
     for is_accepted in (False, True):
         write_page([[made(1, accepted=is_accepted)]], 1, tmp_path, 'fleet')
         assert ('No activation is rec' in (tmp_path / 'trend.html').read_text()) is is_accepted
 
 
 @pytest.mark.parametrize(('note', 'is_missed'), [('met', False), ('missed by 0.2 px', True)])
-def test_a_requirement_that_the_newest_misses_is_in_the_verdict(
-    tmp_path: Path, note: str, is_missed: bool
-) -> None:
+def test_a_requirement_that_the_newest_misses_is_in_the_verdict(tmp_path, note, is_missed) -> None:
     check = GateCheck('map', 'requirements', 0.7, 0.5, 'px', not is_missed, note)
     page = write_page([[made(1), made(2, gate=(check,))]], 1, tmp_path, 'fleet')
     assert page.verdicts[0].attention == 'misses a requirement' * is_missed

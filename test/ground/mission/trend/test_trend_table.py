@@ -47,13 +47,13 @@ def table_of(folder: Path, *rows: Row) -> Table:
     return table
 
 
-def test_rows_come_back_to_the_last_bit_in_order_of_time(tmp_path: Path) -> None:
+def test_rows_come_back_to_the_last_bit_in_order_of_time(tmp_path) -> None:
     rows = [row('a', 3), row('b', 9), row('c', 10, temperature_degc=math.nan)]
     table_of(tmp_path, *rows[::-1])
     assert str(Table(tmp_path).rows()) == str(rows)  # NaN differs from itself
 
 
-def test_a_table_may_be_dropped_in_another_thread(tmp_path: Path) -> None:
+def test_a_table_may_be_dropped_in_another_thread(tmp_path) -> None:
     tables = [table_of(tmp_path, row('a'))]
     thread = threading.Thread(target=tables.clear)
     thread.start()
@@ -71,14 +71,14 @@ ROWS = {  # what replaces what: rows that are added, stamps and cameras that are
 
 
 @pytest.mark.parametrize('case', ROWS)
-def test_a_row_replaces_what_it_mends(tmp_path: Path, case: str) -> None:
+def test_a_row_replaces_what_it_mends(tmp_path, case) -> None:
     rows, expected = ROWS[case]
     table_of(tmp_path, *rows)
     left = Table(tmp_path).rows()
     assert [f'{one.error or one.stamp} {one.camera}' for one in left] == expected
 
 
-def test_rows_come_one_camera_after_the_other(tmp_path: Path) -> None:
+def test_rows_come_one_camera_after_the_other(tmp_path) -> None:
     table = table_of(tmp_path, *(row(stamp, camera=stamp[0]) for stamp in ('x1', 'y1', 'x2')))
     other = table_of(tmp_path, row('y2', camera='y'))  # another run, at the same time
     for each in (table, other, Table(tmp_path)):
@@ -102,7 +102,7 @@ KNOWN = {  # a row, and whether its task is done with
 
 
 @pytest.mark.parametrize('case', KNOWN)
-def test_a_row_of_this_version_is_not_made_again(tmp_path: Path, case: str) -> None:
+def test_a_row_of_this_version_is_not_made_again(tmp_path, case) -> None:
     made, expected = KNOWN[case]
     table = table_of(tmp_path, made)
     assert table.has('a', '', '') is expected
@@ -125,7 +125,7 @@ with table.transaction():
 """
 
 
-def test_a_kill_loses_no_row_that_was_added(tmp_path: Path) -> None:
+def test_a_kill_loses_no_row_that_was_added(tmp_path) -> None:
     here = Path(__file__).parent
     line = [sys.executable, '-c', _KILLED, str(tmp_path), str(here), str(here.parents[2])]
     assert subprocess.run(line).returncode == -signal.SIGKILL
@@ -185,7 +185,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize('kind', HOSTILE)
-def test_a_damaged_table_is_named_and_left_alone(tmp_path: Path, kind: str) -> None:
+def test_a_damaged_table_is_named_and_left_alone(tmp_path, kind) -> None:
     table_of(tmp_path, *(row(str(k), k) for k in range(20)))
     path = tmp_path / TABLE_FILE
     HOSTILE[kind](path)
